@@ -1,0 +1,59 @@
+"""Pytrees that cross module borders."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from wbgs_jax.array import planar_array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Gaussians:
+    """Stored (unconstrained) parameters of N 3D Gaussians in the world frame; `alive` masks the padding of the capacity."""
+
+    means: Float[Array, "n 3"]
+    """Centres, metres."""
+    log_scales: Float[Array, "n 3"]
+    """Natural logarithm of the standard deviations along the own axes, metres."""
+    quats: Float[Array, "n 4"]
+    """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
+    opacity_logits: Float[Array, "n"]
+    """delta_o of the paper (section 4.5), before the sigmoid."""
+    alive: Bool[Array, "n"]
+    """False for padded entries: they never contribute and never receive a gradient."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Receiver:
+    """A fixed receiver array."""
+
+    position: Float[Array, "3"]
+    """World frame, metres."""
+    orientation: Float[Array, "4"]
+    """Unit quaternion (wxyz) that turns the receiver's local frame into the world frame."""
+    element_positions: Float[Array, "elements 3"]
+    """Local frame, wavelengths."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Query:
+    """What is asked of a field: a batch of transmitter positions and frequencies."""
+
+    tx_position: Float[Array, "*b 3"]
+    """World frame, metres."""
+    frequency_hz: Float[Array, "*b"]
+
+
+def make_receiver(position: Any, orientation: Any = (1.0, 0.0, 0.0, 0.0), element_positions: Any = None) -> Receiver:
+    """A float32 receiver; the default array is the 4x4 half-wavelength one in the local y-z plane."""
+    elements = planar_array() if element_positions is None else element_positions
+    quaternion = np.asarray(orientation, np.float64)
+    quaternion = quaternion / np.linalg.norm(quaternion)
+    return Receiver(*(jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements)))
