@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from wbgs_jax.array import planar_array
 
@@ -24,8 +24,9 @@ class Gaussians:
     """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
     opacity_logits: Float[Array, "n"]
     """delta_o of the paper (section 4.5), before the sigmoid."""
-    alive: Bool[Array, "n"]
-    """False for padded entries: they never contribute and never receive a gradient."""
+    alive: Float[Array, "n"]
+    """1 for a Gaussian, 0 for padding up to the capacity, which never contributes and never receives a gradient. A float, so
+    that `jax.grad` works on the whole pytree; its gradient is zero."""
 
 
 @jax.tree_util.register_dataclass
@@ -49,6 +50,17 @@ class Query:
     tx_position: Float[Array, "*b 3"]
     """World frame, metres."""
     frequency_hz: Float[Array, "*b"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Surface:
+    """Points on the scene's surfaces, where Gaussians start."""
+
+    points: Float[Array, "n 3"]
+    """World frame, metres."""
+    spacing: Float[Array, "n"]
+    """Mean distance to the 3 nearest other points, metres."""
 
 
 def make_receiver(position: Any, orientation: Any = (1.0, 0.0, 0.0, 0.0), element_positions: Any = None) -> Receiver:

@@ -8,6 +8,7 @@ sha256 of the meshes, ceilings).
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,10 +61,14 @@ _ARRAYS: dict[str, tuple[type, int]] = {
 }
 
 
+# What NumPy, zipfile and zlib raise on damaged bytes; TypeError is a plain .npy array, RuntimeError an unknown compression.
+_DAMAGED = (ValueError, TypeError, EOFError, RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error)
+
+
 def save_scene(path: Path | str, scene: SceneFile) -> None:
     """Check and write a scene file; equal scenes give equal bytes."""
-    arrays = {key: np.asarray(getattr(scene, key), dtype) for key, (dtype, _) in _ARRAYS.items()}
-    meta = json.dumps({"format": FORMAT, "name": scene.name} | scene.meta, sort_keys=True)
+    arrays: dict[str, np.ndarray] = {key: np.asarray(getattr(scene, key), dtype) for key, (dtype, _) in _ARRAYS.items()}
+    meta = json.dumps(scene.meta | {"format": FORMAT, "name": scene.name}, sort_keys=True)
     _check(arrays, str(path))
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for key, value in (arrays | {"meta": np.array(meta)}).items():
@@ -71,7 +76,7 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
             info = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w") as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(value), allow_pickle=False)
+                np.lib.format.write_array(member, np.asarray(value, order="C"), allow_pickle=False)
 
 
 def load_scene(path: Path | str) -> SceneFile:
@@ -91,11 +96,13 @@ def load_scene(path: Path | str) -> SceneFile:
     except OSError as error:
         reason = error.strerror or "not an .npz archive"
         raise UserError(f"cannot read scene file {path}: {reason}; check the path or make it again with `make data`") from error
-    except (ValueError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
-        raise UserError(f"scene file {path} is damaged or truncated ({error}); copy it or make it again") from error
-    if meta.get("format") != FORMAT:
-        raise UserError(f"{path} has scene format {meta.get('format')}, this version reads {FORMAT}; update wbgs-jax")
+    except _DAMAGED as error:
+        raise UserError(f"scene file {path} is damaged or not a scene file ({error}); copy it or make it again") from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        found = meta.get("format") if isinstance(meta, dict) else None
+        raise UserError(f"{path} has scene format {found}, this version reads {FORMAT}; update wbgs-jax")
     _check(arrays, str(path))
+    arrays = {key: value.astype(_ARRAYS[key][0], copy=False) for key, value in arrays.items()}
     return SceneFile(name=str(meta.get("name", path.stem)), meta=meta, **arrays)
 
 
@@ -106,18 +113,20 @@ def _check(arrays: dict[str, np.ndarray], where: str) -> None:
 
     for key, (dtype, ndim) in _ARRAYS.items():
         value = arrays[key]
-        demand(value.ndim == ndim and np.can_cast(value.dtype, dtype, "same_kind"), f"{key} must be a {ndim}-D {dtype.__name__} array")
+        castable = np.can_cast(value.dtype, dtype, "same_kind")
+        demand(value.ndim == ndim and castable, f"{key} must be a {ndim}-D {dtype.__name__} array")
         demand(bool(np.isfinite(value).all()), f"{key} contains NaN or infinity")
     n_tx, n_freq, n_elements = arrays["snapshots"].shape
-    n_faces, n_vertices = len(arrays["faces"]), len(arrays["vertices"])
+    faces, n_vertices = arrays["faces"], len(arrays["vertices"])
     shapes = {
         "tx_positions": (n_tx, 3), "frequencies_hz": (n_freq,), "rx_position": (3,), "rx_orientation": (4,),
-        "element_positions": (n_elements, 3), "vertices": (n_vertices, 3), "faces": (n_faces, 3), "face_part": (n_faces,), "split": (n_tx,),
+        "element_positions": (n_elements, 3), "vertices": (n_vertices, 3), "faces": (len(faces), 3),
+        "face_part": (len(faces),), "split": (n_tx,),
     }  # fmt: skip
     for key, shape in shapes.items():
         demand(arrays[key].shape == shape, f"{key} has shape {arrays[key].shape}, expected {shape} from the snapshots")
     demand(n_tx > 0 and n_freq > 0, "there is no spectrum in it")
     demand(bool((arrays["frequencies_hz"] > 0).all()), "frequencies_hz must be positive")
     demand(bool(np.isin(arrays["split"], (TRAIN, TEST)).all()), "split must hold 0 (train) and 1 (test) only")
-    demand(n_faces == 0 or 0 <= arrays["faces"].min() and arrays["faces"].max() < n_vertices, "faces point at vertices that do not exist")
+    demand(bool(((faces >= 0) & (faces < n_vertices)).all()), "faces point at vertices that do not exist")
     demand(abs(float(np.linalg.norm(arrays["rx_orientation"])) - 1) < 1e-3, "rx_orientation must be a unit quaternion (wxyz)")

@@ -1,0 +1,176 @@
+"""All settings on one page: frozen dataclasses, and the presets `smoke`, `cpu` and `gpu` at the end.
+
+Every setting can be overridden on the command line (`python -m wbgs_jax.train --help`); a run writes its own to
+`config.json`. Where the paper or the authors' code give a value it is the default of the `gpu` preset; docs/decisions.md
+says what was measured.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+from wbgs_jax.encoding import FrequencyScale
+from wbgs_jax.errors import UserError
+from wbgs_jax.geometry import Projection
+
+
+@dataclass(frozen=True)
+class WidebandConfig:
+    """The paper's field (fields/wideband.py)."""
+
+    gaussians: int = 2000
+    """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
+    width: int = 64
+    """Units of the attenuation network's layers (authors: 128)."""
+    depth: int = 4
+    """Layers of the attenuation network (authors: 8)."""
+    skip: int = 2
+    """The layer at which the inputs enter again (authors: 4)."""
+    radiance_widths: tuple[int, ...] = (64, 32)
+    """Units of the radiance network's layers (authors: 128, 64)."""
+    gaussian_octaves: int = 6
+    """Octaves of P(G) (authors: 10)."""
+    tx_octaves: int = 4
+    """Octaves of P(TX) (authors: 10)."""
+    frequency_octaves: int = 4
+    """Octaves of the frequency encoding (authors: 10)."""
+    frequency_scale: FrequencyScale = "log"
+    """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
+    relative: bool = True
+    """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
+    attenuation_frequency: bool = True
+    """Frequency embedding of the attenuation network (paper, Table 3)."""
+    radiance_frequency: bool = True
+    """Frequency embedding of the radiance network (paper, Table 3)."""
+    projection: Projection = "hemisphere"
+    """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Loss, optimiser groups and schedules; every learning rate decays by a cosine to `final_fraction` of itself."""
+
+    steps: int = 8000
+    batch: int = 8
+    """Queries a step."""
+    ssim_weight: float = 0.2
+    """lambda of the paper's equation 5."""
+    network_lr: float = 1e-3
+    """Authors: 8e-4."""
+    network_weight_decay: float = 0.0
+    means_lr: float = 1e-3
+    """Metres a step, about. (Authors: 0 in effect; their spatial scale multiplies it away.)"""
+    log_scales_lr: float = 5e-3
+    quats_lr: float = 1e-3
+    opacity_lr: float = 2.5e-2
+    final_fraction: float = 0.01
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Adaptive density control (paper, section 4.5; thresholds of the authors' code)."""
+
+    every: int = 500
+    """Steps between two controls; 0 switches it off."""
+    start: int = 500
+    stop_fraction: float = 0.5
+    """No control after this fraction of the steps."""
+    gradient_threshold: float = 2e-4
+    """Clone or split above this mean norm of the positional gradient, in normalised image coordinates (-1..1)."""
+    split_scale: float = 0.3
+    """Metres: Gaussians larger than this are split, smaller ones cloned."""
+    prune_attenuation: float = 0.005
+    """Gaussians whose delta_o lies below are removed."""
+    reset_every: int = 3000
+    """Steps between two resets of delta_o to at most `reset_attenuation`; 0: never."""
+    reset_attenuation: float = 0.01
+    max_gaussians: int = 4000
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How the host drives training."""
+
+    epoch_steps: int = 50
+    """Steps in one jitted epoch: what an interrupt waits for at most."""
+    evaluate_every: int = 1000
+    """Steps between two evaluations on `evaluate_spectra` held-out spectra, for the curves only."""
+    evaluate_spectra: int = 60
+    checkpoint_every: int = 1000
+    keep_checkpoints: int = 2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that makes a run, but the data and the seed."""
+
+    wideband: WidebandConfig = field(default_factory=WidebandConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+
+
+PRESETS: dict[str, Settings] = {
+    # Under a minute on two cores: proves that everything works, not that it is good.
+    "smoke": Settings(
+        wideband=WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
+        optim=OptimConfig(steps=200, batch=4),
+        density=DensityConfig(every=100, start=50, max_gaussians=640, reset_every=0),
+        loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),
+    ),
+    # The default without a GPU.
+    "cpu": Settings(),
+    # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
+    "gpu": Settings(
+        wideband=WidebandConfig(gaussians=0, width=128, depth=8, skip=4, radiance_widths=(128, 64)),
+        optim=OptimConfig(steps=20_000, batch=8, network_lr=8e-4),
+        density=DensityConfig(max_gaussians=100_000),
+        loop=LoopConfig(epoch_steps=100, checkpoint_every=2000),
+    ),
+}
+
+
+def to_dict(settings: Settings) -> dict[str, Any]:
+    """Settings as plain values for JSON."""
+    return dataclasses.asdict(settings)
+
+
+def from_dict(values: dict[str, Any]) -> Settings:
+    """Settings from `to_dict`'s values; unknown or missing names are a `UserError`."""
+
+    def build(cls: type, values: dict[str, Any]) -> Any:
+        try:
+            return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+        except TypeError as error:
+            raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
+
+    fields = {f.name: f.default_factory for f in dataclasses.fields(Settings)}
+    try:
+        return Settings(**{name: build(factory, values[name]) for name, factory in fields.items()})  # type: ignore[arg-type]
+    except KeyError as error:
+        raise UserError(f"these settings lack {error}; they belong to another version of wbgs-jax: start a new run") from error
+
+
+def check(settings: Settings) -> None:
+    """Settings that cannot work are a `UserError` before any work is done."""
+    positive = {
+        "optim.steps": settings.optim.steps,
+        "optim.batch": settings.optim.batch,
+        "loop.epoch-steps": settings.loop.epoch_steps,
+        "loop.evaluate-every": settings.loop.evaluate_every,
+        "loop.checkpoint-every": settings.loop.checkpoint_every,
+        "loop.keep-checkpoints": settings.loop.keep_checkpoints,
+        "wideband.width": settings.wideband.width,
+        "wideband.depth": settings.wideband.depth,
+    }
+    for name, value in positive.items():
+        if value < 1:
+            raise UserError(f"--{name} is {value}; it must be at least 1")
+    if 0 < settings.wideband.gaussians < 4 or settings.wideband.gaussians < 0:
+        raise UserError(f"--wideband.gaussians is {settings.wideband.gaussians}; give at least 4, or 0 for the size of the mesh")
+    if settings.optim.steps % settings.loop.epoch_steps:
+        raise UserError(
+            f"--optim.steps {settings.optim.steps} is not a multiple of --loop.epoch-steps {settings.loop.epoch_steps}; change one of them"
+        )
+    if not 0 <= settings.optim.ssim_weight <= 1:
+        raise UserError(f"--optim.ssim-weight is {settings.optim.ssim_weight}; it must lie between 0 and 1")

@@ -1,0 +1,283 @@
+"""The folder layout in which spectra are published (NeRF2, WRF-GS, Wideband3DGS): in, and out of any scene file.
+
+    spectrum/00001.png ...       8-bit grey PAS, 90 rows (zenith 0..90 degrees) x 360 columns (azimuth -180..180 degrees)
+    tx_pos.csv                   header x,y,z; row k belongs to image k, both counted from 1; metres
+    gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]
+    freq.txt                     optional: one frequency (GHz) a spectrum
+    train_index.txt, test_index.txt   optional: image names without .png, zero-padded or not
+    point_cloud.ply              optional: the surface
+
+Frames: transmitters and receiver share the world frame. The mesh is z-up while that frame is y-up: a mesh point (x, y, z)
+lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed.
+
+    python -m wbgs_jax.data.layout SCENE.npz FOLDER      writes a scene file as such a folder
+"""
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.schema import SceneFile, load_scene
+from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
+from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.types import Receiver, make_receiver
+
+NOMINAL_FREQUENCY_HZ = 1e9
+"""Stands for the frequency of a folder that names none: a model of one frequency only needs some constant."""
+
+SPECTRA, POSITIONS, GATEWAY, FREQUENCIES, MESH = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt", "point_cloud.ply"
+TRAIN_INDEX, TEST_INDEX = "train_index.txt", "test_index.txt"
+
+
+def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2) -> Dataset:
+    """Load a folder of the published layout; spectrum i is image i + 1.
+
+    Without freq.txt all spectra have one frequency: `frequency_hz`, else `frequency` (GHz) in gateway_info.yml, else
+    `NOMINAL_FREQUENCY_HZ`. Without index files `test_fraction` of the transmitters, drawn by `seed`, are the test.
+
+    Raises:
+        UserError: a file is missing, damaged, or at odds with the others.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give one that holds {SPECTRA}/, {POSITIONS} and {GATEWAY}")
+    images = _read_images(folder / SPECTRA)
+    positions = _read_positions(folder / POSITIONS, len(images))
+    name, receiver, gateway_hz = _read_gateway(folder / GATEWAY)
+    tx_index = group_transmitters(positions)
+    vertices, faces = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    if (folder / MESH).exists():
+        vertices, faces = read_ply(folder / MESH)
+    if (folder / TRAIN_INDEX).exists() or (folder / TEST_INDEX).exists():
+        train, test = _read_split(folder, tx_index)
+    else:
+        train, test = tx_disjoint_split(tx_index, test_fraction, seed)
+    return Dataset(
+        name=name or folder.resolve().name,
+        receiver=receiver,
+        tx_positions=positions,
+        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz),
+        tx_index=tx_index,
+        train=train,
+        test=test,
+        snapshots=None,
+        images=images,
+        vertices=mesh_to_world(vertices),
+        faces=faces,
+    )
+
+
+def export_layout(scene: SceneFile, folder: Path | str) -> None:
+    """Write a scene as a folder of the published layout; the folder appears whole or not at all.
+
+    Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and antenna array are not kept.
+
+    Raises:
+        UserError: `folder` exists and is not empty, or cannot be written; or the scene lacks training or test spectra, for
+            which the layout has no form.
+    """
+    dataset = scene_dataset(scene)
+    if len(dataset.train) == 0 or len(dataset.test) == 0:
+        raise UserError(f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; give its split both")
+    with _new_folder(Path(folder)) as target:
+        (target / SPECTRA).mkdir()
+        for start in range(0, len(dataset), 256):  # in blocks: a scene in float32 is a gigabyte
+            index = np.arange(start, min(start + 256, len(dataset)))
+            for number, pas in zip(index + 1, np.asarray(dataset.pas(index)), strict=True):
+                Image.fromarray(np.round(pas * 255).astype(np.uint8)).save(target / SPECTRA / f"{number:05d}.png")
+        rows = (",".join(map(repr, row)) for row in dataset.tx_positions.tolist())
+        (target / POSITIONS).write_text("\n".join(["x,y,z", *rows]) + "\n")
+        (target / FREQUENCIES).write_text("".join(f"{_hz_to_ghz(f)}\n" for f in dataset.frequencies_hz))
+        for name, index in ((TRAIN_INDEX, dataset.train), (TEST_INDEX, dataset.test)):
+            (target / name).write_text("".join(f"{number:05d}\n" for number in index + 1))
+        w, x, y, z = scene.rx_orientation.tolist()
+        gateway = {"position": scene.rx_position.tolist(), "orientation": [x, y, z, w]}
+        (target / GATEWAY).write_text(yaml.safe_dump({"dataset_name": scene.name, "gateway1": gateway}, sort_keys=False))
+        if len(scene.vertices):
+            write_ply(target / MESH, world_to_mesh(scene.vertices), scene.faces)
+
+
+def mesh_to_world(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Points of the layout's z-up mesh in the y-up world of its transmitters: (x, y, z) -> (x, z, -y)."""
+    x, y, z = points.T
+    return np.stack([x, z, -y], -1)
+
+
+def world_to_mesh(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The inverse of `mesh_to_world`: (x, y, z) -> (x, -z, y)."""
+    x, y, z = points.T
+    return np.stack([x, -z, y], -1)
+
+
+def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
+    numbered = sorted((_image_number(path.stem, folder), path) for path in folder.glob("*.png"))
+    if not numbered:
+        raise UserError(f"{folder} holds no .png spectra; put 00001.png, 00002.png, ... there")
+    for expected, (number, path) in enumerate(numbered, 1):
+        if number != expected:
+            raise UserError(f"{path} stands where image {expected:05d} is due; number images from 1, without gaps or doubles")
+    return np.stack([_read_image(path) for _, path in numbered])
+
+
+def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            if image.size != (PAS_WIDTH, PAS_HEIGHT) or image.mode != "L":
+                found = f"{image.height} x {image.width} pixels of mode {image.mode}"
+                raise UserError(f"{path} has {found}; a spectrum is {PAS_HEIGHT} x {PAS_WIDTH}, 8-bit grey (mode L)")
+            return np.asarray(image)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # all of these, says Pillow
+        raise UserError(f"{path} is truncated or not a PNG image ({error}); copy or make it again") from error
+
+
+def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
+    header, *rows = [line for line in _read_text(path).splitlines() if line.strip()] or [""]
+    if header.lower().replace(" ", "") != "x,y,z":
+        raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
+    if len(rows) != n:
+        raise UserError(f"{path} has {len(rows)} rows for {n} images in {SPECTRA}/; give one for each, row k for image k")
+    return np.array([_vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
+
+
+def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None) -> Float[np.ndarray, "n"]:
+    if not path.exists():
+        single = next(f for f in (wanted_hz, gateway_hz, NOMINAL_FREQUENCY_HZ) if f is not None)
+        if not (np.isfinite(single) and single > 0):
+            raise UserError(f"the frequency of {path.parent} is {single:g} Hz; it must be positive")
+        return np.full(n, single, np.float64)
+    if wanted_hz is not None:
+        raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
+    words = _read_text(path).split()
+    if len(words) != n:
+        raise UserError(f"{path} has {len(words)} frequencies for {n} images in {SPECTRA}/; give one (GHz) for each")
+    return np.array([_ghz_to_hz(word, path) for word in words])
+
+
+def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
+    """The data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
+    try:
+        content = yaml.safe_load(_read_text(path))
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date
+        raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); mend it") from error
+    gateways = [v for v in content.values() if isinstance(v, dict) and "position" in v] if isinstance(content, dict) else []
+    if not gateways:
+        raise UserError(f"{path} names no gateway; write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]")
+    position = _vector(gateways[0].get("position"), 3, f"{path}: position")
+    x, y, z, w = _vector(gateways[0].get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
+    if x == y == z == w == 0:
+        raise UserError(f"{path}: orientation is all zeros; write the quaternion [0, 0, 0, 1] for no rotation")
+    frequency = content.get("frequency", gateways[0].get("frequency"))
+    name = content.get("dataset_name")
+    return (
+        None if name is None else str(name),
+        make_receiver(position, (w, x, y, z)),
+        None if frequency is None else _ghz_to_hz(str(frequency), path),
+    )
+
+
+def _vector(value: Any, length: int, what: str) -> list[float]:
+    try:
+        vector = [float(v) for v in value]  # YAML gives 1e-3 as text
+    except (TypeError, ValueError, OverflowError):
+        vector = []
+    if len(vector) != length or not np.isfinite(vector).all():
+        raise UserError(f"{what} is {value!r}; it must be {length} finite numbers")
+    return vector
+
+
+def _read_split(folder: Path, tx_index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    train, test = (_read_index(folder / name, len(tx_index)) for name in (TRAIN_INDEX, TEST_INDEX))
+    both = np.intersect1d(train, test)
+    if len(both):
+        raise UserError(f"image {both[0] + 1:05d} is in both {folder / TRAIN_INDEX} and {TEST_INDEX}; keep it in one of them")
+    if shared := len(np.intersect1d(tx_index[train], tx_index[test])):
+        warnings.warn(f"{folder}: {shared} TX positions are both in training and in test; scores will flatter", stacklevel=3)
+    return train, test
+
+
+def _read_index(path: Path, n: int) -> np.ndarray:
+    """Indices of the spectra that an index file names; at least one, none twice."""
+    numbers = [_image_number(word.removesuffix(".png"), path) for word in _read_text(path).split()]
+    absent = [number for number in numbers if not 1 <= number <= n]
+    if absent:
+        raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ holds images 1 to {n}; mend the index")
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; mend it, or delete both index files")
+    return np.array(numbers) - 1
+
+
+def _image_number(word: str, where: Path) -> int:
+    if not (word.isascii() and word.isdigit()):
+        raise UserError(f"{where}: {word!r} is not an image number; images are named by numbers, 00001 for example")
+    return int(word)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}; the folder must hold it") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
+
+
+def _ghz_to_hz(word: str, where: Path) -> float:
+    """Through decimals, not by a factor of 1e9: rounding must not part a frequency from itself in another file."""
+    try:
+        hertz = float(Decimal(word).scaleb(9))
+    except InvalidOperation:
+        hertz = np.nan
+    if not (np.isfinite(hertz) and hertz > 0):
+        raise UserError(f"{where}: the frequency {word!r} is not a positive number of GHz; mend it")
+    return hertz
+
+
+def _hz_to_ghz(hertz: float) -> str:
+    return f"{Decimal(repr(float(hertz))).scaleb(-9).normalize():f}"
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside `folder` that becomes it when the block ends well and vanishes when it does not."""
+    temporary = None
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(f"{folder} exists and is not an empty folder; choose another one")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+        yield temporary
+        os.umask(umask := os.umask(0))
+        temporary.chmod(0o777 & ~umask)  # mkdtemp makes folders that only their owner can enter
+        temporary.rename(folder)
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}; choose another folder or mend its permissions") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def main() -> None:
+    """Command line: a scene file becomes a folder of the published layout."""
+    if len(sys.argv) != 3:
+        raise UserError("usage: python -m wbgs_jax.data.layout SCENE.npz FOLDER")
+    export_layout(load_scene(sys.argv[1]), sys.argv[2])
+
+
+if __name__ == "__main__":
+    run_command(main)

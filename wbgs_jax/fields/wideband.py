@@ -1,0 +1,154 @@
+"""The paper's model: frequency-embedded 3D Gaussians splatted onto the receiver's hemisphere (paper, section 4).
+
+    delta, Sig = F(P(G), P(TX), f)      the EM feature networks (networks.py), one pair a Gaussian and query
+    PAS(p)     = sum_i T_i delta_i G_i(p) Sig_i    the splatting of splat/
+
+The geometry does not depend on the query: it is planned once and shared by a batch.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from wbgs_jax.array import steering_vector
+from wbgs_jax.config import WidebandConfig
+from wbgs_jax.encoding import frequency_encoding, positional_encoding
+from wbgs_jax.geometry import to_local
+from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, attenuation_activation, signal_activation
+from wbgs_jax.splat import Capacity, GeometryPlan, geometry_plan, render_splats
+from wbgs_jax.types import Gaussians, Query, Receiver, Surface
+
+MAX_ATTENUATION = 0.99
+INITIAL_ATTENUATION = 0.3
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Frame:
+    """Maps world positions to network inputs of about unit size. Set once from the surface, never trained."""
+
+    centre: Float[Array, "3"]
+    half_extent: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class WidebandParams:
+    """All parameters of the field; `config` is static."""
+
+    gaussians: Gaussians
+    networks: dict[str, Any]
+    frame: Frame
+    config: WidebandConfig = field(metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class WidebandPlan:
+    """What is independent of the query."""
+
+    geometry: GeometryPlan
+    receiver: Receiver
+
+
+def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity: int | None = None) -> WidebandParams:
+    """Isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest neighbours.
+
+    `capacity` >= n pads the Gaussians so that density control has room to grow.
+    """
+    points = surface.points
+    n = points.shape[0]
+    pad = (capacity or n) - n
+    if pad < 0:
+        raise ValueError(f"capacity {capacity} is smaller than the {n} points")
+    log_scales = jnp.broadcast_to(jnp.log(jnp.maximum(surface.spacing, 1e-3))[:, None], (n, 3))
+    logit = jnp.log(INITIAL_ATTENUATION / (MAX_ATTENUATION - INITIAL_ATTENUATION))
+    gaussians = Gaussians(
+        means=jnp.pad(points, ((0, pad), (0, 0))),
+        log_scales=jnp.pad(log_scales, ((0, pad), (0, 0))),
+        quats=jnp.zeros((n + pad, 4), points.dtype).at[:, 0].set(1),
+        opacity_logits=jnp.full((n + pad,), logit, points.dtype),
+        alive=(jnp.arange(n + pad) < n).astype(points.dtype),
+    )
+    low, high = points.min(0), points.max(0)
+    frame = Frame(centre=(low + high) / 2, half_extent=jnp.max(high - low) / 2)
+    params = WidebandParams(gaussians, {}, frame, config)
+    receiver = Receiver(frame.centre, jnp.array([1.0, 0, 0, 0], points.dtype), jnp.zeros((1, 3), points.dtype))
+    query = Query(frame.centre[None], jnp.full((1,), 1e9, points.dtype))
+    parts, frequency = _inputs(params, receiver, query)
+    key_attenuation, key_radiance = jax.random.split(key)
+    attenuation, radiance = _networks(config)
+    attenuation_params = attenuation.init(key_attenuation, parts)
+    hidden, _ = attenuation.apply(attenuation_params, parts)
+    networks = {"attenuation": attenuation_params, "radiance": radiance.init(key_radiance, [hidden, *frequency])}
+    return WidebandParams(gaussians, networks, frame, config)
+
+
+def plan(
+    params: WidebandParams,
+    receiver: Receiver,
+    capacity: Capacity | None = None,
+    means2d_offset: Float[Array, "n 2"] | None = None,
+) -> WidebandPlan:
+    """Project and sort the Gaussians once for all queries (see `splat.geometry_plan` about `capacity`)."""
+    return WidebandPlan(geometry_plan(params.gaussians, receiver, capacity, params.config.projection, means2d_offset), receiver)
+
+
+def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Array, "b 90 360"]:
+    """Power angular spectra of B queries."""
+    attenuation, signal = em_features(params, plan.receiver, query)
+    return render_splats(plan.geometry, attenuation, signal)
+
+
+def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
+    """Final attenuation delta and signal Sig of every Gaussian and query (paper, equations 1-3 and section 4.5)."""
+    attenuation_network, radiance_network = _networks(params.config)
+    parts, frequency = _inputs(params, receiver, query)
+    hidden, delta_f = attenuation_network.apply(params.networks["attenuation"], parts)  # type: ignore[misc]
+    signal = radiance_network.apply(params.networks["radiance"], [hidden, *frequency])
+    delta = attenuation_activation(params.gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
+    return delta, signal_activation(signal)  # type: ignore[arg-type]
+
+
+def _networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
+    return AttenuationNetwork(config.width, config.depth, config.skip), RadianceNetwork(config.radiance_widths)
+
+
+def _inputs(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[list[Array], list[Array]]:
+    """Encoded inputs: the attenuation network's parts, and the radiance network's frequency part (empty if switched off)."""
+    config, frame = params.config, jax.lax.stop_gradient(params.frame)
+    means = params.gaussians.means
+    scaled_means = (means - frame.centre) / frame.half_extent
+    scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
+    parts = [
+        positional_encoding(scaled_means, config.gaussian_octaves)[:, None, :],
+        positional_encoding(scaled_tx, config.tx_octaves)[None, :, :],
+    ]
+    if config.relative:
+        parts.append(_relative_features(means, receiver, query, frame.half_extent))
+    encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
+    if config.attenuation_frequency:
+        parts.append(encoded)
+    return parts, [encoded] if config.radiance_frequency else []
+
+
+def _unit(v):
+    return v / jnp.maximum(jnp.linalg.norm(v, axis=-1, keepdims=True), 1e-3)
+
+
+def _relative_features(means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]) -> Float[Array, "n b 5"]:
+    """Functions of (P(G), P(TX)) that spare the network learning trigonometry."""
+    to_g = _unit(to_local(means - receiver.position, receiver.orientation))
+    tx = query.tx_position - receiver.position
+    to_tx = _unit(to_local(tx, receiver.orientation))
+    leg = query.tx_position[None] - means[:, None]
+    d1 = jnp.linalg.norm(leg, axis=-1)
+    u1 = leg / jnp.maximum(d1, 1e-3)[..., None]
+    cosine = to_g @ to_tx.T
+    a_g, a_tx = (steering_vector(receiver.element_positions, u) for u in (to_g, to_tx))
+    gain = jnp.abs(a_g @ a_tx.conj().T) / receiver.element_positions.shape[0]
+    bounce = jnp.sum(u1 * _unit(receiver.position - means)[:, None], -1)
+    return jnp.concatenate([jnp.stack([cosine, gain, bounce, d1 / size], -1), u1], -1)

@@ -1,0 +1,50 @@
+"""Training losses on PAS images: L = (1 - lambda) L1 + lambda (1 - SSIM)  (paper, equation 5)."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+_WINDOW, _SIGMA = 11, 1.5
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+@functools.lru_cache
+def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
+    """Banded matrix that blurs one axis, valid region only."""
+    offset = np.arange(_WINDOW) - _WINDOW // 2
+    window = np.exp(-(offset**2) / (2 * _SIGMA**2))
+    window /= window.sum()
+    matrix = np.zeros((size - _WINDOW + 1, size))
+    for row in range(len(matrix)):
+        matrix[row, row : row + _WINDOW] = window
+    return matrix
+
+
+def _blur(images: Float[Array, "*n h w"]) -> Float[Array, "*n h_valid w_valid"]:
+    """Separable Gaussian blur as two matrix products: forward and backward 16-30 times faster than convolutions or shifted
+    sums on a CPU. Full precision: variances are differences of large numbers."""
+    exact = jax.lax.Precision.HIGHEST
+    rows, columns = (jnp.asarray(_blur_matrix(n), images.dtype) for n in images.shape[-2:])
+    return jnp.matmul(jnp.matmul(rows, images, precision=exact), columns.T, precision=exact)
+
+
+def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"]) -> Float[Array, "*n"]:
+    """Differentiable mean SSIM of images with a data range of 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
+    mean_a, mean_b = _blur(a), _blur(b)
+    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
+    covariance = _blur(a * b) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
+    structure = (2 * covariance + _C2) / (var_a + var_b + _C2)
+    return jnp.mean(luminance * structure, axis=(-2, -1))
+
+
+def image_loss(
+    predicted: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], ssim_weight: float = 0.2
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean loss over the images, and their mean SSIM."""
+    l1 = jnp.mean(jnp.abs(predicted - truth))
+    similarity = jnp.mean(ssim(predicted, truth))
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity), similarity

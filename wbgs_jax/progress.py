@@ -1,0 +1,48 @@
+"""What a person sees while a field trains: a live bar on a terminal, a plain line now and then in a log."""
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LOG_INTERVAL = 20.0
+"""Seconds between two lines when the output is no terminal."""
+
+
+class TrainingProgress:
+    """Shows loss, SSIM, living Gaussians, steps a second and time left, on stderr."""
+
+    def __init__(self, total: int, done: int = 0):
+        self.total, self.done, self.start_step = total, done, done
+        self.held_out = ""
+        self.started = self.last_line = time.monotonic()
+        self.console = Console(file=sys.stderr)
+        self.bar = Progress(
+            SpinnerColumn(), TextColumn("{task.completed}/{task.total}"), BarColumn(bar_width=24),
+            TextColumn("{task.fields[status]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
+            console=self.console, disable=not self.console.is_terminal,
+        )  # fmt: skip
+        self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
+
+    def __enter__(self) -> "TrainingProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.bar.stop()
+
+    def update(
+        self, step: int, loss: float, batch_ssim: float, gaussians: int, seconds: float, held_out_ssim: float | None = None
+    ) -> None:
+        """Show the state after a block of steps."""
+        if held_out_ssim is not None:
+            self.held_out = f"  held-out SSIM {held_out_ssim:.3f}"
+        elapsed = max(time.monotonic() - self.started, 1e-9)
+        rate = (step - self.start_step) / elapsed
+        status = f"loss {loss:.4f}  SSIM {batch_ssim:.3f}{self.held_out}  {gaussians} Gaussians  {rate:.1f} steps/s"
+        self.bar.update(self.task, completed=step, status=status)
+        if not self.console.is_terminal and (time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total):
+            self.last_line = time.monotonic()
+            left = (self.total - step) / max(rate, 1e-9)
+            print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)

@@ -1,0 +1,115 @@
+"""3D Gaussians -> 2D Gaussians ("splats") on the PAS, by the EWA linearisation (Zwicker et al. 2001; paper, section 4.3).
+
+The map is (x, y, z) -> (azimuth, zenith) -> pixel in the receiver's local frame, its Jacobian taken at the centre. Three
+choices keep the image well defined everywhere:
+
+* azimuth is periodic; a splat's footprint is measured to the nearest alias of its centre;
+* the azimuth standard deviation is capped so that a footprint never meets its own alias (near the poles it would grow without bound);
+* a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from wbgs_jax.geometry import (
+    AZIMUTH_PERIOD,
+    Projection,
+    angles_to_pixel,
+    covariance_factor,
+    direction_to_angles,
+    pixels_per_radian,
+    to_local,
+)
+from wbgs_jax.types import Gaussians, Receiver
+
+SUPPORT = 3.0
+"""Footprints end at this many standard deviations: part of the image's definition, not of the tiling."""
+LOW_PASS = 0.3
+"""Pixels squared."""
+MAX_AZIMUTH_SIGMA = (AZIMUTH_PERIOD / 2 - 12) / SUPPORT
+"""Pixels. The 12 leave room for one tile, so that wrapping to a tile's centre equals wrapping to a pixel."""
+MIN_RANGE = 1e-3
+"""Metres. Distances to the receiver and to its zenith axis are bounded from below by this, for finite Jacobians."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Splats:
+    """N projected Gaussians."""
+
+    means2d: Float[Array, "n 2"]
+    """Pixel coordinates (x: column in 0..359, y: row; y > 89 lies below the horizon)."""
+    conics: Float[Array, "n 3"]
+    """Inverse 2D covariance (xx, xy, yy), 1 / px^2. A dead Gaussian has zeros."""
+    depths: Float[Array, "n"]
+    """Distance to the receiver, metres; infinite for a dead Gaussian."""
+    radii: Float[Array, "n 2"]
+    """Half extents (x, y) of the footprint's bounding box, pixels, without gradient; negative for a dead Gaussian."""
+
+
+def jacobian(local: Float[Array, "n 3"], projection: Projection) -> Float[Array, "n 2 3"]:
+    """Derivative of pixel coordinates with respect to the local position (pixels per metre)."""
+    x, y, z = jnp.moveaxis(local, -1, 0)
+    sx, sy = pixels_per_radian(projection)
+    rho2 = jnp.maximum(x * x + y * y, MIN_RANGE**2)
+    rho, r2 = jnp.sqrt(rho2), rho2 + z * z
+    azimuth = jnp.stack([-y / rho2, x / rho2, jnp.zeros_like(x)], -1)
+    zenith = jnp.stack([x * z / (r2 * rho), y * z / (r2 * rho), -rho / r2], -1)
+    return jnp.stack([azimuth * sx, zenith * sy], -2)
+
+
+def project(
+    gaussians: Gaussians,
+    receiver: Receiver,
+    projection: Projection = "hemisphere",
+    means2d_offset: Float[Array, "n 2"] | None = None,
+) -> Splats:
+    """Project Gaussians onto the PAS of a receiver.
+
+    `means2d_offset` (pixels, normally zeros) is added to the centres: its gradient is the positional gradient that density
+    control needs (DESIGN: a probe, not a side effect).
+    """
+    local = to_local(gaussians.means - receiver.position, receiver.orientation)
+    # Dead entries are moved to a harmless place so that neither values nor gradients of theirs can be NaN.
+    alive = gaussians.alive[:, None] > 0
+    local = jnp.where(alive, local, jnp.ones_like(local))
+    factor = covariance_factor(jnp.where(alive, gaussians.log_scales, 0), jnp.where(alive, gaussians.quats, 1))
+    factor = to_local_matrix(factor, receiver.orientation)
+    means2d = angles_to_pixel(*direction_to_angles(_off_axis(local)), projection)
+    if means2d_offset is not None:
+        means2d = means2d + means2d_offset
+    spread = jnp.einsum("nij,njk->nik", jacobian(local, projection), factor)
+    xx, xy, yy = _covariance2d(spread)
+    determinant = xx * yy - xy * xy
+    conics = jnp.stack([yy, -xy, xx], -1) / determinant[:, None]
+    radii = SUPPORT * jnp.sqrt(jnp.stack([xx, yy], -1))
+    return Splats(
+        means2d=means2d,
+        conics=jnp.where(alive, conics, 0),
+        depths=jnp.where(alive[:, 0], jnp.linalg.norm(local, axis=-1), jnp.inf),
+        radii=jax.lax.stop_gradient(jnp.where(alive, radii, -1)),
+    )
+
+
+def to_local_matrix(factor: Float[Array, "n 3 3"], orientation: Float[Array, "4"]) -> Float[Array, "n 3 3"]:
+    """Rotate the columns of world-frame matrices into the local frame."""
+    return jnp.swapaxes(to_local(jnp.swapaxes(factor, -1, -2), orientation), -1, -2)
+
+
+def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Keep centres off the zenith axis, where the azimuth's derivative does not exist."""
+    near = jnp.hypot(local[:, 0], local[:, 1]) < MIN_RANGE
+    return jnp.where(near[:, None], jax.lax.stop_gradient(local) + jnp.array([MIN_RANGE, 0, 0], local.dtype), local)
+
+
+def _covariance2d(spread: Float[Array, "n 2 3"]) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """Low-passed 2D covariance (xx, xy, yy) with the azimuth spread capped; the cap shrinks the x axis as a whole."""
+    xx = jnp.sum(spread[:, 0] ** 2, -1)
+    yy = jnp.sum(spread[:, 1] ** 2, -1) + LOW_PASS
+    xy = jnp.sum(spread[:, 0] * spread[:, 1], -1)
+    limit = MAX_AZIMUTH_SIGMA**2 - LOW_PASS
+    shrink = jnp.sqrt(jnp.minimum(1, limit / jnp.maximum(xx, limit / 2)))
+    return xx * shrink**2 + LOW_PASS, xy * shrink, yy

@@ -1,0 +1,66 @@
+"""Gaussians -> PAS: composes project.py, tiles.py and composite.py.
+
+The receiver is fixed, so everything geometric (projection, depth order, tile lists) is built once as a `GeometryPlan` and
+shared by any number of queries, which differ only in attenuation and signal.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from wbgs_jax.geometry import Projection
+from wbgs_jax.splat.composite import composite
+from wbgs_jax.splat.project import Splats, project
+from wbgs_jax.splat.tiles import Capacity, TileJobs, build_tile_jobs, fit_capacity
+from wbgs_jax.types import Gaussians, Receiver
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class GeometryPlan:
+    """What a fixed receiver sees of the Gaussians, independent of transmitter and frequency."""
+
+    splats: Splats
+    jobs: TileJobs
+
+
+def geometry_plan(
+    gaussians: Gaussians,
+    receiver: Receiver,
+    capacity: Capacity | None = None,
+    projection: Projection = "hemisphere",
+    means2d_offset: Float[Array, "n 2"] | None = None,
+) -> GeometryPlan:
+    """Project and sort the Gaussians.
+
+    Without `capacity` the tile lists are sized on the host (not under jit). With it the call is pure and jittable, and the
+    caller must look at `plan.jobs.overflow`.
+    """
+    splats = project(gaussians, receiver, projection, means2d_offset)
+    if capacity is None:
+        capacity = measure_capacity(splats)
+    return GeometryPlan(splats, build_tile_jobs(splats, capacity))
+
+
+def measure_capacity(splats: Splats, slack: float = 1.25) -> Capacity:
+    """The capacity that splats need, found on the host by building the lists until they fit."""
+    if isinstance(splats.depths, jax.core.Tracer):
+        raise ValueError("the tile lists cannot be sized under jit: pass capacity=..., found outside with measure_capacity")
+    capacity = fit_capacity(0, 0)
+    while True:
+        jobs = jax.jit(build_tile_jobs, static_argnums=1)(splats, capacity)
+        fitted = fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), slack)
+        if not jobs.overflow:
+            return fitted
+        capacity = Capacity(max(capacity.entries, fitted.entries), max(capacity.jobs, fitted.jobs))
+
+
+def render_splats(plan: GeometryPlan, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:
+    """Blend the plan's Gaussians for B queries: attenuation (delta, [0, 1)) and signal (Sig) per Gaussian and query.
+
+    An overflowed plan renders NaN, never a wrong image.
+    """
+    image = composite(plan.splats.means2d, plan.splats.conics, attenuation, signal, plan.jobs)
+    return jnp.where(plan.jobs.overflow, jnp.nan, image)

@@ -1,0 +1,246 @@
+"""The host loop: jitted epochs, density control between them, checkpoints, curves, resume.
+
+A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step.
+"""
+
+import contextlib
+import dataclasses
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from wbgs_jax import checkpoint, density, metrics
+from wbgs_jax.config import Settings
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.surface import make_surface
+from wbgs_jax.errors import UserError
+from wbgs_jax.fields import Field, get_field
+from wbgs_jax.inference import predict_spectra
+from wbgs_jax.optim import make_optimizer
+from wbgs_jax.progress import TrainingProgress
+from wbgs_jax.splat import Capacity, fit_capacity, measure_capacity
+from wbgs_jax.train_step import EpochReport, TrainState, init_state, make_epoch, training_data
+
+TILE_SLACK = 1.4
+"""Room in the tile lists for footprints that grow during training."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """What a training run leaves."""
+
+    params: Any
+    steps: int
+    seconds: float
+    """Wall-clock training time, summed over resumed parts."""
+    gaussians: int
+    """Alive at the end."""
+    compilations: int
+    """Epoch functions compiled in this process."""
+
+
+class Interrupted(UserError):
+    """Ctrl-C: the state is saved, the message says how to go on."""
+
+
+class Run:
+    """One training run in a folder; everything that changes hangs here, everything pure is in train_step.py."""
+
+    def __init__(self, dataset: Dataset, field_name: str, settings: Settings, seed: int, folder: Path):
+        self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
+        self.field: Field = get_field(field_name)
+        self.data = training_data(dataset)
+        self.optimizer = make_optimizer(settings.optim)
+        self.checkpoints = folder / "checkpoints"
+        self.seconds = 0.0
+        self.compilations = 0
+        self.state, self.capacity = self._start()
+        self._build()
+        rng = np.random.default_rng([seed, 1])
+        count = min(settings.loop.evaluate_spectra, len(dataset.test))
+        self.watched = np.sort(rng.choice(dataset.test, count, replace=False))
+
+    def _start(self) -> tuple[TrainState, Capacity]:
+        config = getattr(self.settings, "wideband")
+        surface = make_surface(self.dataset, config.gaussians, self.seed)
+        capacity = density.capacity_bucket(len(surface.points))
+        surface = jax.tree.map(jnp.asarray, surface)
+        params = self.field.init(jax.random.key(self.seed), surface, config, capacity)
+        plan = self.field.plan(params, self.dataset.receiver)
+        return init_state(params, self.optimizer), measure_capacity(plan.geometry.splats, TILE_SLACK)
+
+    def _build(self) -> None:
+        """(Re)make the jitted epoch for the present tile capacity."""
+        self.run_epoch = make_epoch(self.field, self.optimizer, self.capacity, self.settings.optim.ssim_weight)
+        self.compilations += 1
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return int(self.state.step)
+
+    @property
+    def alive(self) -> int:
+        """Living Gaussians."""
+        return int(np.asarray(self.state.params.gaussians.alive).sum())
+
+    def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
+        """The batches of an epoch: a function of seed and epoch alone, so that a resumed run sees the same ones."""
+        rng = np.random.default_rng([self.seed, 2, epoch])
+        batch = min(self.settings.optim.batch, len(self.dataset.train))
+        return np.stack([rng.choice(self.dataset.train, batch, replace=False) for _ in range(steps)]).astype(np.int32)
+
+    def epoch(self) -> tuple[float, float]:
+        """Run one block of steps; returns mean loss and SSIM. Overflowed steps are repeated with a larger capacity."""
+        begin = time.perf_counter()
+        length = self.settings.loop.epoch_steps
+        batches = self.batches(self.step // length, length)
+        done, losses, ssims = 0, [], []
+        while done < length:
+            self.state, report = self.run_epoch(self.state, self.data, jnp.asarray(batches), jnp.asarray(done, jnp.int32))
+            ran = slice(done, done + int(report.good_steps))
+            losses += np.asarray(report.loss)[ran].tolist()
+            ssims += np.asarray(report.ssim)[ran].tolist()
+            done = ran.stop
+            if report.stopped:
+                self._recover(report, batches[done])
+        self.seconds += time.perf_counter() - begin
+        return float(np.mean(losses)), float(np.mean(ssims))
+
+    def _recover(self, report: EpochReport, batch: Int[np.ndarray, "b"]) -> None:
+        """Grow the tile lists after an overflow; anything else that stopped an epoch is a loss that is not finite."""
+        if report.overflow:
+            entries, jobs = (int(n) for n in report.required)
+            self.capacity = fit_capacity(entries, jobs, TILE_SLACK)
+            self._build()
+            return
+        saved = checkpoint.checkpoint_steps(self.checkpoints)
+        last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
+        raise UserError(
+            f"the loss of step {self.step} is not finite (spectra {batch.tolist()}); {last}. "
+            "Check these spectra, or start again with smaller learning rates"
+        )
+
+    def control(self) -> None:
+        """Density control where the schedule asks for it."""
+        config, step = self.settings.density, self.step
+        if not config.every or step < config.start or step > config.stop_fraction * self.settings.optim.steps:
+            return
+        if step % config.every == 0:
+            before = self.state.params.gaussians.means.shape
+            rng = np.random.default_rng([self.seed, 3, step])
+            self.state, report = density.control_density(self.state, config, rng)
+            self.log({"step": step, "density": dataclasses.asdict(report)})
+            if self.state.params.gaussians.means.shape != before:
+                self.compilations += 1
+        if config.reset_every and step % config.reset_every == 0:
+            self.state = density.reset_attenuation(self.state, config)
+
+    def evaluate(self) -> float:
+        """Median SSIM (skimage) on the watched held-out spectra."""
+        predicted = predict_spectra(self.field, self.state.params, self.dataset, self.watched)
+        return float(np.median(metrics.ssim(predicted, np.asarray(self.dataset.pas(self.watched)))))
+
+    def log(self, entry: dict[str, Any]) -> None:
+        """Append a line to metrics.jsonl."""
+        with (self.folder / "metrics.jsonl").open("a") as stream:
+            stream.write(json.dumps(entry) + "\n")
+
+    def save(self) -> None:
+        """Write a checkpoint of the present step."""
+        metadata = {
+            "gaussian_capacity": self.state.params.gaussians.means.shape[0],
+            "tile_capacity": dataclasses.asdict(self.capacity),
+            "seconds": self.seconds,
+        }
+        checkpoint.save(self.checkpoints, self.step, self.state, metadata, self.settings.loop.keep_checkpoints)
+
+    def restore(self) -> bool:
+        """Load the newest checkpoint, if there is one."""
+        steps = checkpoint.checkpoint_steps(self.checkpoints)
+        if not steps:
+            return False
+        metadata = checkpoint.load_metadata(self.checkpoints, steps[-1])
+        capacity = int(metadata["gaussian_capacity"])
+        like = jax.eval_shape(lambda state: _with_gaussian_capacity(state, capacity), self.state)
+        self.state = checkpoint.load(self.checkpoints, steps[-1], like)
+        self.capacity, self.seconds = Capacity(**metadata["tile_capacity"]), float(metadata["seconds"])
+        self._build()
+        _forget_later_metrics(self.folder / "metrics.jsonl", steps[-1])
+        return True
+
+
+def _with_gaussian_capacity(state: TrainState, capacity: int) -> TrainState:
+    """The state's structure with another number of Gaussians."""
+
+    def resize(path, leaf):
+        names = [str(getattr(entry, "name", "")) for entry in path]
+        per_gaussian = ("gaussians" in names or "density" in names) and leaf.ndim > 0
+        return jnp.zeros((capacity, *leaf.shape[1:]), leaf.dtype) if per_gaussian else leaf
+
+    return jax.tree_util.tree_map_with_path(resize, state)
+
+
+def _forget_later_metrics(path: Path, step: int) -> None:
+    """Drop curve entries after the checkpoint a run resumes from: those steps are done again."""
+    if path.exists():
+        kept = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
+        path.write_text("".join(line + "\n" for line in kept))
+
+
+@contextlib.contextmanager
+def _deferred_interrupt() -> Iterator[dict[str, bool]]:
+    """Turn the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once."""
+    flag = {"set": False}
+
+    def handler(signum, frame):
+        if flag["set"]:
+            raise KeyboardInterrupt
+        flag["set"] = True
+
+    previous = {s: signal.signal(s, handler) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield flag
+    finally:
+        for s, old in previous.items():
+            signal.signal(s, old)
+
+
+def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:
+    """Train a field and leave checkpoints and curves in `folder`.
+
+    Raises:
+        UserError: a loss that is not finite (step, batch and last good checkpoint named), an unwritable folder.
+        Interrupted: Ctrl-C; the state is saved.
+    """
+    run = Run(dataset, field_name, settings, seed, folder)
+    if resume:
+        run.restore()
+    loop, total = settings.loop, settings.optim.steps
+    with _deferred_interrupt() as interrupt, TrainingProgress(total, run.step) as progress:
+        while run.step < total:
+            before = run.step
+            loss, ssim = run.epoch()
+            run.control()
+            entry: dict[str, Any] = {"step": run.step, "loss": loss, "batch_ssim": ssim, "gaussians": run.alive, "seconds": run.seconds}
+            if _crosses(before, run.step, loop.evaluate_every) or run.step == total:
+                entry["held_out_ssim"] = run.evaluate()
+            run.log(entry)
+            progress.update(**entry)
+            if _crosses(before, run.step, loop.checkpoint_every) or run.step == total or interrupt["set"]:
+                run.save()
+            if interrupt["set"] and run.step < total:
+                raise Interrupted(f"stopped at step {run.step} of {total}; the state is saved: run the same command with --resume to go on")
+    return TrainResult(run.state.params, run.step, run.seconds, run.alive, run.compilations)
+
+
+def _crosses(before: int, after: int, interval: int) -> bool:
+    return before // interval != after // interval
