@@ -47,7 +47,9 @@ def pas_directions() -> Float[np.ndarray, "90 360 3"]:
     return _pas_directions()
 
 
-def steering_vector(element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]) -> Complex[Array, "*n elements"]:
+def steering_vector(
+    element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]
+) -> Complex[Array, "*n elements"]:
     """Element phases exp(+j 2 pi p.k) of plane waves from unit vectors `directions`; positions in wavelengths."""
     return jnp.exp(2j * jnp.pi * (directions @ element_positions.T))
 

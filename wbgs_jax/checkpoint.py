@@ -6,7 +6,6 @@ renames it, so a checkpoint is whole or absent.
 
 import contextlib
 import logging
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,12 @@ def save(folder: Path, step: int, state: Any, metadata: dict[str, Any], keep: in
     target = (folder / str(step)).absolute()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        ocp.save_pytree(target, _flatten(state), custom_metadata=metadata, overwrite=True)
+        host = {key: np.asarray(leaf) for key, leaf in _flatten(state).items()}  # loads on any device
+        ocp.save_pytree(target, host, custom_metadata=metadata, overwrite=True)
     except OSError as error:
-        raise UserError(f"cannot write checkpoint {target}: {error.strerror or error}; free some space or choose another OUT") from error
+        raise UserError(
+            f"cannot write checkpoint {target}: {error.strerror or error}; free some space or choose another OUT"
+        ) from error
     for old in checkpoint_steps(folder)[:-keep]:
         shutil.rmtree(folder / str(old))
 
@@ -69,7 +71,9 @@ def _explained(path: Path):
     try:
         yield
     except Exception as error:
-        if isinstance(error, UserError) or os.environ.get("WBGS_DEBUG"):
+        if isinstance(error, UserError):
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(f"checkpoint {path} is damaged or incomplete ({reason}); delete that folder to use an older one") from error
+        raise UserError(
+            f"checkpoint {path} is damaged or incomplete ({reason}); delete that folder to use an older one"
+        ) from error

@@ -167,7 +167,9 @@ def check(settings: Settings) -> None:
         if value < 1:
             raise UserError(f"--{name} is {value}; it must be at least 1")
     if 0 < settings.wideband.gaussians < 4 or settings.wideband.gaussians < 0:
-        raise UserError(f"--wideband.gaussians is {settings.wideband.gaussians}; give at least 4, or 0 for the size of the mesh")
+        raise UserError(
+            f"--wideband.gaussians is {settings.wideband.gaussians}; give at least 4, or 0 for the size of the mesh"
+        )
     if settings.optim.steps % settings.loop.epoch_steps:
         raise UserError(
             f"--optim.steps {settings.optim.steps} is not a multiple of --loop.epoch-steps {settings.loop.epoch_steps}; change one of them"

@@ -57,7 +57,9 @@ def control_density(state: TrainState, config: DensityConfig, rng: np.random.Gen
     params = dataclasses.replace(state.params, gaussians=edited)
     moments = _carry_moments(state.optimizer, source, fresh)
     alive = int(keep.sum() + clone.sum() + split.sum() * 2)
-    report = DensityReport(int(clone.sum()), int(split.sum()), int((gaussians.alive > 0).sum() - keep.sum() - split.sum()), alive)
+    report = DensityReport(
+        int(clone.sum()), int(split.sum()), int((gaussians.alive > 0).sum() - keep.sum() - split.sum()), alive
+    )
     return TrainState(params, moments, empty_density_stats(capacity), state.step), report
 
 
@@ -127,4 +129,3 @@ def _carry_moments(optimizer: Any, source: Int[np.ndarray, "m"], fresh: Bool[np.
         return jnp.where(mask, 0, leaf[source])
 
     return jax.tree_util.tree_map_with_path(carry, optimizer)
-

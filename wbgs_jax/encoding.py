@@ -16,7 +16,7 @@ def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "
     """(x, sin(2^k x), cos(2^k x), k = 0..octaves-1), the input included: d_out = d (1 + 2 octaves)  (NeRF, equation 4)."""
     scaled = x[..., None, :] * (2.0 ** jnp.arange(octaves, dtype=x.dtype))[:, None]
     waves = jnp.concatenate([jnp.sin(scaled), jnp.cos(scaled)], -2)
-    return jnp.concatenate([x, waves.reshape(x.shape[:-1] + (-1,))], -1)
+    return jnp.concatenate([x, waves.reshape((*x.shape[:-1], -1))], -1)
 
 
 def scale_frequency(frequency_hz: Float[Array, "*n"], scale: FrequencyScale = "log") -> Float[Array, "*n"]:

@@ -60,7 +60,9 @@ def pixels_per_radian(projection: Projection) -> tuple[float, float]:
     return AZIMUTH_PERIOD / (2 * jnp.pi), (PAS_HEIGHT - 1) / _ZENITH_SPAN[projection]
 
 
-def angles_to_pixel(azimuth: Float[Array, "*n"], zenith: Float[Array, "*n"], projection: Projection = "hemisphere") -> Float[Array, "*n 2"]:
+def angles_to_pixel(
+    azimuth: Float[Array, "*n"], zenith: Float[Array, "*n"], projection: Projection = "hemisphere"
+) -> Float[Array, "*n 2"]:
     """Continuous pixel coordinates (x: column, y: row); see the paper, section 4.3, with its p_x = (phi + pi) / (2 pi) W."""
     sx, sy = pixels_per_radian(projection)
     return jnp.stack([(azimuth + jnp.pi) * sx, zenith * sy], -1)

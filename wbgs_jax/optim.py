@@ -34,4 +34,6 @@ def make_optimizer(config: OptimConfig) -> optax.GradientTransformation:
     groups: dict[str, optax.GradientTransformation] = {name: optax.adam(decay(rate), eps=1e-15) for name, rate in rates.items()}
     groups["networks"] = optax.adamw(decay(config.network_lr), weight_decay=config.network_weight_decay)
     groups[FROZEN] = optax.set_to_zero()
-    return optax.multi_transform(groups, lambda params: jax.tree_util.tree_map_with_path(lambda path, _: parameter_group(path), params))
+    return optax.multi_transform(
+        groups, lambda params: jax.tree_util.tree_map_with_path(lambda path, _: parameter_group(path), params)
+    )

@@ -1,6 +1,6 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
-    config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
+config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
 """
 
 import dataclasses
@@ -77,7 +77,9 @@ def difference(a: RunConfig, b: RunConfig) -> str:
 
     def flat(value: Any, name: str = "") -> dict[str, Any]:
         if dataclasses.is_dataclass(value):
-            return {k: v for f in dataclasses.fields(value) for k, v in flat(getattr(value, f.name), f"{name}.{f.name}").items()}
+            return {
+                k: v for f in dataclasses.fields(value) for k, v in flat(getattr(value, f.name), f"{name}.{f.name}").items()
+            }
         return {name.lstrip("."): value}
 
     left, right = flat(a), flat(b)

@@ -54,7 +54,9 @@ def parse(arguments: list[str]) -> Command:
             preset = argument.split("=", 1)[1] if "=" in argument else "".join(arguments[i + 1 : i + 2])
     if preset not in PRESETS:
         raise UserError(f"unknown preset {preset!r}; choose one of: {', '.join(PRESETS)}")
-    return tyro.cli(Command, default=Command(preset=preset, settings=PRESETS[preset]), args=arguments, prog="python -m wbgs_jax.train")
+    return tyro.cli(
+        Command, default=Command(preset=preset, settings=PRESETS[preset]), args=arguments, prog="python -m wbgs_jax.train"
+    )
 
 
 def run_config(command: Command) -> RunConfig:
@@ -95,16 +97,16 @@ def main() -> None:
     dataset = config.dataset()
     folder = command.out or default_folder(dataset, config)
     prepare_folder(folder, config, command.resume)
-    say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {len(dataset.train)} spectra, {len(dataset.test)} held out")
+    say(
+        f"training {config.field} ({config.preset} preset) on {dataset.name}: {len(dataset.train)} spectra, {len(dataset.test)} held out"
+    )
     result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
     say(summary(result, folder))
 
 
 def summary(result: TrainResult, folder: Path) -> str:
     """One line at the end."""
-    return (
-        f"trained {result.steps} steps in {result.seconds:.0f} s, {result.gaussians} Gaussians, {result.compilations} compilations: {folder}"
-    )
+    return f"trained {result.steps} steps in {result.seconds:.0f} s, {result.gaussians} Gaussians, {result.compilations} compilations: {folder}"
 
 
 def say(line: str) -> None:

@@ -6,7 +6,6 @@ and the host decides (larger capacity and repeat, or stop with a message).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,12 +19,12 @@ from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH, cbf, normalise, pas_directions
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field
 from wbgs_jax.losses import image_loss
+from wbgs_jax.pytree import pytree
 from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class DensityStats:
     """What density control needs to know about every Gaussian, summed since the last control."""
 
@@ -37,8 +36,7 @@ class DensityStats:
     """Steps in which the Gaussian touched the image."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class TrainState:
     """Everything that changes during training."""
 
@@ -48,8 +46,7 @@ class TrainState:
     step: Int[Array, ""]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class TrainingData:
     """All spectra on the device, as 16 complex numbers or 8-bit pixels each; images are made in the step."""
 
@@ -67,8 +64,7 @@ class TrainingData:
         return normalise(cbf(self.snapshots[index], self.steering))
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class EpochReport:
     """What an epoch of K steps tells the host."""
 
@@ -113,7 +109,9 @@ def init_state(params: Any, optimizer: optax.GradientTransformation) -> TrainSta
     return TrainState(params, optimizer.init(params), density, jnp.zeros((), jnp.int32))
 
 
-def loss_and_gradients(field: Field, params: Any, data: TrainingData, index: Int[Array, "b"], capacity: Capacity, ssim_weight: float):
+def loss_and_gradients(
+    field: Field, params: Any, data: TrainingData, index: Int[Array, "b"], capacity: Capacity, ssim_weight: float
+):
     """((loss, (ssim, jobs)), (d params, d means2d)) of one batch."""
     probe = jnp.zeros((params.gaussians.means.shape[0], 2))
 
@@ -143,7 +141,9 @@ def make_epoch(field: Field, optimizer: optax.GradientTransformation, capacity: 
         index, position = batch
 
         def run(state: TrainState):
-            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(field, state.params, data, index, capacity, ssim_weight)
+            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(
+                field, state.params, data, index, capacity, ssim_weight
+            )
             ok = jnp.isfinite(loss) & ~jobs.overflow
             updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
             density = _add_density(state.density, gradients.gaussians.means, probe)

@@ -69,7 +69,7 @@ class Run:
         self.watched = np.sort(rng.choice(dataset.test, count, replace=False))
 
     def _start(self) -> tuple[TrainState, Capacity]:
-        config = getattr(self.settings, "wideband")
+        config = self.settings.wideband
         surface = make_surface(self.dataset, config.gaussians, self.seed)
         capacity = density.capacity_bucket(len(surface.points))
         surface = jax.tree.map(jnp.asarray, surface)
@@ -230,7 +230,13 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
             before = run.step
             loss, ssim = run.epoch()
             run.control()
-            entry: dict[str, Any] = {"step": run.step, "loss": loss, "batch_ssim": ssim, "gaussians": run.alive, "seconds": run.seconds}
+            entry: dict[str, Any] = {
+                "step": run.step,
+                "loss": loss,
+                "batch_ssim": ssim,
+                "gaussians": run.alive,
+                "seconds": run.seconds,
+            }
             if _crosses(before, run.step, loop.evaluate_every) or run.step == total:
                 entry["held_out_ssim"] = run.evaluate()
             run.log(entry)
@@ -238,7 +244,9 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
             if _crosses(before, run.step, loop.checkpoint_every) or run.step == total or interrupt["set"]:
                 run.save()
             if interrupt["set"] and run.step < total:
-                raise Interrupted(f"stopped at step {run.step} of {total}; the state is saved: run the same command with --resume to go on")
+                raise Interrupted(
+                    f"stopped at step {run.step} of {total}; the state is saved: run the same command with --resume to go on"
+                )
     return TrainResult(run.state.params, run.step, run.seconds, run.alive, run.compilations)
 
 

@@ -1,18 +1,16 @@
 """Pytrees that cross module borders."""
 
-from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from wbgs_jax.array import planar_array
+from wbgs_jax.pytree import pytree
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Gaussians:
     """Stored (unconstrained) parameters of N 3D Gaussians in the world frame; `alive` masks the padding of the capacity."""
 
@@ -29,8 +27,7 @@ class Gaussians:
     that `jax.grad` works on the whole pytree; its gradient is zero."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Receiver:
     """A fixed receiver array."""
 
@@ -42,8 +39,7 @@ class Receiver:
     """Local frame, wavelengths."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Query:
     """What is asked of a field: a batch of transmitter positions and frequencies."""
 
@@ -52,8 +48,7 @@ class Query:
     frequency_hz: Float[Array, "*b"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Surface:
     """Points on the scene's surfaces, where Gaussians start."""
 

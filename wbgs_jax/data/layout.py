@@ -86,7 +86,7 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
 def export_layout(scene: SceneFile, folder: Path | str) -> None:
     """Write a scene as a folder of the published layout; the folder appears whole or not at all.
 
-    Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and antenna array are not kept.
+    Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and array are not kept.
 
     Raises:
         UserError: `folder` exists and is not empty, or cannot be written; or the scene lacks training or test spectra, for

@@ -25,7 +25,11 @@ class Field(Protocol):
     def init(self, key: Key[Array, ""], surface: Surface, config: Any, capacity: int | None = None) -> Any: ...
 
     def plan(
-        self, params: Any, receiver: Receiver, capacity: Capacity | None = None, means2d_offset: Float[Array, "n 2"] | None = None
+        self,
+        params: Any,
+        receiver: Receiver,
+        capacity: Capacity | None = None,
+        means2d_offset: Float[Array, "n 2"] | None = None,
     ) -> Any: ...
 
     def render(self, params: Any, plan: Any, query: Query) -> Float[Array, "b 90 360"]: ...

@@ -6,7 +6,6 @@
 The geometry does not depend on the query: it is planned once and shared by a batch.
 """
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -18,6 +17,7 @@ from wbgs_jax.config import WidebandConfig
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
 from wbgs_jax.geometry import to_local
 from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, attenuation_activation, signal_activation
+from wbgs_jax.pytree import pytree, static
 from wbgs_jax.splat import Capacity, GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.types import Gaussians, Query, Receiver, Surface
 
@@ -25,8 +25,7 @@ MAX_ATTENUATION = 0.99
 INITIAL_ATTENUATION = 0.3
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Frame:
     """Maps world positions to network inputs of about unit size. Set once from the surface, never trained."""
 
@@ -34,19 +33,17 @@ class Frame:
     half_extent: Float[Array, ""]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class WidebandParams:
     """All parameters of the field; `config` is static."""
 
     gaussians: Gaussians
     networks: dict[str, Any]
     frame: Frame
-    config: WidebandConfig = field(metadata={"static": True})
+    config: WidebandConfig = static()
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class WidebandPlan:
     """What is independent of the query."""
 
@@ -139,7 +136,9 @@ def _unit(v):
     return v / jnp.maximum(jnp.linalg.norm(v, axis=-1, keepdims=True), 1e-3)
 
 
-def _relative_features(means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]) -> Float[Array, "n b 5"]:
+def _relative_features(
+    means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]
+) -> Float[Array, "n b 5"]:
     """Functions of (P(G), P(TX)) that spare the network learning trigonometry."""
     to_g = _unit(to_local(means - receiver.position, receiver.orientation))
     tx = query.tx_position - receiver.position

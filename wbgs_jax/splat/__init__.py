@@ -8,4 +8,14 @@ from wbgs_jax.splat.reference import render_dense
 from wbgs_jax.splat.render import GeometryPlan, geometry_plan, measure_capacity, render_splats
 from wbgs_jax.splat.tiles import Capacity, fit_capacity
 
-__all__ = ["Capacity", "GeometryPlan", "Splats", "fit_capacity", "geometry_plan", "measure_capacity", "project", "render_dense", "render_splats"]
+__all__ = [
+    "Capacity",
+    "GeometryPlan",
+    "Splats",
+    "fit_capacity",
+    "geometry_plan",
+    "measure_capacity",
+    "project",
+    "render_dense",
+    "render_splats",
+]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.geometry import AZIMUTH_PERIOD
@@ -28,7 +28,9 @@ def _group_size(jobs: int) -> int:
 
 def _tile_offsets(dtype) -> tuple[Float[Array, "pixels"], Float[Array, "pixels"], Float[Array, "pixels 6"]]:
     """Pixel offsets (x, y) from a tile's centre, and the monomials 1, x, y, x^2, xy, y^2 of them."""
-    y, x = np.meshgrid(np.arange(TILE_HEIGHT) - (TILE_HEIGHT - 1) / 2, np.arange(TILE_WIDTH) - (TILE_WIDTH - 1) / 2, indexing="ij")
+    y, x = np.meshgrid(
+        np.arange(TILE_HEIGHT) - (TILE_HEIGHT - 1) / 2, np.arange(TILE_WIDTH) - (TILE_WIDTH - 1) / 2, indexing="ij"
+    )
     x, y = x.ravel(), y.ravel()
     monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
     return jnp.asarray(x, dtype), jnp.asarray(y, dtype), jnp.asarray(monomials, dtype)
@@ -47,11 +49,11 @@ def _gather(means2d, conics, attenuation, signal, jobs: TileJobs):
     return geometry, jnp.where(live, attenuation[index], 0), signal[index]
 
 
-def _grouped(values: Float[Array, "jobs ..."], group: int) -> Float[Array, "groups group ..."]:
-    return values.reshape((-1, group) + values.shape[1:])
+def _grouped(values: Shaped[Array, "jobs ..."], group: int) -> Shaped[Array, "groups group ..."]:
+    return values.reshape((-1, group, *values.shape[1:]))
 
 
-def _slots_first(values: Float[Array, "jobs chunk ..."], group: int) -> Float[Array, "groups chunk group ..."]:
+def _slots_first(values: Shaped[Array, "jobs chunk ..."], group: int) -> Shaped[Array, "groups chunk group ..."]:
     return jnp.moveaxis(_grouped(values, group), 2, 1)
 
 
@@ -85,7 +87,7 @@ def _blend_jobs(geometry, attenuation, signal):
 def _chain_jobs(image, transmittance, jobs: TileJobs, keep_prefix: bool):
     """Blend the jobs of every tile in order. Returns the tiles' image and, if wanted, each job's (T, I) in front of it."""
     n_jobs = image.shape[0]
-    blank = jnp.zeros((jobs.first.shape[0],) + image.shape[1:], image.dtype)
+    blank = jnp.zeros((jobs.first.shape[0], *image.shape[1:]), image.dtype)
     prefix = (jnp.ones_like(image), jnp.zeros_like(image)) if keep_prefix else None
 
     def step(level, state):
@@ -118,7 +120,11 @@ def _image_to_tiles(image: Float[Array, "b 90 360"]) -> Float[Array, "tiles b pi
 
 @jax.custom_vjp
 def composite(
-    means2d: Float[Array, "n 2"], conics: Float[Array, "n 3"], attenuation: Float[Array, "n b"], signal: Float[Array, "n b"], jobs: TileJobs
+    means2d: Float[Array, "n 2"],
+    conics: Float[Array, "n 3"],
+    attenuation: Float[Array, "n b"],
+    signal: Float[Array, "n b"],
+    jobs: TileJobs,
 ) -> Float[Array, "b 90 360"]:
     """Blend N splats for B queries. `attenuation` (delta) must lie in [0, 1); `jobs` must not have overflowed.
 
@@ -158,12 +164,18 @@ def _blend_group_bwd(geometry, attenuation, signal, cotangent, behind, transmitt
         behind = behind - signal * weight
         d_alpha = cotangent * (signal * transmittance - behind / (1 - alpha))
         d_q = jnp.sum(attenuation * d_alpha, 1) * windowed_exponential(q)
-        return (transmittance - weight, behind), (pixel_sum(d_alpha * g), pixel_sum(cotangent * weight), jnp.matmul(d_q, monomials, precision=lax.Precision.HIGHEST))
+        return (transmittance - weight, behind), (
+            pixel_sum(d_alpha * g),
+            pixel_sum(cotangent * weight),
+            jnp.matmul(d_q, monomials, precision=lax.Precision.HIGHEST),
+        )
 
     return lax.scan(step, (transmittance, behind), (geometry, attenuation, signal))[1]
 
 
-def _geometry_gradient(geometry: Float[Array, "jobs chunk 5"], moments: Float[Array, "jobs chunk 6"]) -> Float[Array, "jobs chunk 5"]:
+def _geometry_gradient(
+    geometry: Float[Array, "jobs chunk 5"], moments: Float[Array, "jobs chunk 6"]
+) -> Float[Array, "jobs chunk 5"]:
     """Gradients of (u, v, conic xx, xy, yy) from the moments of -2 dL/dq about the tile's centre."""
     u, v, a, b, c = jnp.moveaxis(geometry, -1, 0)
     m0, mx, my, mxx, mxy, myy = jnp.moveaxis(moments, -1, 0)
@@ -188,13 +200,12 @@ def _composite_bwd(residuals, cotangent):
     slots = tuple(_slots_first(a, group) for a in (geometry, job_attenuation, job_signal))
     groups = tuple(_grouped(a, group) for a in (jobs.tile, prefix_t, prefix_image))
     d_attenuation, d_signal, moments = (
-        jnp.moveaxis(a, 1, 2).reshape((n_jobs, CHUNK) + a.shape[3:]) for a in lax.map(backward, slots + groups)
+        jnp.moveaxis(a, 1, 2).reshape((n_jobs, CHUNK, *a.shape[3:])) for a in lax.map(backward, slots + groups)
     )
     per_slot = jnp.concatenate([_geometry_gradient(geometry, moments), d_attenuation, d_signal], -1).reshape(n_jobs * CHUNK, -1)
     owner = jnp.where(jobs.gaussian >= 0, jobs.gaussian, n).reshape(-1)
     total = jnp.zeros((n + 1, per_slot.shape[1]), per_slot.dtype).at[owner].add(per_slot)[:n]
-    no_gradient = jax.tree.map(lambda a: np.zeros(a.shape, jax.dtypes.float0), jobs)
-    return total[:, :2], total[:, 2:5], total[:, 5 : 5 + b], total[:, 5 + b :], no_gradient
+    return total[:, :2], total[:, 2:5], total[:, 5 : 5 + b], total[:, 5 + b :], None
 
 
 composite.defvjp(_composite_fwd, _composite_bwd)

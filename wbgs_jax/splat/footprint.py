@@ -18,7 +18,7 @@ _EDGE = math.exp(-CUT / 2)
 GAIN = 1 / (1 - _EDGE)
 
 
-def mahalanobis2(dx: Float[Array, "*n"], dy: Float[Array, "*n"], conic: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+def mahalanobis2(dx: Float[Array, "*#n"], dy: Float[Array, "*#n"], conic: Float[Array, "*#n 3"]) -> Float[Array, "*n"]:
     """q of offsets (pixels) from the centre."""
     return conic[..., 0] * dx * dx + conic[..., 2] * dy * dy + 2 * conic[..., 1] * dx * dy
 

@@ -8,8 +8,6 @@ choices keep the image well defined everywhere:
 * a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
 """
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -23,6 +21,7 @@ from wbgs_jax.geometry import (
     pixels_per_radian,
     to_local,
 )
+from wbgs_jax.pytree import pytree
 from wbgs_jax.types import Gaussians, Receiver
 
 SUPPORT = 3.0
@@ -35,8 +34,7 @@ MIN_RANGE = 1e-3
 """Metres. Distances to the receiver and to its zenith axis are bounded from below by this, for finite Jacobians."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Splats:
     """N projected Gaussians."""
 
@@ -75,15 +73,15 @@ def project(
     local = to_local(gaussians.means - receiver.position, receiver.orientation)
     # Dead entries are moved to a harmless place so that neither values nor gradients of theirs can be NaN.
     alive = gaussians.alive[:, None] > 0
-    local = jnp.where(alive, local, jnp.ones_like(local))
+    local = _off_axis(jnp.where(alive, local, jnp.ones_like(local)))
     factor = covariance_factor(jnp.where(alive, gaussians.log_scales, 0), jnp.where(alive, gaussians.quats, 1))
     factor = to_local_matrix(factor, receiver.orientation)
-    means2d = angles_to_pixel(*direction_to_angles(_off_axis(local)), projection)
+    means2d = angles_to_pixel(*direction_to_angles(local), projection)
     if means2d_offset is not None:
         means2d = means2d + means2d_offset
     spread = jnp.einsum("nij,njk->nik", jacobian(local, projection), factor)
-    xx, xy, yy = _covariance2d(spread)
-    determinant = xx * yy - xy * xy
+    spread = _cap_azimuth(spread)
+    xx, xy, yy, determinant = _covariance2d(spread)
     conics = jnp.stack([yy, -xy, xx], -1) / determinant[:, None]
     radii = SUPPORT * jnp.sqrt(jnp.stack([xx, yy], -1))
     return Splats(
@@ -105,11 +103,22 @@ def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return jnp.where(near[:, None], jax.lax.stop_gradient(local) + jnp.array([MIN_RANGE, 0, 0], local.dtype), local)
 
 
-def _covariance2d(spread: Float[Array, "n 2 3"]) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
-    """Low-passed 2D covariance (xx, xy, yy) with the azimuth spread capped; the cap shrinks the x axis as a whole."""
-    xx = jnp.sum(spread[:, 0] ** 2, -1)
-    yy = jnp.sum(spread[:, 1] ** 2, -1) + LOW_PASS
-    xy = jnp.sum(spread[:, 0] * spread[:, 1], -1)
+def _cap_azimuth(spread: Float[Array, "n 2 3"]) -> Float[Array, "n 2 3"]:
+    """Shrink the x axis where its standard deviation exceeds `MAX_AZIMUTH_SIGMA`."""
     limit = MAX_AZIMUTH_SIGMA**2 - LOW_PASS
+    xx = jnp.sum(spread[:, 0] ** 2, -1)
     shrink = jnp.sqrt(jnp.minimum(1, limit / jnp.maximum(xx, limit / 2)))
-    return xx * shrink**2 + LOW_PASS, xy * shrink, yy
+    return spread.at[:, 0].multiply(shrink[:, None])
+
+
+def _covariance2d(
+    spread: Float[Array, "n 2 3"],
+) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """Low-passed 2D covariance (xx, xy, yy) and its determinant.
+
+    xx yy - xy^2 cancels for thin splats; the cross product of the two rows (Lagrange's identity) does not.
+    """
+    x, y = spread[:, 0], spread[:, 1]
+    xx, xy, yy = jnp.sum(x * x, -1), jnp.sum(x * y, -1), jnp.sum(y * y, -1)
+    determinant = jnp.sum(jnp.cross(x, y) ** 2, -1) + LOW_PASS * (xx + yy) + LOW_PASS**2
+    return xx + LOW_PASS, xy, yy + LOW_PASS, determinant

@@ -4,21 +4,19 @@ The receiver is fixed, so everything geometric (projection, depth order, tile li
 shared by any number of queries, which differ only in attenuation and signal.
 """
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wbgs_jax.geometry import Projection
+from wbgs_jax.pytree import pytree
 from wbgs_jax.splat.composite import composite
 from wbgs_jax.splat.project import Splats, project
 from wbgs_jax.splat.tiles import Capacity, TileJobs, build_tile_jobs, fit_capacity
 from wbgs_jax.types import Gaussians, Receiver
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class GeometryPlan:
     """What a fixed receiver sees of the Gaussians, independent of transmitter and frequency."""
 
@@ -57,7 +55,9 @@ def measure_capacity(splats: Splats, slack: float = 1.25) -> Capacity:
         capacity = Capacity(max(capacity.entries, fitted.entries), max(capacity.jobs, fitted.jobs))
 
 
-def render_splats(plan: GeometryPlan, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:
+def render_splats(
+    plan: GeometryPlan, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]
+) -> Float[Array, "b 90 360"]:
     """Blend the plan's Gaussians for B queries: attenuation (delta, [0, 1)) and signal (Sig) per Gaussian and query.
 
     An overflowed plan renders NaN, never a wrong image.

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.geometry import AZIMUTH_PERIOD
+from wbgs_jax.pytree import pytree
 from wbgs_jax.splat.footprint import CUT
 from wbgs_jax.splat.project import Splats
 
@@ -34,8 +35,7 @@ class Capacity:
     """Jobs of `CHUNK` Gaussians."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class TileJobs:
     """Every tile's Gaussians, near to far, cut into jobs of `CHUNK`."""
 
@@ -82,7 +82,9 @@ def build_tile_jobs(splats: Splats, capacity: Capacity) -> TileJobs:
     return _cut_into_jobs(ranked, starts, required_entries, capacity)
 
 
-def _tile_range(low: Float[Array, "n"], high: Float[Array, "n"], size: int, tiles: int) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+def _tile_range(
+    low: Float[Array, "n"], high: Float[Array, "n"], size: int, tiles: int
+) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
     """First tile and number of tiles that hold pixels in low..high."""
     first = jnp.clip(jnp.floor(jnp.ceil(low) / size), 0, tiles)
     last = jnp.clip(jnp.floor(jnp.floor(high) / size), -1, tiles - 1)

@@ -1,0 +1,55 @@
+"""Fixtures shared by all tests: a fresh, printed random seed and the optional folder of published data."""
+
+import os
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
+
+import numpy as np
+import pytest
+
+SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # In the environment, so that the workers of pytest-xdist draw the same.
+    os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    return f"random seed: repeat this run with {SEED_VARIABLE}={os.environ[SEED_VARIABLE]}"
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.option.verbose < 0:  # pytest -q prints no header
+        terminalreporter.write_line(pytest_report_header(config))
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Random numbers that differ by run and by test, and depend on nothing but the printed seed and the test's name."""
+    return np.random.default_rng([int(os.environ[SEED_VARIABLE]), zlib.crc32(request.node.name.encode())])
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Callable[[str], Path]:
+    """Finds a folder of published data by name, or skips: that data is not ours to ship."""
+    root = Path(os.environ.get(DATA_VARIABLE) or Path(__file__).parents[2] / "shared" / "data")
+
+    def find(name: str) -> Path:
+        if not (root / name).is_dir():
+            pytest.skip(f"{name} is not in {root}; set {DATA_VARIABLE} to the folder that holds it")
+        return root / name
+
+    return find
+
+
+@pytest.fixture
+def x64():
+    """Double precision for one test."""
+    import jax
+
+    with jax.enable_x64(True):
+        yield
