@@ -65,22 +65,14 @@ def snapshot_to_pas(
     """Power angular spectra, each scaled to a maximum of 1, of complex array snapshots. A zero snapshot gives a zero PAS."""
     snapshot = jnp.asarray(snapshot)
     real = snapshot.real.dtype
-    # Phases in float64 on the host (they are constants of the array), then the snapshot's own precision.
-    steering = _pas_steering(tuple(map(tuple, np.asarray(element_positions, np.float64).tolist()))).astype(snapshot.dtype)
-    pas = cbf(snapshot, jnp.asarray(steering))
-    return normalise(pas).astype(real)
+    steering = steering_vector(jnp.asarray(element_positions, real), jnp.asarray(pas_directions(), real))
+    return normalise(cbf(snapshot, steering))
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
     """Scale every PAS to a maximum of 1; an all-zero PAS stays zero."""
     peak = jnp.max(pas, axis=(-2, -1), keepdims=True)
     return pas / jnp.where(peak > 0, peak, 1)
-
-
-@functools.lru_cache(maxsize=8)
-def _pas_steering(element_positions: tuple[tuple[float, ...], ...]) -> Complex[np.ndarray, "90 360 elements"]:
-    phase = _pas_directions() @ np.asarray(element_positions).T
-    return np.exp(2j * np.pi * phase)
 
 
 def lag_basis(element_positions: Float[np.ndarray, "elements 3"], tolerance: float = 1e-9) -> Float[np.ndarray, "pixels rank"]:

@@ -7,7 +7,7 @@ says what was measured.
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from wbgs_jax.encoding import FrequencyScale
 from wbgs_jax.errors import UserError
@@ -20,6 +20,8 @@ class WidebandConfig:
 
     gaussians: int = 2000
     """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
+    sampling: Literal["solid_angle", "area"] = "solid_angle"
+    """Spread them evenly over the receiver's directions, or over the area of the surface."""
     width: int = 64
     """Units of the attenuation network's layers (authors: 128)."""
     depth: int = 4

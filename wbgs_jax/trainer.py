@@ -70,7 +70,7 @@ class Run:
 
     def _start(self) -> tuple[TrainState, Capacity]:
         config = self.settings.wideband
-        surface = make_surface(self.dataset, config.gaussians, self.seed)
+        surface = make_surface(self.dataset, config.gaussians, self.seed, config.sampling)
         capacity = density.capacity_bucket(len(surface.points))
         surface = jax.tree.map(jnp.asarray, surface)
         params = self.field.init(jax.random.key(self.seed), surface, config, capacity)

@@ -64,3 +64,10 @@ def make_receiver(position: Any, orientation: Any = (1.0, 0.0, 0.0, 0.0), elemen
     quaternion = np.asarray(orientation, np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion)
     return Receiver(*(jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements)))
+
+
+def make_query(tx_position: Any, frequency_hz: Any) -> Query:
+    """A float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one number in hertz."""
+    position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
+    frequency = jnp.broadcast_to(jnp.asarray(frequency_hz, jnp.float32), position.shape[:1])
+    return Query(position, frequency)

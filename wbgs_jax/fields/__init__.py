@@ -9,7 +9,7 @@ A field is a module of pure functions
 Trainer, evaluation and experiments know nothing else about a model.
 """
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Key
 
@@ -19,6 +19,7 @@ from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver, Surface
 
 
+@runtime_checkable
 class Field(Protocol):
     """The seam between models and everything else."""
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from wbgs_jax.array import steering_vector
+from wbgs_jax.checks import check_query, check_receiver, check_surface
 from wbgs_jax.config import WidebandConfig
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
 from wbgs_jax.geometry import to_local
@@ -56,6 +57,7 @@ def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity
 
     `capacity` >= n pads the Gaussians so that density control has room to grow.
     """
+    check_surface(surface)
     points = surface.points
     n = points.shape[0]
     pad = (capacity or n) - n
@@ -91,11 +93,13 @@ def plan(
     means2d_offset: Float[Array, "n 2"] | None = None,
 ) -> WidebandPlan:
     """Project and sort the Gaussians once for all queries (see `splat.geometry_plan` about `capacity`)."""
+    check_receiver(receiver)
     return WidebandPlan(geometry_plan(params.gaussians, receiver, capacity, params.config.projection, means2d_offset), receiver)
 
 
 def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Array, "b 90 360"]:
     """Power angular spectra of B queries."""
+    check_query(query)
     attenuation, signal = em_features(params, plan.receiver, query)
     return render_splats(plan.geometry, attenuation, signal)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wbgs_jax.checks import check_array
 from wbgs_jax.geometry import Projection
 from wbgs_jax.pytree import pytree
 from wbgs_jax.splat.composite import composite
@@ -62,5 +63,7 @@ def render_splats(
 
     An overflowed plan renders NaN, never a wrong image.
     """
+    check_array("attenuation", attenuation, (plan.splats.depths.shape[0], "b"))
+    check_array("signal", signal, attenuation.shape)
     image = composite(plan.splats.means2d, plan.splats.conics, attenuation, signal, plan.jobs)
     return jnp.where(plan.jobs.overflow, jnp.nan, image)

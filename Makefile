@@ -1,0 +1,65 @@
+# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED RESUME.
+SCENE  ?= 1
+FIELD  ?= wideband
+PRESET ?=
+DATA   ?=
+OUT    ?=
+SEED   ?= 0
+PYTHON ?= python3
+
+VENV   := .venv
+PY     := $(VENV)/bin/python
+READY  := $(VENV)/.ready
+CUDA   := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo cuda)
+SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
+NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),scene$(notdir $(basename $(SCENE))))
+RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)$(if $(PRESET),-$(PRESET))-seed$(SEED))
+
+.PHONY: help setup train eval test data lint typecheck bench tables clean
+.DEFAULT_GOAL := help
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+setup: $(READY)  ## make .venv with the locked dependencies (uv where it is, else venv and pip)
+
+$(READY): uv.lock requirements.lock pyproject.toml
+	@echo "setup: installing the locked dependencies into $(VENV) ..."
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "error: $(PYTHON) is older than Python 3.11; give another one: make PYTHON=python3.12 ..." >&2; exit 2; }
+	@if command -v uv >/dev/null 2>&1; then \
+		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev $(if $(CUDA),--extra cuda); \
+	else \
+		$(PYTHON) -m venv $(VENV) && $(PY) -m pip install --quiet --disable-pip-version-check -r requirements.lock && \
+		$(PY) -m pip install --quiet --disable-pip-version-check --no-deps -e . $(if $(CUDA),&& $(PY) -m pip install --quiet "jax[cuda12]"); \
+	fi
+	@touch $@
+
+train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|cpu|gpu DATA=folder OUT=runs/x SEED=]
+	$(PY) -m wbgs_jax.train $(SOURCE) --field $(FIELD) $(if $(PRESET),--preset $(PRESET)) --seed $(SEED) --out $(RUN) --resume
+	$(PY) -m wbgs_jax.eval --run $(RUN)
+
+eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
+	$(PY) -m wbgs_jax.eval --run $(RUN)
+
+test: setup  ## run the tests
+	$(PY) -m pytest -n 2 --dist worksteal
+
+data: setup  ## trace a scene with Sionna RT: make data SCENE=1
+	@if command -v uv >/dev/null 2>&1; then \
+		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev --extra data $(if $(CUDA),--extra cuda); \
+	else $(PY) -m pip install --quiet --disable-pip-version-check -r requirements-data.lock; fi
+	$(PY) -m data_gen.generate --scene $(SCENE)
+
+lint: setup  ## ruff
+	$(PY) -m ruff check . && $(PY) -m ruff format --check .
+
+typecheck: setup  ## mypy
+	$(PY) -m mypy
+
+bench: setup  ## measure this machine: experiments/results/bench_<device>.json
+	$(PY) -m experiments.bench
+
+clean:  ## remove caches; runs, data and .venv stay
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
