@@ -172,9 +172,8 @@ def check(settings: Settings) -> None:
         raise UserError(
             f"--wideband.gaussians is {settings.wideband.gaussians}; give at least 4, or 0 for the size of the mesh"
         )
-    if settings.optim.steps % settings.loop.epoch_steps:
-        raise UserError(
-            f"--optim.steps {settings.optim.steps} is not a multiple of --loop.epoch-steps {settings.loop.epoch_steps}; change one of them"
-        )
+    steps, block = settings.optim.steps, settings.loop.epoch_steps
+    if steps % block:
+        raise UserError(f"--optim.steps {steps} is not a multiple of --loop.epoch-steps {block}; change one of them")
     if not 0 <= settings.optim.ssim_weight <= 1:
         raise UserError(f"--optim.ssim-weight is {settings.optim.ssim_weight}; it must lie between 0 and 1")

@@ -115,7 +115,8 @@ def _edit(gaussians: Gaussians, stats: DensityStats, source, clone, split, n_kep
     rotation = np.asarray(rotation_matrix(jnp.asarray(quats[halves])))
     means[halves] += np.einsum("nij,nj->ni", rotation, draw).astype(means.dtype)
     log_scales[halves] -= math.log(SPLIT_SHRINK)
-    return Gaussians(means, log_scales, quats, logits, np.ones(len(source), means.dtype))
+    arrays = (means, log_scales, quats, logits, np.ones(len(source), means.dtype))
+    return Gaussians(*map(jnp.asarray, arrays))
 
 
 def _carry_moments(optimizer: Any, source: Int[np.ndarray, "m"], fresh: Bool[np.ndarray, "m"], only: str = "") -> Any:

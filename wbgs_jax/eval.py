@@ -21,6 +21,7 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax import metrics, pictures
+from wbgs_jax.config import to_dict
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
@@ -78,23 +79,29 @@ def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> d
     return result
 
 
-def provenance(trained: TrainedField) -> dict[str, Any]:
-    """Where a figure comes from."""
-    git = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    )
+def environment() -> dict[str, Any]:
+    """Code version and device of this process."""
+    describe = ["git", "describe", "--always", "--dirty"]
+    git = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
     device = jax.devices()[0]
     return {
         "version": wbgs_jax.__version__,
         "commit": git.stdout.strip() or None,
+        "device": device.device_kind if device.platform != "cpu" else f"cpu {platform.machine()}",
+        "jax": jax.__version__,
+    }
+
+
+def provenance(trained: TrainedField) -> dict[str, Any]:
+    """Where a figure comes from."""
+    return environment() | {
         "command": " ".join(["python -m wbgs_jax.train", *_training_arguments(trained)]),
         "preset": trained.config.preset,
         "seed": trained.config.seed,
         "steps": trained.step,
-        "device": device.device_kind if device.platform != "cpu" else f"cpu {platform.machine()}",
-        "jax": jax.__version__,
         "training_seconds": round(trained.seconds, 1),
         "gaussians": int(np.asarray(trained.params.gaussians.alive).sum()),
+        "settings": to_dict(trained.config.settings),
     }
 
 

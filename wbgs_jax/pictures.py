@@ -121,7 +121,7 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
     series = {report["field"]: report} | {name.replace("_", " "): r for name, r in report["references"].items()}
     for i, (name, result) in enumerate(series.items()):
         rows = result["per_frequency"]
-        style = {"lw": 2.5, "marker": "o"} if i == 0 else {"lw": 1.2, "marker": ".", "ls": "--"}
+        style: dict[str, Any] = {"lw": 2.5, "marker": "o"} if i == 0 else {"lw": 1.2, "marker": ".", "ls": "--"}
         label = f"{name}: {result['median_ssim']:.3f}"
         axis.plot([r["frequency_ghz"] for r in rows], [r["median_ssim"] for r in rows], label=label, **style)
     ticks = [r["frequency_ghz"] for r in report["per_frequency"]]

@@ -19,10 +19,16 @@ class TrainingProgress:
         self.started = self.last_line = time.monotonic()
         self.console = Console(file=sys.stderr)
         self.bar = Progress(
-            SpinnerColumn(), TextColumn("{task.completed}/{task.total}"), BarColumn(bar_width=24),
-            TextColumn("{task.fields[status]}"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
-            console=self.console, disable=not self.console.is_terminal,
-        )  # fmt: skip
+            SpinnerColumn(),
+            TextColumn("{task.completed}/{task.total}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
 
     def __enter__(self) -> "TrainingProgress":

@@ -20,7 +20,7 @@ def pytree(cls: type[T]) -> type[T]:
     Unlike `jax.tree_util.register_dataclass`, rebuilding a tree does not call `__init__`: transformations put shapes, masks
     and markers where the annotations promise arrays, and run-time type checks must not trip over them.
     """
-    cls = dataclasses.dataclass(frozen=True)(cls)  # type: ignore[assignment]
+    cls = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     children = [f.name for f in fields if not f.metadata.get("static")]
     constants = [f.name for f in fields if f.metadata.get("static")]

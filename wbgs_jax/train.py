@@ -97,16 +97,16 @@ def main() -> None:
     dataset = config.dataset()
     folder = command.out or default_folder(dataset, config)
     prepare_folder(folder, config, command.resume)
-    say(
-        f"training {config.field} ({config.preset} preset) on {dataset.name}: {len(dataset.train)} spectra, {len(dataset.test)} held out"
-    )
+    counts = f"{len(dataset.train)} spectra, {len(dataset.test)} held out"
+    say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
     result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
     say(summary(result, folder))
 
 
 def summary(result: TrainResult, folder: Path) -> str:
     """One line at the end."""
-    return f"trained {result.steps} steps in {result.seconds:.0f} s, {result.gaussians} Gaussians, {result.compilations} compilations: {folder}"
+    size = f"{result.gaussians} Gaussians, {result.compilations} compilations"
+    return f"trained {result.steps} steps in {result.seconds:.0f} s, {size}: {folder}"
 
 
 def say(line: str) -> None:

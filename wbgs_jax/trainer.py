@@ -55,7 +55,7 @@ class Run:
     """One training run in a folder; everything that changes hangs here, everything pure is in train_step.py."""
 
     def __init__(self, dataset: Dataset, field_name: str, settings: Settings, seed: int, folder: Path):
-        self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
+        self.dataset, self.field_name, self.settings, self.seed, self.folder = dataset, field_name, settings, seed, folder
         self.field: Field = get_field(field_name)
         self.data = training_data(dataset)
         self.optimizer = make_optimizer(settings.optim)
@@ -72,7 +72,6 @@ class Run:
         config = self.settings.wideband
         surface = make_surface(self.dataset, config.gaussians, self.seed, config.sampling)
         capacity = density.capacity_bucket(len(surface.points))
-        surface = jax.tree.map(jnp.asarray, surface)
         params = self.field.init(jax.random.key(self.seed), surface, config, capacity)
         plan = self.field.plan(params, self.dataset.receiver)
         return init_state(params, self.optimizer), measure_capacity(plan.geometry.splats, TILE_SLACK)

@@ -64,4 +64,4 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
     """A surface (float32) with the spacing of its points; needs at least 4 points."""
     neighbours, _ = cKDTree(points).query(points, 4)
-    return Surface(np.asarray(points, np.float32), np.asarray(neighbours[:, 1:].mean(1), np.float32))  # type: ignore[arg-type]
+    return Surface(jnp.asarray(points, jnp.float32), jnp.asarray(neighbours[:, 1:].mean(1), jnp.float32))

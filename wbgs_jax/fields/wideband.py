@@ -81,8 +81,8 @@ def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity
     key_attenuation, key_radiance = jax.random.split(key)
     attenuation, radiance = _networks(config)
     attenuation_params = attenuation.init(key_attenuation, parts)
-    hidden, _ = attenuation.apply(attenuation_params, parts)
-    networks = {"attenuation": attenuation_params, "radiance": radiance.init(key_radiance, [hidden, *frequency])}
+    outputs: Any = attenuation.apply(attenuation_params, parts)
+    networks = {"attenuation": attenuation_params, "radiance": radiance.init(key_radiance, [outputs[0], *frequency])}
     return WidebandParams(gaussians, networks, frame, config)
 
 
@@ -108,10 +108,11 @@ def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tup
     """Final attenuation delta and signal Sig of every Gaussian and query (paper, equations 1-3 and section 4.5)."""
     attenuation_network, radiance_network = _networks(params.config)
     parts, frequency = _inputs(params, receiver, query)
-    hidden, delta_f = attenuation_network.apply(params.networks["attenuation"], parts)  # type: ignore[misc]
-    signal = radiance_network.apply(params.networks["radiance"], [hidden, *frequency])
+    outputs: Any = attenuation_network.apply(params.networks["attenuation"], parts)
+    hidden, delta_f = outputs
+    signal: Any = radiance_network.apply(params.networks["radiance"], [hidden, *frequency])
     delta = attenuation_activation(params.gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
-    return delta, signal_activation(signal)  # type: ignore[arg-type]
+    return delta, signal_activation(signal)
 
 
 def _networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:

@@ -5,13 +5,11 @@ chain gives the job's own (image, transmittance), and a short loop chains the jo
 recomputes the chain instead of storing it and turns its pixel sums into small matrix products (docs/performance.md).
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.geometry import AZIMUTH_PERIOD
@@ -84,6 +82,13 @@ def _blend_jobs(geometry, attenuation, signal):
     return image.reshape(shape), transmittance.reshape(shape)
 
 
+def _put(
+    values: Float[Array, "jobs ..."], job: Int[Array, "tiles"], new: Float[Array, "tiles ..."]
+) -> Float[Array, "jobs ..."]:
+    """Store a value for every tile's job; tiles without one point past the end."""
+    return values.at[job].set(new, mode="drop", unique_indices=True)
+
+
 def _chain_jobs(image, transmittance, jobs: TileJobs, keep_prefix: bool):
     """Blend the jobs of every tile in order. Returns the tiles' image and, if wanted, each job's (T, I) in front of it."""
     n_jobs = image.shape[0]
@@ -95,8 +100,7 @@ def _chain_jobs(image, transmittance, jobs: TileJobs, keep_prefix: bool):
         live = level < jobs.count
         job = jnp.where(live, jobs.first + level, n_jobs)
         if prefix is not None:
-            put = partial(dict, mode="drop", unique_indices=True)
-            prefix = (prefix[0].at[job].set(tile_transmittance, **put()), prefix[1].at[job].set(tile_image, **put()))
+            prefix = (_put(prefix[0], job, tile_transmittance), _put(prefix[1], job, tile_image))
         job, live = jnp.minimum(job, n_jobs - 1), live[:, None, None]
         tile_image = jnp.where(live, tile_image + tile_transmittance * image[job], tile_image)
         tile_transmittance = jnp.where(live, tile_transmittance * transmittance[job], tile_transmittance)
@@ -130,13 +134,13 @@ def composite(
 
     Differentiable once, in reverse mode, with respect to the four float arguments.
     """
-    blended = _blend_jobs(*_gather(means2d, conics, attenuation, signal, jobs))
-    return _tiles_to_image(_chain_jobs(*blended, jobs, keep_prefix=False)[0])
+    image, transmittance = _blend_jobs(*_gather(means2d, conics, attenuation, signal, jobs))
+    return _tiles_to_image(_chain_jobs(image, transmittance, jobs, keep_prefix=False)[0])
 
 
 def _composite_fwd(means2d, conics, attenuation, signal, jobs):
-    blended = _blend_jobs(*_gather(means2d, conics, attenuation, signal, jobs))
-    tile_image, prefix = _chain_jobs(*blended, jobs, keep_prefix=True)
+    image, transmittance = _blend_jobs(*_gather(means2d, conics, attenuation, signal, jobs))
+    tile_image, prefix = _chain_jobs(image, transmittance, jobs, keep_prefix=True)
     return _tiles_to_image(tile_image), (means2d, conics, attenuation, signal, jobs, tile_image, prefix)
 
 

@@ -4,7 +4,8 @@ The map is (x, y, z) -> (azimuth, zenith) -> pixel in the receiver's local frame
 choices keep the image well defined everywhere:
 
 * azimuth is periodic; a splat's footprint is measured to the nearest alias of its centre;
-* the azimuth standard deviation is capped so that a footprint never meets its own alias (near the poles it would grow without bound);
+* the azimuth standard deviation, which grows without bound near the poles, is capped so that a footprint never meets its
+  own alias;
 * a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
 """
 

@@ -1,0 +1,1 @@
+"""Experiments and measurements; they use public names only."""

@@ -1,0 +1,1 @@
+"""`python -m experiments.bench`: what this machine does, as a JSON file with provenance."""

@@ -1,0 +1,127 @@
+"""Choices made by measurement: one setting changed at a time, several seeds, everything else equal.
+
+    python -m experiments.choices --data FOLDER|SCENE --steps 1000 --seeds 0 1 2 [--only relative_off area ...]
+
+Trains the `cpu` preset with fewer steps, scores all held-out spectra, and writes experiments/results/choices_<dataset>.json
+after every run; what is already there is skipped, so that an interrupted series goes on. docs/decisions.md quotes it.
+"""
+
+import dataclasses
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from wbgs_jax import metrics
+from wbgs_jax.config import PRESETS, DensityConfig, OptimConfig, Settings, WidebandConfig
+from wbgs_jax.data import load_dataset
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.eval import environment
+from wbgs_jax.fields import get_field
+from wbgs_jax.files import read_json, write_json
+from wbgs_jax.inference import predict_spectra
+from wbgs_jax.trainer import train
+
+RESULTS = Path(__file__).parent / "results"
+Change = dict[str, Any]
+
+CHANGES: dict[str, tuple[Change, Change, Change]] = {
+    # name: changes of (the field, the optimiser, density control)
+    "default": ({}, {}, {}),
+    "paper_inputs": ({"relative": False}, {}, {}),
+    "raw_gigahertz": ({"frequency_scale": "ghz"}, {}, {}),
+    "sphere": ({"projection": "sphere"}, {}, {}),
+    "area": ({"sampling": "area"}, {}, {}),
+    "no_density_control": ({}, {}, {"every": 0, "reset_every": 0}),
+    "density_with_reset": ({}, {}, {"reset_every": 300}),
+    "octaves_10": ({"gaussian_octaves": 10, "tx_octaves": 10, "frequency_octaves": 10}, {}, {}),
+    "octaves_3_2_2": ({"gaussian_octaves": 3, "tx_octaves": 2, "frequency_octaves": 2}, {}, {}),
+    "gaussians_1000": ({"gaussians": 1000}, {}, {}),
+    "gaussians_4000": ({"gaussians": 4000}, {}, {}),
+    "width_128": ({"width": 128, "radiance_widths": (128, 64)}, {}, {}),
+    "network_lr_3e-3": ({}, {"network_lr": 3e-3}, {}),
+    "weight_decay_0.1": ({}, {"network_weight_decay": 0.1}, {}),
+    "fixed_means": ({}, {"means_lr": 0.0}, {}),
+    "no_attenuation_frequency": ({"attenuation_frequency": False}, {}, {}),
+    "no_radiance_frequency": ({"radiance_frequency": False}, {}, {}),
+    "no_frequency": ({"attenuation_frequency": False, "radiance_frequency": False}, {}, {}),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Train variants of the `cpu` preset and score them."""
+
+    data: str
+    """Scene number, scene file or folder."""
+    steps: int = 1000
+    seeds: tuple[int, ...] = (0, 1, 2)
+    only: tuple[str, ...] = ()
+    """Names of changes; all by default."""
+    out: Path = RESULTS
+
+
+def changed_settings(name: str, steps: int) -> Settings:
+    """The `cpu` preset with one change and fewer steps; schedules that count steps shrink with them."""
+    base = PRESETS["cpu"]
+    field, optim, density = CHANGES[name]
+    scale = steps / base.optim.steps
+    block = base.loop.epoch_steps
+
+    def shrink(count: int) -> int:
+        return max(block, round(count * scale / block) * block) if count else 0
+
+    wideband: WidebandConfig = dataclasses.replace(base.wideband, **field)
+    optimiser: OptimConfig = dataclasses.replace(base.optim, **{"steps": steps} | optim)
+    shrunk = {key: shrink(getattr(base.density, key)) for key in ("every", "start", "reset_every")}
+    control: DensityConfig = dataclasses.replace(base.density, **shrunk | density)
+    loop = dataclasses.replace(base.loop, evaluate_every=10 * steps, checkpoint_every=10 * steps)
+    return Settings(wideband, optimiser, control, loop)
+
+
+def measure(dataset: Dataset, settings: Settings, seed: int) -> dict[str, Any]:
+    """Train once and score all held-out spectra."""
+    with tempfile.TemporaryDirectory() as folder:
+        result = train(dataset, "wideband", settings, seed, Path(folder))
+    predicted = predict_spectra(get_field("wideband"), result.params, dataset, dataset.test)
+    ssim = metrics.ssim(predicted, np.asarray(dataset.pas(dataset.test)))
+    scores = {"median_ssim": round(float(np.median(ssim)), 4), "mean_ssim": round(float(np.mean(ssim)), 4)}
+    return {"seed": seed, **scores, "seconds": round(result.seconds, 1), "gaussians": result.gaussians}
+
+
+def main() -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m experiments.choices")
+    names = command.only or tuple(CHANGES)
+    if unknown := [name for name in names if name not in CHANGES]:
+        raise UserError(f"unknown change {unknown[0]!r}; choose among: {', '.join(CHANGES)}")
+    dataset = load_dataset(command.data)
+    path = command.out / f"choices_{dataset.name}.json"
+    report: dict[str, Any] = read_json(path) if path.exists() else {"dataset": dataset.name, "steps": command.steps, "changes": {}}
+    if report["steps"] != command.steps:
+        raise UserError(
+            f"{path} holds runs of {report['steps']} steps, not {command.steps}; move it away or use --steps {report['steps']}"
+        )
+    for seed in command.seeds:
+        for name in names:
+            runs = report["changes"].setdefault(name, {"runs": []})["runs"]
+            if any(run["seed"] == seed for run in runs):
+                continue
+            begin = time.perf_counter()
+            runs.append(measure(dataset, changed_settings(name, command.steps), seed) | environment())
+            report["changes"][name]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
+            write_json(path, report)
+            print(
+                f"{name:26} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}  {time.perf_counter() - begin:.0f} s",
+                file=sys.stderr,
+            )
+
+
+if __name__ == "__main__":
+    run_command(main)
