@@ -1,0 +1,149 @@
+"""What a scene is made of: parts with a material, a receiver, candidate transmitters; and furniture to fill a room with.
+
+World frame: z up, metres. Walls, floor and ceiling are SINGLE surfaces whose material has a thickness (Sionna RT's slab model);
+furniture is made of closed meshes. No two surfaces may coincide: the ray tracer would see both, or one at random. Furniture
+therefore stands `GAP` above the floor and is built of boxes that are `JOINT` apart.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from data_gen.materials import THICKNESS, check_material
+from wbgs_jax.errors import UserError
+
+GAP = 0.01
+"""Metres between furniture and the floor or wall it stands at; hides nothing and keeps surfaces apart."""
+JOINT = 0.002
+"""Metres between the boxes of one piece of furniture."""
+TX_CLEARANCE = 0.10
+"""A transmitter is at least this far (metres) from every surface."""
+RX_CLEARANCE = 0.50
+"""A transmitter is at least this far (metres) from the receiver, and the receiver from every surface."""
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One object of a scene: a mesh of one material."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    material: str
+    thickness: float
+    """Slab thickness in metres."""
+    closed: bool = True
+    """A solid (furniture) rather than a piece of the room's surface."""
+
+
+def part(name: str, mesh: trimesh.Trimesh, material: str, thickness: float | None = None, closed: bool = True) -> Part:
+    """A part with a checked material and, unless given, that material's default thickness (metres)."""
+    check_material(material)
+    return Part(name, mesh, material, THICKNESS[material] if thickness is None else thickness, closed)
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """A scene before simulation. Positions in metres, orientation as a unit quaternion (wxyz, local to world)."""
+
+    name: str
+    parts: tuple[Part, ...]
+    rx_position: Vec3
+    tx_grid: Float[np.ndarray, "candidates 3"]
+    """Candidate transmitter positions; `accessible_tx` picks those that can be reached."""
+    frequencies_hz: tuple[float, ...]
+    rx_orientation: tuple[float, float, float, float] = IDENTITY
+    description: str = field(default="")
+
+    @property
+    def furniture(self) -> tuple[Part, ...]:
+        """The closed parts."""
+        return tuple(p for p in self.parts if p.closed)
+
+    def bounds(self) -> Float[np.ndarray, "2 3"]:
+        """Lowest and highest corner of the room."""
+        corners = np.concatenate([p.mesh.bounds for p in self.parts])
+        return np.stack([corners.min(0), corners.max(0)])
+
+    def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points are inside a piece of furniture."""
+        inside = [np.abs(winding_number(p.mesh, points)) > 0.5 for p in self.furniture]
+        return np.any([np.zeros(len(points), bool), *inside], axis=0)
+
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Distance (metres) of every point to the nearest surface."""
+        each = [trimesh.proximity.closest_point_naive(p.mesh, points)[1] for p in self.parts]
+        return np.min(each, axis=0)
+
+    def accessible_tx(self) -> Float[np.ndarray, "tx 3"]:
+        """The candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.
+
+        Raises:
+            UserError: the receiver is inside or too near to something, or no candidate is left.
+        """
+        self.check_receiver()
+        grid = np.asarray(self.tx_grid, np.float64)
+        low, high = self.bounds()
+        keep = ((grid > low) & (grid < high)).all(1)
+        keep &= ~self.inside_objects(grid) & (self.distance(grid) >= TX_CLEARANCE)
+        keep &= np.linalg.norm(grid - self.rx_position, axis=1) >= RX_CLEARANCE
+        if not keep.any():
+            raise UserError(f"no transmitter position of scene {self.name} is accessible; change its grid or its furniture")
+        return grid[keep]
+
+    def check_receiver(self) -> None:
+        """Raise a `UserError` when the receiver is outside the room, inside an object or too near to a surface."""
+        point = np.asarray([self.rx_position], np.float64)
+        low, high = self.bounds()
+        outside = not ((point > low) & (point < high)).all()
+        if outside or self.inside_objects(point)[0] or self.distance(point)[0] < RX_CLEARANCE:
+            raise UserError(f"the receiver of scene {self.name} at {self.rx_position} is not {RX_CLEARANCE} m clear; move it")
+
+    def mesh_arrays(self) -> dict[str, np.ndarray]:
+        """All surfaces as one mesh: vertices (n, 3) float32, faces (m, 3) int32, face_part (m,) int32 index into `parts`."""
+        offsets = np.cumsum([0, *(len(p.mesh.vertices) for p in self.parts)])
+        vertices = np.concatenate([np.asarray(p.mesh.vertices, np.float32) for p in self.parts])
+        faces = np.concatenate([np.asarray(p.mesh.faces) + start for p, start in zip(self.parts, offsets, strict=False)])
+        face_part = np.repeat(np.arange(len(self.parts)), [len(p.mesh.faces) for p in self.parts])
+        return {"vertices": vertices, "faces": faces.astype(np.int32), "face_part": face_part.astype(np.int32)}
+
+    def mesh_sha256(self) -> str:
+        """Checksum of the surfaces and their materials."""
+        digest = hashlib.sha256(repr(self.part_table()).encode())
+        for array in self.mesh_arrays().values():
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def part_table(self) -> list[dict[str, Any]]:
+        """Name, material and thickness (metres) of every part, as in a scene file's meta."""
+        return [{"name": p.name, "material": p.material, "thickness": p.thickness} for p in self.parts]
+
+
+def grid_3d(low: Vec3, high: Vec3, counts: tuple[int, int, int]) -> Float[np.ndarray, "n 3"]:
+    """A uniform grid with both ends included, x slowest, z fastest."""
+    axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """How often a closed mesh goes around every point: 0 outside, 1 or -1 inside (sum of the triangles' solid angles)."""
+    a, b, c = (np.asarray(mesh.triangles)[None, :, i] - points[:, None] for i in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    triple = np.einsum("nmi,nmi->nm", a, np.cross(b, c))
+    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return np.arctan2(triple, below).sum(1) / (2 * np.pi)
+
+
+def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Several bodies as one mesh."""
+    meshes = list(meshes)
+    offsets = np.cumsum([0, *(len(m.vertices) for m in meshes)])
+    faces = [np.asarray(m.faces) + start for m, start in zip(meshes, offsets, strict=False)]
+    return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
