@@ -78,7 +78,7 @@ def changed_settings(name: str, steps: int) -> Settings:
         return max(block, round(count * scale / block) * block) if count else 0
 
     wideband: WidebandConfig = dataclasses.replace(base.wideband, **field)
-    optimiser: OptimConfig = dataclasses.replace(base.optim, **{"steps": steps} | optim)
+    optimiser: OptimConfig = dataclasses.replace(base.optim, **{"steps": steps, "min_steps": steps} | optim)
     shrunk = {key: shrink(getattr(base.density, key)) for key in ("every", "start", "reset_every")}
     control: DensityConfig = dataclasses.replace(base.density, **shrunk | density)
     loop = dataclasses.replace(base.loop, evaluate_every=10 * steps, checkpoint_every=10 * steps)
@@ -103,7 +103,9 @@ def main() -> None:
         raise UserError(f"unknown change {unknown[0]!r}; choose among: {', '.join(CHANGES)}")
     dataset = load_dataset(command.data)
     path = command.out / f"choices_{dataset.name}.json"
-    report: dict[str, Any] = read_json(path) if path.exists() else {"dataset": dataset.name, "steps": command.steps, "changes": {}}
+    report: dict[str, Any] = {"dataset": dataset.name, "steps": command.steps, "changes": {}}
+    if path.exists():
+        report = read_json(path)
     if report["steps"] != command.steps:
         raise UserError(
             f"{path} holds runs of {report['steps']} steps, not {command.steps}; move it away or use --steps {report['steps']}"

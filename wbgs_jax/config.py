@@ -53,6 +53,11 @@ class OptimConfig:
     """Loss, optimiser groups and schedules; every learning rate decays by a cosine to `final_fraction` of itself."""
 
     steps: int = 8000
+    """Upper bound; see `max_epochs`."""
+    max_epochs: float = 16.0
+    """Small data sets are not seen more often than this (they would be learned by heart) ..."""
+    min_steps: int = 1000
+    """... but get at least this many steps."""
     batch: int = 8
     """Queries a step."""
     ssim_weight: float = 0.2
@@ -151,6 +156,14 @@ def from_dict(values: dict[str, Any]) -> Settings:
         return Settings(**{name: build(factory, values[name]) for name, factory in fields.items()})  # type: ignore[arg-type]
     except KeyError as error:
         raise UserError(f"these settings lack {error}; they belong to another version of wbgs-jax: start a new run") from error
+
+
+def limit_steps(settings: Settings, n_train: int) -> Settings:
+    """Settings whose `optim.steps` are what a data set of `n_train` spectra gets: a multiple of the epoch block."""
+    optim, block = settings.optim, settings.loop.epoch_steps
+    wanted = max(optim.min_steps, optim.max_epochs * n_train / optim.batch)
+    steps = min(optim.steps, round(wanted / block) * block)
+    return dataclasses.replace(settings, optim=dataclasses.replace(optim, steps=max(steps, block)))
 
 
 def check(settings: Settings) -> None:

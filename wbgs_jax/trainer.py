@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int
 
 from wbgs_jax import checkpoint, density, metrics
-from wbgs_jax.config import Settings
+from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import make_surface
 from wbgs_jax.errors import UserError
@@ -220,6 +220,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
         UserError: a loss that is not finite (step, batch and last good checkpoint named), an unwritable folder.
         Interrupted: Ctrl-C; the state is saved.
     """
+    settings = limit_steps(settings, len(dataset.train))
     run = Run(dataset, field_name, settings, seed, folder)
     if resume:
         run.restore()

@@ -137,22 +137,26 @@ def _inputs(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[l
     return parts, [encoded] if config.radiance_frequency else []
 
 
-def _unit(v):
-    return v / jnp.maximum(jnp.linalg.norm(v, axis=-1, keepdims=True), 1e-3)
+def _length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
+    """Length, rounded up to a millimetre so that it is differentiable everywhere."""
+    return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)
 
 
 def _relative_features(
     means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]
-) -> Float[Array, "n b 5"]:
-    """Functions of (P(G), P(TX)) that spare the network learning trigonometry."""
-    to_g = _unit(to_local(means - receiver.position, receiver.orientation))
-    tx = query.tx_position - receiver.position
-    to_tx = _unit(to_local(tx, receiver.orientation))
-    leg = query.tx_position[None] - means[:, None]
-    d1 = jnp.linalg.norm(leg, axis=-1)
-    u1 = leg / jnp.maximum(d1, 1e-3)[..., None]
-    cosine = to_g @ to_tx.T
-    a_g, a_tx = (steering_vector(receiver.element_positions, u) for u in (to_g, to_tx))
-    gain = jnp.abs(a_g @ a_tx.conj().T) / receiver.element_positions.shape[0]
-    bounce = jnp.sum(u1 * _unit(receiver.position - means)[:, None], -1)
-    return jnp.concatenate([jnp.stack([cosine, gain, bounce, d1 / size], -1), u1], -1)
+) -> Float[Array, "n b 7"]:
+    """Functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
+
+    The angle between Gaussian and TX as the receiver sees it, the array's response to the TX in the Gaussian's direction (the
+    line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
+    """
+    to_g, to_tx = (to_local(p - receiver.position, receiver.orientation) for p in (means, query.tx_position))
+    to_g, to_tx = to_g / _length(to_g), to_tx / _length(to_tx)
+    steering_g, steering_tx = (steering_vector(receiver.element_positions, u) for u in (to_g, to_tx))
+    response = jnp.abs(steering_g @ steering_tx.conj().T) / receiver.element_positions.shape[0]
+    leg, back = query.tx_position[None] - means[:, None], receiver.position - means
+    distance = _length(leg)
+    direction = leg / distance
+    bounce = jnp.sum(direction * (back / _length(back))[:, None], -1)
+    scalars = jnp.stack([to_g @ to_tx.T, response, bounce], -1)
+    return jnp.concatenate([scalars, distance / size, direction], -1)
