@@ -1,9 +1,11 @@
 """A made-up room that needs no simulator: the line of sight and one mirror image in closed form, at three frequencies."""
 
 import dataclasses
+import functools
 
 import numpy as np
 
+from wbgs_jax import optim, train_step
 from wbgs_jax.array import planar_array
 from wbgs_jax.config import DensityConfig, LoopConfig, OptimConfig, Settings, WidebandConfig
 from wbgs_jax.data import scene_dataset
@@ -63,9 +65,14 @@ def tiny_settings(**changes) -> Settings:
         wideband=WidebandConfig(
             gaussians=60, width=8, depth=2, skip=1, radiance_widths=(8,), gaussian_octaves=2, tx_octaves=2, frequency_octaves=2
         ),
-        optim=OptimConfig(steps=8, batch=2),
+        optim=OptimConfig(steps=8, batch=2, final_fraction=1.0),
         density=DensityConfig(every=0, reset_every=0),
         loop=LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2),
     )
     sections = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in changes.items()}
     return dataclasses.replace(settings, **sections)
+
+
+make_optimizer = functools.cache(optim.make_optimizer)
+make_epoch = functools.cache(train_step.make_epoch)
+"""As the originals, but equal arguments share one compilation within a process."""

@@ -16,7 +16,8 @@ from orbax.checkpoint import v1 as ocp
 
 from wbgs_jax.errors import UserError
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax reports every file it writes
+for _name in ("absl", "asyncio"):  # Orbax reports every file it writes; what fails is explained by a `UserError` here
+    logging.getLogger(_name).setLevel(logging.CRITICAL)
 
 
 def _flatten(tree: Any) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def save(folder: Path, step: int, state: Any, metadata: dict[str, Any], keep: in
     try:
         folder.mkdir(parents=True, exist_ok=True)
         host = {key: np.asarray(leaf) for key, leaf in _flatten(state).items()}  # loads on any device
-        ocp.save_pytree(target, host, custom_metadata=metadata, overwrite=True)
+        ocp.save(target, host, custom_metadata=metadata, overwrite=True)
     except OSError as error:
         raise UserError(
             f"cannot write checkpoint {target}: {error.strerror or error}; free some space or choose another OUT"
@@ -48,7 +49,10 @@ def save(folder: Path, step: int, state: Any, metadata: dict[str, Any], keep: in
 def load_metadata(folder: Path, step: int) -> dict[str, Any]:
     """The metadata given to `save`."""
     with _explained(folder / str(step)):
-        return dict(ocp.pytree_metadata((folder / str(step)).absolute()).custom_metadata or {})
+        metadata = ocp.metadata((folder / str(step)).absolute()).custom_metadata
+        if not metadata:  # Orbax gives None for a file that it cannot read
+            raise ValueError("no metadata")
+        return dict(metadata)
 
 
 def load(folder: Path, step: int, like: Any, prefix: str = "") -> Any:
@@ -58,7 +62,7 @@ def load(folder: Path, step: int, like: Any, prefix: str = "") -> Any:
     """
     path = folder / str(step)
     with _explained(path):
-        found = ocp.load_pytree(path.absolute())
+        found = ocp.load(path.absolute())
     wanted = {prefix + key: leaf for key, leaf in _flatten(like).items()}
     if any(key not in found or np.shape(found[key]) != leaf.shape for key, leaf in wanted.items()):
         raise UserError(f"checkpoint {path} does not fit this configuration; start a new run in another OUT")

@@ -52,7 +52,7 @@ class WidebandConfig:
 class OptimConfig:
     """Loss, optimiser groups and schedules; every learning rate decays by a cosine to `final_fraction` of itself."""
 
-    steps: int = 8000
+    steps: int = 6000
     """Upper bound; see `max_epochs`."""
     max_epochs: float = 16.0
     """Small data sets are not seen more often than this (they would be learned by heart) ..."""
@@ -82,16 +82,16 @@ class DensityConfig:
     start: int = 500
     stop_fraction: float = 0.5
     """No control after this fraction of the steps."""
-    gradient_threshold: float = 2e-4
-    """Clone or split above this mean norm of the positional gradient, in normalised image coordinates (-1..1)."""
+    gradient_threshold: float = 8e-4
+    """Clone or split above this mean norm of the positional gradient in normalised image coordinates, -1..1 (authors: 2e-4)."""
     split_scale: float = 0.3
     """Metres: Gaussians larger than this are split, smaller ones cloned."""
     prune_attenuation: float = 0.005
     """Gaussians whose delta_o lies below are removed."""
-    reset_every: int = 3000
-    """Steps between two resets of delta_o to at most `reset_attenuation`; 0: never."""
+    reset_every: int = 0
+    """Steps between two resets of delta_o to at most `reset_attenuation` (authors: 3000); 0: never."""
     reset_attenuation: float = 0.01
-    max_gaussians: int = 4000
+    max_gaussians: int = 3000
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ PRESETS: dict[str, Settings] = {
     "smoke": Settings(
         wideband=WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
         optim=OptimConfig(steps=200, batch=4),
-        density=DensityConfig(every=100, start=50, max_gaussians=640, reset_every=0),
+        density=DensityConfig(every=100, start=50, max_gaussians=640),
         loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),
     ),
     # The default without a GPU.
@@ -131,7 +131,7 @@ PRESETS: dict[str, Settings] = {
     "gpu": Settings(
         wideband=WidebandConfig(gaussians=0, width=128, depth=8, skip=4, radiance_widths=(128, 64)),
         optim=OptimConfig(steps=20_000, batch=8, network_lr=8e-4),
-        density=DensityConfig(max_gaussians=100_000),
+        density=DensityConfig(max_gaussians=100_000, reset_every=3000),
         loop=LoopConfig(epoch_steps=100, checkpoint_every=2000),
     ),
 }

@@ -1,8 +1,8 @@
 """The jitted part of training: pure functions on a `TrainState`.
 
-An epoch is a `lax.scan` over a block of batches with donated state. A step whose tile lists overflowed or whose loss is not
-finite commits nothing, and neither do the steps after it: the epoch returns the last good state and says where it stopped,
-and the host decides (larger capacity and repeat, or stop with a message).
+An epoch is a `lax.scan` over a block of batches with donated state. A step whose tile lists overflowed, or whose loss or
+gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and says
+where it stopped, and the host decides (larger capacity and repeat, or stop with a message).
 """
 
 from collections.abc import Callable
@@ -79,7 +79,7 @@ class EpochReport:
     required: Int[Array, "2"]
     """... and needed this many entries and jobs (the largest seen)."""
     stopped: Bool[Array, ""]
-    """The epoch ended early, by overflow or a loss that is not finite."""
+    """The epoch ended early, by overflow or a loss or gradient that is not finite."""
 
 
 def training_data(dataset: Dataset) -> TrainingData:
@@ -130,6 +130,10 @@ def _add_density(stats: DensityStats, mean_gradient, means2d_gradient) -> Densit
     return DensityStats(stats.gradient_norm + norm, stats.mean_gradient + mean_gradient, stats.visible + (norm > 0))
 
 
+def _all_finite(tree: Any) -> Bool[Array, ""]:
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+
+
 EpochFunction = Callable[[TrainState, TrainingData, Int[Array, "k b"], Int[Array, ""]], tuple[TrainState, EpochReport]]
 
 
@@ -144,7 +148,7 @@ def make_epoch(field: Field, optimizer: optax.GradientTransformation, capacity: 
             (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(
                 field, state.params, data, index, capacity, ssim_weight
             )
-            ok = jnp.isfinite(loss) & ~jobs.overflow
+            ok = _all_finite((loss, gradients)) & ~jobs.overflow
             updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
             density = _add_density(state.density, gradients.gaussians.means, probe)
             new = TrainState(optax.apply_updates(state.params, updates), optimizer_state, density, state.step + 1)

@@ -23,6 +23,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import make_surface
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import Field, get_field
+from wbgs_jax.files import atomic_write
 from wbgs_jax.inference import predict_spectra
 from wbgs_jax.optim import make_optimizer
 from wbgs_jax.progress import TrainingProgress
@@ -115,16 +116,16 @@ class Run:
         return float(np.mean(losses)), float(np.mean(ssims))
 
     def _recover(self, report: EpochReport, batch: Int[np.ndarray, "b"]) -> None:
-        """Grow the tile lists after an overflow; anything else that stopped an epoch is a loss that is not finite."""
+        """Grow the tile lists after an overflow; anything else that stopped an epoch is a loss or gradient that is not finite."""
         if report.overflow:
-            entries, jobs = (int(n) for n in report.required)
-            self.capacity = fit_capacity(entries, jobs, TILE_SLACK)
+            grown = fit_capacity(*(int(n) for n in report.required), TILE_SLACK)
+            self.capacity = Capacity(max(grown.entries, self.capacity.entries), max(grown.jobs, self.capacity.jobs))
             self._build()
             return
         saved = checkpoint.checkpoint_steps(self.checkpoints)
         last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
         raise UserError(
-            f"the loss of step {self.step} is not finite (spectra {batch.tolist()}); {last}. "
+            f"the loss of step {self.step} or its gradient is not finite (spectra {batch.tolist()}); {last}. "
             "Check these spectra, or start again with smaller learning rates"
         )
 
@@ -165,6 +166,7 @@ class Run:
     def restore(self) -> bool:
         """Load the newest checkpoint, if there is one."""
         steps = checkpoint.checkpoint_steps(self.checkpoints)
+        _forget_later_metrics(self.folder / "metrics.jsonl", steps[-1] if steps else 0)
         if not steps:
             return False
         metadata = checkpoint.load_metadata(self.checkpoints, steps[-1])
@@ -173,7 +175,6 @@ class Run:
         self.state = checkpoint.load(self.checkpoints, steps[-1], like)
         self.capacity, self.seconds = Capacity(**metadata["tile_capacity"]), float(metadata["seconds"])
         self._build()
-        _forget_later_metrics(self.folder / "metrics.jsonl", steps[-1])
         return True
 
 
@@ -189,10 +190,14 @@ def _with_gaussian_capacity(state: TrainState, capacity: int) -> TrainState:
 
 
 def _forget_later_metrics(path: Path, step: int) -> None:
-    """Drop curve entries after the checkpoint a run resumes from: those steps are done again."""
+    """Drop curve entries after the checkpoint a run resumes from (those steps are done again), and a line cut short."""
     if path.exists():
-        kept = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
-        path.write_text("".join(line + "\n" for line in kept))
+        kept = []
+        for line in path.read_text().splitlines():
+            with contextlib.suppress(ValueError):
+                kept += [line] * (json.loads(line)["step"] <= step)
+        with atomic_write(path) as stream:
+            stream.write("".join(line + "\n" for line in kept).encode())
 
 
 @contextlib.contextmanager
@@ -217,7 +222,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
     """Train a field and leave checkpoints and curves in `folder`.
 
     Raises:
-        UserError: a loss that is not finite (step, batch and last good checkpoint named), an unwritable folder.
+        UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder.
         Interrupted: Ctrl-C; the state is saved.
     """
     settings = limit_steps(settings, len(dataset.train))

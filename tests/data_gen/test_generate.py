@@ -73,6 +73,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, m
     assert len(calls) == 7
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(uninterrupted, tmp_path):
     assert generate(options(tmp_path, workers=2, threads=1)).read_bytes() == uninterrupted.read_bytes()
 
