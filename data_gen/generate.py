@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from data_gen import work
+from data_gen import jobs
 from data_gen.llvm import find_backend
 from data_gen.materials import check_frequency
 from data_gen.scenes import SceneSpec, get_scene
@@ -101,7 +101,7 @@ def _output(options: Options, spec: SceneSpec) -> Path:
     return out
 
 
-def _job(options: Options, spec: SceneSpec) -> work.Job:
+def _job(options: Options, spec: SceneSpec) -> jobs.Job:
     settings = SolverSettings(
         max_depth=options.depth, samples_per_src=options.samples, diffraction=options.diffraction,
         max_paths_per_src=options.max_paths,
@@ -111,7 +111,7 @@ def _job(options: Options, spec: SceneSpec) -> work.Job:
         tx = tx[np.sort(np.random.default_rng(SUBSET_SEED).permutation(len(tx))[: options.max_tx])]
     test = np.flatnonzero(_split(len(tx)) == TEST)
     chosen = test[np.unique(np.linspace(0, len(test) - 1, CEILING_TX).round().astype(int))] if options.ceilings else []
-    return work.Job(spec, settings, tx, tuple(int(i) for i in chosen))
+    return jobs.Job(spec, settings, tx, tuple(int(i) for i in chosen))
 
 
 def _split(n_tx: int) -> np.ndarray:
@@ -120,18 +120,18 @@ def _split(n_tx: int) -> np.ndarray:
     return split
 
 
-def _compute(job: work.Job, frequencies: tuple[float, ...], folder: Path, options: Options) -> None:
-    everything = work.chunks(job, frequencies)
+def _compute(job: jobs.Job, frequencies: tuple[float, ...], folder: Path, options: Options) -> None:
+    everything = jobs.chunks(job, frequencies)
     todo = [chunk for chunk in everything if not chunk.file(folder).exists()]
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
         task = progress.add_task(job.spec.name, total=len(everything), completed=len(everything) - len(todo))
-        for chunk in work.run(job, todo, folder, options.workers, options.threads) if todo else ():
+        for chunk in jobs.run(job, todo, folder, options.workers, options.threads) if todo else ():
             progress.update(task, advance=1, description=f"{job.spec.name} {chunk.frequency_hz / 1e9:g} GHz")
 
 
-def _assemble(job: work.Job, frequencies: tuple[float, ...], folder: Path, backend: str) -> SceneFile:
-    spec, found = job.spec, work.collect(job, frequencies, folder)
+def _assemble(job: jobs.Job, frequencies: tuple[float, ...], folder: Path, backend: str) -> SceneFile:
+    spec, found = job.spec, jobs.collect(job, frequencies, folder)
     if lost := int((found["n_paths"] == 0).any(1).sum()):
         total = len(job.tx_positions)
         raise UserError(f"{lost} of {total} transmitters have no path at some frequency; raise --samples or --depth")
@@ -142,11 +142,11 @@ def _assemble(job: work.Job, frequencies: tuple[float, ...], folder: Path, backe
     )  # fmt: skip
 
 
-def _meta(job: work.Job, frequencies: tuple[float, ...], found: dict[str, Any], backend: str) -> dict[str, Any]:
+def _meta(job: jobs.Job, frequencies: tuple[float, ...], found: dict[str, Any], backend: str) -> dict[str, Any]:
     # Nothing that differs between two runs: no times, no paths, no host.
     interactions = ["line of sight", "specular reflection", "refraction", *["diffraction"] * job.settings.diffraction]
     return {
-        "generator": {"name": "data_gen", "simulator": "NVIDIA Sionna RT", "backend": backend, "versions": work.versions()},
+        "generator": {"name": "data_gen", "simulator": "NVIDIA Sionna RT", "backend": backend, "versions": jobs.versions()},
         "description": job.spec.description,
         "parts": job.spec.part_table(),
         "mesh_sha256": job.spec.mesh_sha256(),

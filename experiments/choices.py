@@ -21,6 +21,7 @@ from wbgs_jax import metrics
 from wbgs_jax.config import PRESETS, DensityConfig, OptimConfig, Settings, WidebandConfig
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import select_frequencies
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
@@ -64,6 +65,8 @@ class Command:
     seeds: tuple[int, ...] = (0, 1, 2)
     only: tuple[str, ...] = ()
     """Names of changes; all by default."""
+    train_ghz: tuple[float, ...] = ()
+    """Train on these frequencies alone and score the others (held-out transmitters, unseen frequencies)."""
     out: Path = RESULTS
 
 
@@ -102,8 +105,13 @@ def main() -> None:
     if unknown := [name for name in names if name not in CHANGES]:
         raise UserError(f"unknown change {unknown[0]!r}; choose among: {', '.join(CHANGES)}")
     dataset = load_dataset(command.data)
-    path = command.out / f"choices_{dataset.name}.json"
-    report: dict[str, Any] = {"dataset": dataset.name, "steps": command.steps, "changes": {}}
+    name = dataset.name
+    if command.train_ghz:
+        unseen = [f for f in np.unique(dataset.frequencies_hz) / 1e9 if not np.isclose(f, command.train_ghz).any()]
+        dataset = select_frequencies(dataset, command.train_ghz, unseen)
+        name += "_f" + "-".join(f"{f:g}" for f in command.train_ghz)
+    path = command.out / f"choices_{name}.json"
+    report: dict[str, Any] = {"dataset": name, "steps": command.steps, "changes": {}}
     if path.exists():
         report = read_json(path)
     if report["steps"] != command.steps:
@@ -111,16 +119,16 @@ def main() -> None:
             f"{path} holds runs of {report['steps']} steps, not {command.steps}; move it away or use --steps {report['steps']}"
         )
     for seed in command.seeds:
-        for name in names:
-            runs = report["changes"].setdefault(name, {"runs": []})["runs"]
+        for change in names:
+            runs = report["changes"].setdefault(change, {"runs": []})["runs"]
             if any(run["seed"] == seed for run in runs):
                 continue
             begin = time.perf_counter()
-            runs.append(measure(dataset, changed_settings(name, command.steps), seed) | environment())
-            report["changes"][name]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
+            runs.append(measure(dataset, changed_settings(change, command.steps), seed) | environment())
+            report["changes"][change]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
             write_json(path, report)
             print(
-                f"{name:26} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}  {time.perf_counter() - begin:.0f} s",
+                f"{change:26} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}  {time.perf_counter() - begin:.0f} s",
                 file=sys.stderr,
             )
 

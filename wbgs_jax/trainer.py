@@ -116,9 +116,10 @@ class Run:
         return float(np.mean(losses)), float(np.mean(ssims))
 
     def _recover(self, report: EpochReport, batch: Int[np.ndarray, "b"]) -> None:
-        """Grow the tile lists after an overflow; anything else that stopped an epoch is a loss or gradient that is not finite."""
+        """Grow the tile lists after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
         if report.overflow:
-            grown = fit_capacity(*(int(n) for n in report.required), TILE_SLACK)
+            entries, jobs = (int(n) for n in report.required)
+            grown = fit_capacity(entries, jobs, TILE_SLACK)
             self.capacity = Capacity(max(grown.entries, self.capacity.entries), max(grown.jobs, self.capacity.jobs))
             self._build()
             return
@@ -151,8 +152,13 @@ class Run:
 
     def log(self, entry: dict[str, Any]) -> None:
         """Append a line to metrics.jsonl."""
-        with (self.folder / "metrics.jsonl").open("a") as stream:
-            stream.write(json.dumps(entry) + "\n")
+        path = self.folder / "metrics.jsonl"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with path.open("a") as stream:
+                stream.write(json.dumps(entry) + "\n")
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror}; free some space or choose another OUT") from error
 
     def save(self) -> None:
         """Write a checkpoint of the present step."""

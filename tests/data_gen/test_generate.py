@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from data_gen import generate as module
-from data_gen import llvm, work
+from data_gen import jobs, llvm
 from data_gen.generate import Options, generate
 from data_gen.scenes import get_scene
 from wbgs_jax.array import planar_array
@@ -42,7 +42,7 @@ def test_the_scene_file_is_complete(uninterrupted):
     assert meta["tx_candidates"] == 900 and meta["tx_kept"] == 20
     assert meta["solver"]["samples_per_src"] == 500 and meta["solver"]["max_depth"] == 1
     np.testing.assert_allclose(meta["frequencies_read_back_hz"], scene.frequencies_hz, rtol=1e-6)
-    assert set(meta["generator"]["versions"]) == set(work.PACKAGES)
+    assert set(meta["generator"]["versions"]) == set(jobs.PACKAGES)
     assert [entry["frequency_ghz"] for entry in meta["ceilings"]] == [2.4, 60.0]
     for entry in meta["ceilings"]:
         assert entry["order<=1"] == 1.0  # depth 1: nothing is left out
@@ -82,7 +82,7 @@ def test_transmitters_without_a_path_are_counted(simulator_backend, tmp_path, mo
     def nothing(job, frequencies, folder):
         return {"n_paths": np.array([[3, 0], [1, 1], [0, 0]])}
 
-    monkeypatch.setattr(work, "collect", nothing)
+    monkeypatch.setattr(jobs, "collect", nothing)
     monkeypatch.setattr(module, "_compute", lambda *_: None)
     with pytest.raises(UserError, match="2 of 20 transmitters have no path"):
         generate(options(tmp_path))
@@ -101,7 +101,7 @@ def test_transmitters_without_a_path_are_counted(simulator_backend, tmp_path, mo
     ],
 )
 def test_mistakes_are_told_before_anything_is_computed(tmp_path, changes, message, monkeypatch):
-    monkeypatch.setattr(work, "run", None)
+    monkeypatch.setattr(jobs, "run", None)
     with pytest.raises(UserError, match=message) as caught:
         generate(options(tmp_path, **changes))
     assert "\n" not in str(caught.value)
