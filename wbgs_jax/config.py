@@ -142,20 +142,18 @@ def to_dict(settings: Settings) -> dict[str, Any]:
     return dataclasses.asdict(settings)
 
 
-def from_dict(values: dict[str, Any]) -> Settings:
-    """Settings from `to_dict`'s values; unknown or missing names are a `UserError`."""
+def from_dict(values: Any) -> Settings:
+    """Settings from `to_dict`'s values; unknown names and missing sections are a `UserError`."""
 
-    def build(cls: type, values: dict[str, Any]) -> Any:
-        try:
-            return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
-        except TypeError as error:
-            raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
+    def build(cls: Any, values: Any) -> Any:
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
 
-    fields = {f.name: f.default_factory for f in dataclasses.fields(Settings)}
+    sections = {f.name: f.default_factory for f in dataclasses.fields(Settings)}
     try:
-        return Settings(**{name: build(factory, values[name]) for name, factory in fields.items()})  # type: ignore[arg-type]
-    except KeyError as error:
-        raise UserError(f"these settings lack {error}; they belong to another version of wbgs-jax: start a new run") from error
+        built = {name: build(sections[name], value) for name, value in values.items()}
+        return Settings(**built | {name: built[name] for name in sections})
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
 
 
 def limit_steps(settings: Settings, n_train: int) -> Settings:

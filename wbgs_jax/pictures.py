@@ -24,7 +24,7 @@ def draw_all(run: Path, dataset: Dataset, predicted: Float[np.ndarray, "n 90 360
     """Draw everything into `run/pictures`; returns the files."""
     chosen = spread(dataset)
     truth, shown = np.asarray(dataset.pas(dataset.test[chosen])), predicted[chosen]
-    titles = [_title(dataset, i) for i in dataset.test[chosen]]
+    titles = [_title(dataset, i) for i in dataset.test[chosen].tolist()]
     figures = {
         "spectra.png": draw_spectra(truth, shown, titles),
         "spectra_polar.png": draw_polar(truth, shown, titles),

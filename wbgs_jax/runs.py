@@ -88,8 +88,12 @@ def difference(a: RunConfig, b: RunConfig) -> str:
 
 def abstract_params(field: Field, settings: Settings, field_name: str, capacity: int) -> Any:
     """Shapes of a field's parameters for a Gaussian capacity."""
-    surface = Surface(jax.ShapeDtypeStruct((capacity, 3), jnp.float32), jax.ShapeDtypeStruct((capacity,), jnp.float32))  # type: ignore[arg-type]
-    return jax.eval_shape(lambda s: field.init(jax.random.key(0), s, getattr(settings, field_name), capacity), surface)
+
+    def init() -> Any:
+        surface = Surface(jnp.zeros((capacity, 3)), jnp.zeros(capacity))
+        return field.init(jax.random.key(0), surface, getattr(settings, field_name), capacity)
+
+    return jax.eval_shape(init)
 
 
 def load_trained(folder: Path) -> TrainedField:

@@ -6,6 +6,7 @@
 The geometry does not depend on the query: it is planned once and shared by a batch.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -58,6 +59,13 @@ def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity
     `capacity` >= n pads the Gaussians so that density control has room to grow.
     """
     check_surface(surface)
+    low, high = surface.points.min(0), surface.points.max(0)
+    frame = Frame(centre=(low + high) / 2, half_extent=jnp.max(high - low) / 2)
+    untrained = WidebandParams(_initial_gaussians(surface, capacity), {}, frame, config)
+    return dataclasses.replace(untrained, networks=_initial_networks(key, untrained))
+
+
+def _initial_gaussians(surface: Surface, capacity: int | None) -> Gaussians:
     points = surface.points
     n = points.shape[0]
     pad = (capacity or n) - n
@@ -65,25 +73,25 @@ def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity
         raise ValueError(f"capacity {capacity} is smaller than the {n} points")
     log_scales = jnp.broadcast_to(jnp.log(jnp.maximum(surface.spacing, 1e-3))[:, None], (n, 3))
     logit = jnp.log(INITIAL_ATTENUATION / (MAX_ATTENUATION - INITIAL_ATTENUATION))
-    gaussians = Gaussians(
+    return Gaussians(
         means=jnp.pad(points, ((0, pad), (0, 0))),
         log_scales=jnp.pad(log_scales, ((0, pad), (0, 0))),
         quats=jnp.zeros((n + pad, 4), points.dtype).at[:, 0].set(1),
         opacity_logits=jnp.full((n + pad,), logit, points.dtype),
         alive=(jnp.arange(n + pad) < n).astype(points.dtype),
     )
-    low, high = points.min(0), points.max(0)
-    frame = Frame(centre=(low + high) / 2, half_extent=jnp.max(high - low) / 2)
-    params = WidebandParams(gaussians, {}, frame, config)
-    receiver = Receiver(frame.centre, jnp.array([1.0, 0, 0, 0], points.dtype), jnp.zeros((1, 3), points.dtype))
-    query = Query(frame.centre[None], jnp.full((1,), 1e9, points.dtype))
-    parts, frequency = _inputs(params, receiver, query)
+
+
+def _initial_networks(key: Key[Array, ""], untrained: WidebandParams) -> dict[str, Any]:
+    """Initial weights; the inputs matter by their shapes only."""
+    centre = untrained.frame.centre
+    receiver = Receiver(centre, jnp.array([1.0, 0, 0, 0], centre.dtype), jnp.zeros((1, 3), centre.dtype))
+    parts, frequency = _inputs(untrained, receiver, Query(centre[None], jnp.full((1,), 1e9, centre.dtype)))
     key_attenuation, key_radiance = jax.random.split(key)
-    attenuation, radiance = _networks(config)
-    attenuation_params = attenuation.init(key_attenuation, parts)
-    outputs: Any = attenuation.apply(attenuation_params, parts)
-    networks = {"attenuation": attenuation_params, "radiance": radiance.init(key_radiance, [outputs[0], *frequency])}
-    return WidebandParams(gaussians, networks, frame, config)
+    attenuation_network, radiance_network = _networks(untrained.config)
+    outputs: Any
+    outputs, attenuation = attenuation_network.init_with_output(key_attenuation, parts)
+    return {"attenuation": attenuation, "radiance": radiance_network.init(key_radiance, [outputs[0], *frequency])}
 
 
 def plan(
