@@ -1,4 +1,4 @@
-# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED RESUME.
+# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; PYTHON for the set-up.
 SCENE  ?= 1
 FIELD  ?= wideband
 PRESET ?=
@@ -15,7 +15,7 @@ SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
 NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),scene$(notdir $(basename $(SCENE))))
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)$(if $(PRESET),-$(PRESET))-seed$(SEED))
 
-.PHONY: help setup train eval test data lint typecheck bench tables clean
+.PHONY: help setup train eval test simulator data lint typecheck bench clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -45,10 +45,12 @@ eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE
 test: setup  ## run the tests
 	$(PY) -m pytest -n 2 --dist worksteal
 
-data: setup  ## trace a scene with Sionna RT: make data SCENE=1
+simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \
 		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev --extra data $(if $(CUDA),--extra cuda); \
 	else $(PY) -m pip install --quiet --disable-pip-version-check -r requirements-data.lock; fi
+
+data: simulator  ## trace a scene with Sionna RT: make data SCENE=1
 	$(PY) -m data_gen.generate --scene $(SCENE)
 
 lint: setup  ## ruff

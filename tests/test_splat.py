@@ -14,14 +14,15 @@ from wbgs_jax.types import Gaussians, Receiver
 EXACT = 1e-12
 
 
-def random_gaussians(rng, n, receiver, dtype=np.float64, dead=0.1):
+def random_gaussians(rng, n, receiver, dtype=np.float64, dead=0.1, on_axis=True):
     """Gaussians all around a receiver, some below the horizon, one straight above it, some dead."""
     directions = rng.normal(size=(n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:, 2] = np.abs(directions[:, 2]) * rng.choice([1, 1, 1, -0.3], n)
     ranges = rng.uniform(1, 6, n)
     local = directions * ranges[:, None]
-    local[0] = [0, 0, 2.5]
+    if on_axis:
+        local[0] = [0, 0, 2.5]
     from wbgs_jax.geometry import rotation_matrix
 
     means = local @ np.asarray(rotation_matrix(receiver.orientation)).T + np.asarray(receiver.position)
@@ -30,9 +31,9 @@ def random_gaussians(rng, n, receiver, dtype=np.float64, dead=0.1):
     return Gaussians(*(jnp.asarray(a, dtype) for a in arrays))
 
 
-def random_case(rng, n=250, b=3, dtype=np.float64):
+def random_case(rng, n=250, b=3, dtype=np.float64, on_axis=True):
     receiver = Receiver(*(jnp.asarray(a, dtype) for a in (rng.normal(size=3), rng.normal(size=4), np.zeros((1, 3)))))
-    gaussians = random_gaussians(rng, n, receiver, dtype)
+    gaussians = random_gaussians(rng, n, receiver, dtype, on_axis=on_axis)
     attenuation, signal = jnp.asarray(rng.uniform(0, 0.99, (n, b)), dtype), jnp.asarray(rng.uniform(0, 1, (n, b)), dtype)
     return gaussians, receiver, attenuation, signal
 
@@ -97,7 +98,7 @@ def test_dense_reference_agrees_with_equation_6_written_pixel_by_pixel(rng, x64)
 
 
 def test_gradients_agree_with_finite_differences(rng, x64):
-    gaussians, receiver, attenuation, signal = random_case(rng, n=60, b=2)
+    gaussians, receiver, attenuation, signal = random_case(rng, n=60, b=2, on_axis=False)  # on the axis the azimuth has no derivative
     cotangent = jnp.asarray(rng.normal(size=(2, 90, 360)))
     capacity = measure_capacity(project(gaussians, receiver), slack=2.0)
 

@@ -99,9 +99,11 @@ def to_local_matrix(factor: Float[Array, "n 3 3"], orientation: Float[Array, "4"
 
 
 def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Keep centres off the zenith axis, where the azimuth's derivative does not exist."""
-    near = jnp.hypot(local[:, 0], local[:, 1]) < MIN_RANGE
-    return jnp.where(near[:, None], jax.lax.stop_gradient(local) + jnp.array([MIN_RANGE, 0, 0], local.dtype), local)
+    """Keep centres off the zenith axis, where the azimuth has no derivative: there x and y get none."""
+    horizontal, vertical = local[:, :2], local[:, 2:]
+    near = jnp.linalg.norm(jax.lax.stop_gradient(horizontal), axis=-1, keepdims=True) < MIN_RANGE
+    beside = jax.lax.stop_gradient(horizontal) + jnp.array([MIN_RANGE, 0], local.dtype)
+    return jnp.concatenate([jnp.where(near, beside, horizontal), vertical], -1)
 
 
 def _cap_azimuth(spread: Float[Array, "n 2 3"]) -> Float[Array, "n 2 3"]:
