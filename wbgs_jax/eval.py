@@ -109,6 +109,8 @@ def _training_arguments(trained: TrainedField) -> list[str]:
     config = trained.config
     source = Path(config.source)
     data = ["--data", source.name] if source.is_dir() else ["--scene", source.name]
+    if config.frequency_ghz is not None:
+        data += ["--frequency-ghz", f"{config.frequency_ghz:g}"]
     return [*data, "--field", config.field, "--preset", config.preset, "--seed", str(config.seed)]
 
 
