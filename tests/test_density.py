@@ -73,7 +73,9 @@ def rows(gaussians):
 def per_gaussian(state):
     """Moments and statistics with a row for every Gaussian, by their place in the tree."""
     leaves = jax.tree_util.tree_leaves_with_path(state.optimizer)
-    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves if ".gaussians." in jax.tree_util.keystr(path)}
+    return {
+        jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves if ".gaussians." in jax.tree_util.keystr(path)
+    }
 
 
 def test_who_stays_and_who_comes(state):
@@ -125,9 +127,7 @@ def test_moments_travel_with_survivors_and_are_zero_for_the_new(state):
         assert not moments[3:].any(), path
     others = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(new.optimizer)]
     assert any("networks" in path for path in others)
-    for (path, a), b in zip(
-        jax.tree_util.tree_leaves_with_path(new.optimizer), jax.tree.leaves(state.optimizer), strict=True
-    ):
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(new.optimizer), jax.tree.leaves(state.optimizer), strict=True):
         if ".gaussians." not in jax.tree_util.keystr(path):
             np.testing.assert_array_equal(a, b)
 
@@ -136,9 +136,7 @@ def test_statistics_start_anew_and_the_step_stays(state):
     new, _ = control(state)
     assert int(new.step) == 7
     assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(new.density))
-    np.testing.assert_array_equal(
-        jax.tree.leaves(new.params.networks)[0], jax.tree.leaves(state.params.networks)[0]
-    )
+    np.testing.assert_array_equal(jax.tree.leaves(new.params.networks)[0], jax.tree.leaves(state.params.networks)[0])
 
 
 def test_the_neediest_come_first_where_room_is_short(state):

@@ -12,9 +12,7 @@ from wbgs_jax.fields import wideband
 from wbgs_jax.optim import make_optimizer
 
 RATES = {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity_logits": 0.4, "networks": 0.5, "alive": 0, "frame": 0}
-CONFIG = OptimConfig(
-    steps=6, means_lr=0.1, log_scales_lr=0.2, quats_lr=0.3, opacity_lr=0.4, network_lr=0.5, final_fraction=0.1
-)
+CONFIG = OptimConfig(steps=6, means_lr=0.1, log_scales_lr=0.2, quats_lr=0.3, opacity_lr=0.4, network_lr=0.5, final_fraction=0.1)
 
 
 @pytest.fixture

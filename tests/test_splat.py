@@ -98,7 +98,9 @@ def test_dense_reference_agrees_with_equation_6_written_pixel_by_pixel(rng, x64)
 
 
 def test_gradients_agree_with_finite_differences(rng, x64):
-    gaussians, receiver, attenuation, signal = random_case(rng, n=60, b=2, on_axis=False)  # on the axis the azimuth has no derivative
+    gaussians, receiver, attenuation, signal = random_case(
+        rng, n=60, b=2, on_axis=False
+    )  # on the axis the azimuth has no derivative
     cotangent = jnp.asarray(rng.normal(size=(2, 90, 360)))
     capacity = measure_capacity(project(gaussians, receiver), slack=2.0)
 

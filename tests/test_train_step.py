@@ -12,7 +12,7 @@ from wbgs_jax import trainer
 from wbgs_jax.data.layout import export_layout, load_layout
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import wideband
-from wbgs_jax.splat import Capacity, measure_capacity, project
+from wbgs_jax.splat import Capacity, project
 from wbgs_jax.splat.tiles import build_tile_jobs
 from wbgs_jax.train_step import loss_and_gradients, training_data
 from wbgs_jax.trainer import Run
@@ -135,13 +135,14 @@ def test_an_overflow_in_the_middle_of_an_epoch_repeats_the_rest_of_it(tmp_path, 
         run.state = dataclasses.replace(run.state, params=dataclasses.replace(run.state.params, gaussians=small))
         return run
 
-    roomy = start()
-    jobs = measure_capacity(project(roomy.state.params.gaussians, dataset.receiver)).jobs
-    entries = build_tile_jobs(project(roomy.state.params.gaussians, dataset.receiver), roomy.capacity).required_entries
-    short, probe = start(Capacity(int(entries), jobs)), start(Capacity(int(entries), jobs))
+    splats = jax.jit(project)(start().state.params.gaussians, dataset.receiver)
+    exact = Capacity(int(jax.jit(build_tile_jobs, static_argnums=1)(splats, TINY).required_entries), 1024)
+    short, probe = start(exact), start(exact)
     _, report = probe.run_epoch(probe.state, probe.data, jnp.asarray(probe.batches(0, LENGTH)), first(0))
     assert bool(report.overflow) and 0 < int(report.good_steps) < LENGTH
-    assert short.epoch() == roomy.epoch()
+    losses = short.epoch()
+    roomy = start(short.capacity)
+    assert roomy.epoch() == losses and roomy.compilations < short.compilations
     assert_equal_states(short.state, roomy.state)
 
 
@@ -168,7 +169,7 @@ def test_a_spectrum_that_is_not_a_number_stops_with_the_last_good_state(tmp_path
 def test_without_a_checkpoint_the_message_says_so(tmp_path, dataset):
     run = new_run(dataset, tmp_path)
     run.data = training_data(dataclasses.replace(dataset, snapshots=dataset.snapshots * np.nan))
-    with pytest.raises(UserError, match="step 0 .* no checkpoint"):
+    with pytest.raises(UserError, match=r"step 0 .* no checkpoint"):
         run.epoch()
 
 
@@ -195,7 +196,7 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
 
 def test_the_loss_decreases(tmp_path, dataset):
     run = new_run(dataset, tmp_path)
-    losses, ssims = zip(*(run.epoch() for _ in range(20)), strict=True)
+    losses, ssims = zip(*(run.epoch() for _ in range(40)), strict=True)
     assert np.mean(losses[-3:]) < 0.7 * losses[0]
     assert np.mean(ssims[-3:]) > ssims[0] + 0.1
 

@@ -121,8 +121,8 @@ def test_gradients_are_finite_and_agree_with_finite_differences(rng, x64, points
     arguments = (params, query.tx_position, jnp.log(query.frequency_hz))
     gradients = jax.jit(jax.grad(objective, argnums=(0, 1, 2)))(*arguments)
     leaves, structure = jax.tree.flatten(arguments)
-    assert bool(jnp.isfinite(objective(*arguments)))  # NaN: the tile lists overflowed
-    step, checked = 1e-7, 0
+    centre, step, checked = objective(*arguments), 1e-8, 0
+    assert bool(jnp.isfinite(centre))  # NaN: the tile lists overflowed
     for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
         name = jax.tree_util.keystr(path)
         assert bool(jnp.isfinite(gradient).all()), name
@@ -134,8 +134,11 @@ def test_gradients_are_finite_and_agree_with_finite_differences(rng, x64, points
         def at(t, i=i, direction=direction):
             return objective(*jax.tree.unflatten(structure, [a + t * direction if j == i else a for j, a in enumerate(leaves)]))
 
-        numeric = float(at(step) - at(-step)) / (2 * step)
-        assert float(jnp.sum(gradient * direction)) == pytest.approx(numeric, rel=1e-4, abs=1e-4), name
+        # A kink (the edge of a footprint, a ReLU) within the step spoils the difference on one side of the centre only.
+        exact, *sides = (
+            float(d) for d in (jnp.sum(gradient * direction), (at(step) - centre) / step, (centre - at(-step)) / step)
+        )
+        assert any(exact == pytest.approx(side, rel=1e-4, abs=1e-4) for side in sides), (name, exact, sides)
         assert bool(gradient.any()), name
         checked += 1
     assert checked >= 10
