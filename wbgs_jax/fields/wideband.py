@@ -7,6 +7,7 @@ The geometry does not depend on the query: it is planned once and shared by a ba
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -53,6 +54,7 @@ class WidebandPlan:
     receiver: Receiver
 
 
+@partial(jax.jit, static_argnames=("config", "capacity"))
 def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity: int | None = None) -> WidebandParams:
     """Isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest neighbours.
 

@@ -9,6 +9,8 @@ choices keep the image well defined everywhere:
 * a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -60,6 +62,7 @@ def jacobian(local: Float[Array, "n 3"], projection: Projection) -> Float[Array,
     return jnp.stack([azimuth * sx, zenith * sy], -2)
 
 
+@partial(jax.jit, static_argnames="projection")
 def project(
     gaussians: Gaussians,
     receiver: Receiver,

@@ -49,7 +49,7 @@ def measure_capacity(splats: Splats, slack: float = 1.25) -> Capacity:
         raise ValueError("the tile lists cannot be sized under jit: pass capacity=..., found outside with measure_capacity")
     capacity = fit_capacity(0, 0)
     while True:
-        jobs = jax.jit(build_tile_jobs, static_argnums=1)(splats, capacity)
+        jobs = build_tile_jobs(splats, capacity)
         fitted = fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), slack)
         if not jobs.overflow:
             return fitted

@@ -6,6 +6,7 @@ required counts and an overflow flag, the caller throws the result away and repe
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +68,7 @@ class _Boxes:
     alias_columns: Int[Array, "n"]
 
 
+@partial(jax.jit, static_argnames="capacity")
 def build_tile_jobs(splats: Splats, capacity: Capacity) -> TileJobs:
     """Sort splats into tiles. Works under jit; carries no gradient."""
     n = splats.depths.shape[0]
