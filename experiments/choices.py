@@ -42,6 +42,8 @@ CHANGES: dict[str, tuple[Change, Change, Change]] = {
     "no_density_control": ({}, {}, {"every": 0, "reset_every": 0}),
     "density_with_reset": ({}, {}, {"reset_every": 300}),
     "octaves_10": ({"gaussian_octaves": 10, "tx_octaves": 10, "frequency_octaves": 10}, {}, {}),
+    "frequency_octaves_0": ({"frequency_octaves": 0}, {}, {}),
+    "frequency_octaves_1": ({"frequency_octaves": 1}, {}, {}),
     "octaves_3_2_2": ({"gaussian_octaves": 3, "tx_octaves": 2, "frequency_octaves": 2}, {}, {}),
     "gaussians_1000": ({"gaussians": 1000}, {}, {}),
     "gaussians_4000": ({"gaussians": 4000}, {}, {}),

@@ -1,5 +1,7 @@
 """The host loop: a run that was interrupted and resumed is the run that was not."""
 
+import concurrent.futures
+import dataclasses
 import json
 import shutil
 import signal
@@ -185,3 +187,17 @@ def test_a_folder_that_cannot_be_written(dataset, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"cannot write .*metrics\.jsonl"):
         train(dataset, "wideband", SETTINGS, 0, tmp_path / "file" / "run")
+
+
+def test_data_without_training_or_test_spectra(dataset, tmp_path):
+    with pytest.raises(UserError, match="box has no training spectra"):
+        train(dataclasses.replace(dataset, train=dataset.train[:0]), "wideband", SETTINGS, 0, tmp_path / "untrained")
+    assert not (tmp_path / "untrained").exists()
+    train(dataclasses.replace(dataset, test=dataset.test[:0]), "wideband", SETTINGS, 0, tmp_path / "unwatched")
+    assert not any("held_out_ssim" in entry for entry in metrics_of(tmp_path / "unwatched"))
+
+
+def test_training_in_a_thread(dataset, tmp_path):
+    """Signals can be handled in the main thread only; sweeps train in others."""
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        assert pool.submit(train, dataset, "wideband", SETTINGS, 0, tmp_path).result().steps == STEPS

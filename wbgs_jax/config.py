@@ -175,6 +175,7 @@ def check(settings: Settings) -> None:
         "loop.keep-checkpoints": settings.loop.keep_checkpoints,
         "wideband.width": settings.wideband.width,
         "wideband.depth": settings.wideband.depth,
+        "wideband.radiance-widths": min(settings.wideband.radiance_widths, default=0),
     }
     for name, value in positive.items():
         if value < 1:

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import json
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -208,7 +209,10 @@ def _forget_later_metrics(path: Path, step: int) -> None:
 
 @contextlib.contextmanager
 def _deferred_interrupt() -> Iterator[dict[str, bool]]:
-    """Turn the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once."""
+    """Turn the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once.
+
+    Signals reach the main thread only; elsewhere the flag is never set.
+    """
     flag = {"set": False}
 
     def handler(signum, frame):
@@ -216,7 +220,8 @@ def _deferred_interrupt() -> Iterator[dict[str, bool]]:
             raise KeyboardInterrupt
         flag["set"] = True
 
-    previous = {s: signal.signal(s, handler) for s in (signal.SIGINT, signal.SIGTERM)}
+    signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    previous = {s: signal.signal(s, handler) for s in signals}
     try:
         yield flag
     finally:
@@ -228,9 +233,12 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
     """Train a field and leave checkpoints and curves in `folder`.
 
     Raises:
-        UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder.
+        UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder,
+            no training spectra.
         Interrupted: Ctrl-C; the state is saved.
     """
+    if len(dataset.train) == 0:
+        raise UserError(f"{dataset.name} has no training spectra; choose another split")
     settings = limit_steps(settings, len(dataset.train))
     run = Run(dataset, field_name, settings, seed, folder)
     if resume:
@@ -248,7 +256,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
                 "gaussians": run.alive,
                 "seconds": run.seconds,
             }
-            if _crosses(before, run.step, loop.evaluate_every) or run.step == total:
+            if len(run.watched) and (_crosses(before, run.step, loop.evaluate_every) or run.step == total):
                 entry["held_out_ssim"] = run.evaluate()
             run.log(entry)
             progress.update(**entry)

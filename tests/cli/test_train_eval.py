@@ -151,6 +151,7 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--preset"], ["preset"]),
         (["--scene", "SCENE", "--preset", "smoke", "--optim.steps", "7"], ["7", "multiple"]),
         (["--scene", "SCENE", "--preset", "smoke", "--optim.batch", "0"], ["optim.batch"]),
+        (["--scene", "SCENE", "--preset", "smoke", "--wideband.radiance-widths"], ["radiance-widths", "at least 1"]),
         (["--data", "LAYOUT", "--frequency-ghz", "5"], ["freq.txt"]),
     ],
 )

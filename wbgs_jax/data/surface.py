@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.geometry import angles_to_direction, rotation_matrix, to_local
+from wbgs_jax.geometry import to_local
 from wbgs_jax.types import Surface
 
 MESH_SIZED = (20_000, 70_000)
@@ -21,8 +21,8 @@ MIN_DISTANCE = 0.3
 """Metres; nearer surfaces are not sampled more densely than at this distance."""
 BELOW_HORIZON = -0.1
 """Cosine of the largest zenith angle at which points start: a little below the horizon, for footprints that reach above it."""
-SHELL_MARGIN = 1.0
-"""Metres from the farthest transmitter to the hemisphere that stands in where no surface is known."""
+BOX_MARGIN = 1.0
+"""Metres around transmitters and receiver in which points are drawn where no surface is known."""
 
 
 def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampling = "solid_angle") -> Surface:
@@ -30,8 +30,8 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
 
     "solid_angle" spreads them evenly over the directions of the receiver's hemisphere, hidden surfaces included: the image
     has the same resolution everywhere and no Gaussian is spent where the image cannot show it. "area" spreads them evenly
-    over the surface. Without faces the points of the cloud are used; without any points, the receiver's hemisphere at a
-    distance beyond all transmitters.
+    over the surface. Without faces the points of the cloud are used; without any points, random ones in the box of
+    transmitters and receiver.
     """
     rng = np.random.default_rng(seed)
     if count == 0:
@@ -41,7 +41,8 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
     elif len(dataset.vertices):
         points = dataset.vertices[rng.choice(len(dataset.vertices), min(count, len(dataset.vertices)), replace=False)]
     else:
-        points = _hemisphere(dataset, count, rng)
+        places = np.concatenate([dataset.tx_positions, np.asarray(dataset.receiver.position)[None]])
+        points = rng.uniform(places.min(0) - BOX_MARGIN, places.max(0) + BOX_MARGIN, (count, 3))
     return surface_from_points(points)
 
 
@@ -58,15 +59,6 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
     if np.count_nonzero(weight) < count:
         weight = weight + 1e-12
     return np.asarray(candidates)[rng.choice(len(candidates), count, replace=False, p=weight / weight.sum())]
-
-
-def _hemisphere(dataset: Dataset, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Points even over the receiver's hemisphere (and a little below its horizon), world frame."""
-    position = np.asarray(dataset.receiver.position, np.float64)
-    radius = np.linalg.norm(dataset.tx_positions - position, axis=1).max() + SHELL_MARGIN
-    cosine, azimuth = rng.uniform(BELOW_HORIZON, 1, count), rng.uniform(-np.pi, np.pi, count)
-    local = np.asarray(angles_to_direction(jnp.asarray(azimuth), jnp.arccos(jnp.asarray(cosine))))
-    return position + radius * local @ np.asarray(rotation_matrix(dataset.receiver.orientation)).T
 
 
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
