@@ -34,8 +34,9 @@ class WidebandConfig:
     """Octaves of P(G) (authors: 10)."""
     tx_octaves: int = 4
     """Octaves of P(TX) (authors: 10)."""
-    frequency_octaves: int = 4
-    """Octaves of the frequency encoding (authors: 10)."""
+    frequency_octaves: int = 0
+    """Octaves of the frequency encoding, beyond the scaled frequency itself (authors: 10; more than none fail between the
+    frequencies that were trained)."""
     frequency_scale: FrequencyScale = "log"
     """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
     relative: bool = True
