@@ -28,7 +28,7 @@ def quality_table(results: list[dict[str, Any]]) -> str:
     return markdown(head, rows)
 
 
-def choices_table(report: dict[str, Any]) -> str:
+def choices_table(name: str, report: dict[str, Any]) -> str:
     """One row a change: median SSIM of every seed, their median, and the mean SSIM's median."""
     seeds = sorted({run["seed"] for change in report["changes"].values() for run in change["runs"]})
     rows = []
@@ -38,7 +38,7 @@ def choices_table(report: dict[str, Any]) -> str:
         mean = statistics.median(run["mean_ssim"] for run in change["runs"])
         rows.append([name, *each, f"**{change['median_of_medians']:.3f}**", f"{mean:.3f}"])
     head = ["change", *(f"seed {seed}" for seed in seeds), "median", "mean SSIM"]
-    return f"`{report['dataset']}`, {report['steps']} steps:\n\n" + markdown(head, rows)
+    return f"`{name}`, {report['steps']} steps:\n\n" + markdown(head, rows)
 
 
 def markdown(head: list[str], rows: list[list[str]]) -> str:
@@ -52,7 +52,7 @@ def main() -> None:
     if quality := [read_json(path) for path in sorted(RESULTS.glob("quality_*.json"))]:
         print(quality_table(quality))
     for path in sorted(RESULTS.glob("choices_*.json")):
-        print("\n" + choices_table(read_json(path)))
+        print("\n" + choices_table(path.stem, read_json(path)))
 
 
 if __name__ == "__main__":
