@@ -1,7 +1,7 @@
 # One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; PYTHON for the set-up.
 SCENE  ?= 1
 FIELD  ?= wideband
-PRESET ?=
+PRESET ?= $(if $(CUDA),gpu,cpu)
 DATA   ?=
 OUT    ?=
 SEED   ?= 0
@@ -12,8 +12,8 @@ PY     := $(VENV)/bin/python
 READY  := $(VENV)/.ready
 CUDA   := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo cuda)
 SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
-NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),scene$(notdir $(basename $(SCENE))))
-RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)$(if $(PRESET),-$(PRESET))-seed$(SEED))
+NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCENE)),$(notdir $(basename $(SCENE))),scene$(SCENE)))
+RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
 .PHONY: help setup train eval test simulator data lint typecheck bench clean
 .DEFAULT_GOAL := help
@@ -36,7 +36,7 @@ $(READY): uv.lock requirements.lock pyproject.toml
 	@touch $@
 
 train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|cpu|gpu DATA=folder OUT=runs/x SEED=]
-	$(PY) -m wbgs_jax.train $(SOURCE) --field $(FIELD) $(if $(PRESET),--preset $(PRESET)) --seed $(SEED) --out $(RUN) --resume
+	$(PY) -m wbgs_jax.train $(SOURCE) --field $(FIELD) --preset $(PRESET) --seed $(SEED) --out $(RUN) --resume
 	$(PY) -m wbgs_jax.eval --run $(RUN)
 
 eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)

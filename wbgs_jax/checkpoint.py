@@ -1,7 +1,7 @@
 """Checkpoints with Orbax: the training state, and in the metadata what is needed to rebuild its shape.
 
 A state is saved as a flat dictionary of arrays named by their place in the tree. Orbax writes to a temporary folder and
-renames it, so a checkpoint is whole or absent.
+renames it, so a checkpoint is whole or absent (one that is written again is absent for a moment).
 """
 
 import contextlib

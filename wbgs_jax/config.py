@@ -144,9 +144,11 @@ def to_dict(settings: Settings) -> dict[str, Any]:
 
 
 def from_dict(values: Any) -> Settings:
-    """Settings from `to_dict`'s values; unknown names and missing sections are a `UserError`."""
+    """Settings from `to_dict`'s values; unknown or missing names are a `UserError` (today's default was not set then)."""
 
     def build(cls: Any, values: Any) -> Any:
+        if missing := {f.name for f in dataclasses.fields(cls)} - set(values):
+            raise KeyError(f"{cls.__name__}.{min(missing)}")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
 
     sections = {f.name: f.default_factory for f in dataclasses.fields(Settings)}
@@ -188,5 +190,8 @@ def check(settings: Settings) -> None:
     steps, block = settings.optim.steps, settings.loop.epoch_steps
     if steps % block:
         raise UserError(f"--optim.steps {steps} is not a multiple of --loop.epoch-steps {block}; change one of them")
+    for name in ("gaussian", "tx", "frequency"):
+        if getattr(settings.wideband, f"{name}_octaves") < 0:
+            raise UserError(f"--wideband.{name}-octaves is negative; give 0 or more")
     if not 0 <= settings.optim.ssim_weight <= 1:
         raise UserError(f"--optim.ssim-weight is {settings.optim.ssim_weight}; it must lie between 0 and 1")

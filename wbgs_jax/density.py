@@ -7,6 +7,7 @@ new ones start from zero moments.
 """
 
 import dataclasses
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -38,9 +39,9 @@ class DensityReport:
 
 
 def capacity_bucket(n: int) -> int:
-    """The smallest capacity (64 times a power of 2^(1/4)) that holds n Gaussians: small changes do not recompile."""
-    steps = math.ceil(4 * math.log2(max(n, 64) / 64) - 1e-9)
-    return -(-int(64 * 2 ** (steps / 4)) // 16) * 16
+    """The smallest capacity that holds n Gaussians; buckets grow by 2^(1/4) from 64, so that small changes do not recompile."""
+    sizes = (-(-int(64 * 2 ** (step / 4)) // 16) * 16 for step in itertools.count())
+    return next(size for size in sizes if size >= n)
 
 
 def control_density(state: TrainState, config: DensityConfig, rng: np.random.Generator) -> tuple[TrainState, DensityReport]:
@@ -66,7 +67,7 @@ def control_density(state: TrainState, config: DensityConfig, rng: np.random.Gen
 def choose(
     gaussians: Gaussians, stats: DensityStats, config: DensityConfig
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is. Never more than the maximum."""
+    """Masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is. Never grows beyond the maximum."""
     alive = np.asarray(gaussians.alive) > 0
     attenuation = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits)))
     useful = alive & (attenuation >= config.prune_attenuation)

@@ -148,7 +148,7 @@ def main() -> None:
     command = tyro.cli(Command, prog="python -m wbgs_jax.eval")
     trained = load_trained(command.run)
     dataset = trained.config.dataset() if command.data is None else load_dataset(command.data, seed=trained.config.seed)
-    console = Console(file=sys.stderr)
+    console = Console(file=sys.stderr, markup=False, soft_wrap=True)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(dataset.test)} spectra of {dataset.name} ...")
     report, predicted = evaluate(trained, dataset)
     write_json(command.run / "eval.json", report)
@@ -158,7 +158,7 @@ def main() -> None:
         console.print(f"results: {path}")
     if command.pictures:
         for path in pictures.draw_all(command.run, dataset, predicted, report):
-            console.print(f"picture: {path}", soft_wrap=True)
+            console.print(f"picture: {path}")
     if command.json:
         print(json.dumps(report, allow_nan=False))
     else:

@@ -36,11 +36,17 @@ def draw_all(run: Path, dataset: Dataset, predicted: Float[np.ndarray, "n 90 360
 
 
 def spread(dataset: Dataset, count: int = SHOWN) -> Int[np.ndarray, "count"]:
-    """Positions in `dataset.test` of a spread of frequencies, each at another transmitter; the same for every run."""
-    frequencies = np.unique(dataset.frequencies_hz[dataset.test])
-    wanted = frequencies[np.linspace(0, len(frequencies) - 1, count).round().astype(int)]
+    """Positions in `dataset.test` of a spread of frequencies, at different transmitters where there are enough."""
+    test = dataset.test
+    frequencies = np.unique(dataset.frequencies_hz[test])
     rng = np.random.default_rng(0)
-    return np.array([rng.choice(np.flatnonzero(dataset.frequencies_hz[dataset.test] == f)) for f in wanted])
+    chosen: list[int] = []
+    for frequency in frequencies[np.linspace(0, len(frequencies) - 1, min(count, len(test))).round().astype(int)]:
+        candidates = np.flatnonzero(dataset.frequencies_hz[test] == frequency)
+        used = dataset.tx_index[test[np.array(chosen, int)]]
+        fresh = candidates[~np.isin(dataset.tx_index[test[candidates]], used)]
+        chosen.append(int(rng.choice(fresh if len(fresh) else candidates)))
+    return np.array(chosen)
 
 
 def _title(dataset: Dataset, index: int) -> str:

@@ -46,7 +46,7 @@ class TrainResult:
     gaussians: int
     """Alive at the end."""
     compilations: int
-    """Epoch functions compiled in this process."""
+    """Times the jitted epoch was compiled in this process: at the start and whenever a capacity changed."""
 
 
 class Interrupted(UserError):
@@ -182,6 +182,7 @@ class Run:
         self.state = checkpoint.load(self.checkpoints, steps[-1], like)
         self.capacity, self.seconds = Capacity(**metadata["tile_capacity"]), float(metadata["seconds"])
         self._build()
+        self.compilations = 1
         return True
 
 

@@ -2,8 +2,8 @@
 
 A field is a module of pure functions
 
-    init(key, surface, config, capacity=None)              -> params      a pytree; `params.gaussians` if it has Gaussians
-    plan(params, receiver, capacity=None, means2d_offset=None) -> plan    what does not depend on the query
+    init(key, surface, config, capacity=None)                  -> params  a pytree with `gaussians` (density control)
+    plan(params, receiver, capacity=None, means2d_offset=None) -> plan    with `geometry.jobs` (overflow); query-independent
     render(params, plan, query)                            -> PAS (b, 90, 360)
 
 Trainer, evaluation and experiments know nothing else about a model.
