@@ -32,11 +32,11 @@ def choices_table(name: str, report: dict[str, Any]) -> str:
     """One row a change: median SSIM of every seed, their median, and the mean SSIM's median."""
     seeds = sorted({run["seed"] for change in report["changes"].values() for run in change["runs"]})
     rows = []
-    for name, change in report["changes"].items():
+    for label, change in report["changes"].items():
         by_seed = {run["seed"]: run for run in change["runs"]}
         each = [f"{by_seed[seed]['median_ssim']:.3f}" if seed in by_seed else "" for seed in seeds]
         mean = statistics.median(run["mean_ssim"] for run in change["runs"])
-        rows.append([name, *each, f"**{change['median_of_medians']:.3f}**", f"{mean:.3f}"])
+        rows.append([label, *each, f"**{change['median_of_medians']:.3f}**", f"{mean:.3f}"])
     head = ["change", *(f"seed {seed}" for seed in seeds), "median", "mean SSIM"]
     return f"`{name}`, {report['steps']} steps:\n\n" + markdown(head, rows)
 
