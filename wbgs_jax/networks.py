@@ -69,6 +69,3 @@ def signal_activation(logits: Float[Array, "n b"]) -> Float[Array, "n b"]:
 def attenuation_activation(delta_o: Float[Array, "n"], delta_f: Float[Array, "n b"], maximum: float) -> Float[Array, "n b"]:
     """delta = delta_o + delta_f, the sum taken before the squash so that it lies in (0, maximum) for any network output."""
     return maximum * jax.nn.sigmoid(delta_o[:, None] + delta_f)
-
-
-__all__ = ["AttenuationNetwork", "PartwiseDense", "RadianceNetwork", "attenuation_activation", "signal_activation"]
