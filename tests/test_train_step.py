@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import make_epoch, make_optimizer, tiny_dataset, tiny_scene, tiny_settings
+from synthetic import make_epoch, tiny_dataset, tiny_scene, tiny_settings
 
-from wbgs_jax import trainer
 from wbgs_jax.data.layout import export_layout, load_layout
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import wideband
@@ -22,10 +21,7 @@ SETTINGS = tiny_settings(loop={"epoch_steps": LENGTH})
 TINY = Capacity(entries=256, jobs=256)
 
 
-@pytest.fixture(autouse=True)
-def compile_once(monkeypatch):
-    monkeypatch.setattr(trainer, "make_optimizer", make_optimizer)
-    monkeypatch.setattr(trainer, "make_epoch", make_epoch)
+pytestmark = pytest.mark.usefixtures("compile_once")
 
 
 @pytest.fixture(scope="module")

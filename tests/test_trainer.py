@@ -9,9 +9,9 @@ import signal
 import jax
 import numpy as np
 import pytest
-from synthetic import make_epoch, make_optimizer, tiny_dataset, tiny_settings
+from synthetic import tiny_dataset, tiny_settings
 
-from wbgs_jax import checkpoint, trainer
+from wbgs_jax import checkpoint
 from wbgs_jax.errors import UserError
 from wbgs_jax.trainer import Interrupted, Run, train
 
@@ -24,10 +24,7 @@ GROWING = tiny_settings(
 """Half way, the Gaussians outgrow their capacity of 64."""
 
 
-@pytest.fixture(autouse=True)
-def compile_once(monkeypatch):
-    monkeypatch.setattr(trainer, "make_optimizer", make_optimizer)
-    monkeypatch.setattr(trainer, "make_epoch", make_epoch)
+pytestmark = pytest.mark.usefixtures("compile_once")
 
 
 @pytest.fixture(scope="module")

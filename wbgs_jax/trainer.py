@@ -28,7 +28,7 @@ from wbgs_jax.files import atomic_write
 from wbgs_jax.inference import predict_spectra
 from wbgs_jax.optim import make_optimizer
 from wbgs_jax.progress import TrainingProgress
-from wbgs_jax.splat import Capacity, fit_capacity, measure_capacity
+from wbgs_jax.splat import Capacity, fit_capacity
 from wbgs_jax.train_step import EpochReport, TrainState, init_state, make_epoch, training_data
 
 TILE_SLACK = 1.4
@@ -71,12 +71,13 @@ class Run:
         self.watched = np.sort(rng.choice(dataset.test, count, replace=False))
 
     def _start(self) -> tuple[TrainState, Capacity]:
-        config = self.settings.wideband
+        config = getattr(self.settings, self.field_name)
         surface = make_surface(self.dataset, config.gaussians, self.seed, config.sampling)
         capacity = density.capacity_bucket(len(surface.points))
         params = self.field.init(jax.random.key(self.seed), surface, config, capacity)
-        plan = self.field.plan(params, self.dataset.receiver)
-        return init_state(params, self.optimizer), measure_capacity(plan.geometry.splats, TILE_SLACK)
+        jobs = self.field.plan(params, self.dataset.receiver).geometry.jobs
+        capacity_of_tiles = fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), TILE_SLACK)
+        return init_state(params, self.optimizer), capacity_of_tiles
 
     def _build(self) -> None:
         """(Re)make the jitted epoch for the present tile capacity."""
