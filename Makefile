@@ -1,10 +1,11 @@
-# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; PYTHON for the set-up.
+# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PYTHON for set-up.
 SCENE  ?= 1
 FIELD  ?= wideband
 PRESET ?= $(if $(CUDA),gpu,cpu)
 DATA   ?=
 OUT    ?=
 SEED   ?= 0
+ARGS   ?=
 PYTHON ?= python3
 
 VENV   := .venv
@@ -50,8 +51,8 @@ simulator: setup  ## also install Sionna RT, which only `make data` needs
 		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev --extra data $(if $(CUDA),--extra cuda); \
 	else $(PY) -m pip install --quiet --disable-pip-version-check -r requirements-data.lock; fi
 
-data: simulator  ## trace a scene with Sionna RT: make data SCENE=1
-	$(PY) -m data_gen.generate --scene $(SCENE)
+data: simulator  ## trace a scene with Sionna RT, or go on with it: make data SCENE=1 [ARGS="--frequency-set 21"]
+	$(PY) -m data_gen.generate --scene $(SCENE) $(ARGS)
 
 lint: setup  ## ruff
 	$(PY) -m ruff check . && $(PY) -m ruff format --check .

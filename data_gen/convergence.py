@@ -1,6 +1,6 @@
-"""How many rays are enough: compares snapshots at several sample counts with those at the largest.
+"""How many rays are enough: the snapshots and spectra of fewer rays against those of the most.
 
-python -m data_gen.convergence --scene 1 --frequencies 1 10 94 --samples 50000 100000 400000 1000000
+python -m data_gen.convergence --scene 2 --effort 0.25 0.5 1 4
 """
 
 import dataclasses
@@ -8,76 +8,101 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Complex, Float
 
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
-from data_gen.settings import SolverSettings
-from wbgs_jax.errors import run_command
+from data_gen.settings import ArraySettings, SolverSettings
+from wbgs_jax.array import snapshot_to_pas
+from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.metrics import ssim
 
 TX_SEED = 0
 
 
 @dataclass(frozen=True)
 class Options:
-    """Compare snapshots at several sample counts with those at the largest."""
+    """Compare snapshots and spectra of several numbers of rays with those of the largest."""
 
     scene: int = 1
     """Number of the scene."""
     frequencies: tuple[float, ...] = (1.0, 10.0, 94.0)
     """GHz."""
-    samples: tuple[int, ...] = (50_000, 100_000, 400_000, 1_000_000)
-    """Rays for every transmitter, ascending; the last is the yardstick."""
-    tx: int = 10
+    effort: tuple[float, ...] = (0.25, 0.5, 1.0, 4.0)
+    """All numbers of rays times this, ascending; 1 is that of the released scenes, the last is the yardstick."""
+    tx: int = 16
     """Number of transmitters, drawn at random by a fixed seed."""
     diffraction: bool = True
     """First-order diffraction."""
+    depth: int = SolverSettings.max_depth
+    """Interactions a path may have."""
 
 
-def correlation(first: Complex[np.ndarray, "n elements"], second: Complex[np.ndarray, "n elements"]) -> Float[np.ndarray, "n"]:
+def correlation(
+    first: Complex[np.ndarray, "*n elements"], second: Complex[np.ndarray, "*n elements"]
+) -> Float[np.ndarray, "*n"]:
     """|a^H b| / (|a| |b|) of every pair of snapshots; 1 means equal images."""
     inner = np.abs((first.conj() * second).sum(-1))
     return inner / (np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1))
 
 
-def convergence(options: Options, frequency_hz: float) -> list[str]:
-    """One line of the table for every sample count at a frequency."""
+def settings(effort: float, diffraction: bool = True, depth: int = SolverSettings.max_depth) -> SolverSettings:
+    """The solver's settings with all numbers of rays times `effort`."""
+    usual = SolverSettings(diffraction=diffraction, max_depth=depth)
+    rays = ("samples_per_src", "rays_per_face", "rays_per_mirrored_face")
+    more = {name: max(1, round(getattr(usual, name) * effort)) for name in rays}
+    batch = max(1, int(usual.tx_per_call / max(effort, 1)))  # memory grows with rays x transmitters
+    room = round(usual.max_paths_per_src * max(effort, 1))
+    return dataclasses.replace(usual, tx_per_call=batch, max_paths_per_src=room, **more)
+
+
+def convergence(options: Options) -> list[str]:
+    """The lines of the table: one for every number of rays at every frequency."""
     from data_gen.solve import Simulator
 
     spec = get_scene(options.scene)
     tx = spec.accessible_tx()
     tx = tx[np.random.default_rng(TX_SEED).permutation(len(tx))[: options.tx]]
-    snapshots, seconds = [], []
-    for samples in options.samples:
-        settings = SolverSettings(samples_per_src=samples, diffraction=options.diffraction, tx_per_call=options.tx)
-        simulator = Simulator(
-            spec, dataclasses.replace(settings, max_paths_per_src=max(settings.max_paths_per_src, samples // 10))
-        )
-        simulator.set_frequency(frequency_hz)
-        simulator.paths(tx)  # compiles
+    frequencies = [ghz * 1e9 for ghz in options.frequencies]
+    snapshots, costs = [], []
+    for effort in options.effort:
+        simulator = Simulator(spec, settings(effort, options.diffraction, options.depth))
+        size = simulator.settings.tx_per_call
+        simulator.paths(tx[:size], frequencies)  # compiles
         start = time.perf_counter()
-        snapshots.append(np.stack([paths.snapshot() for paths in simulator.paths(tx)]))
-        seconds.append((time.perf_counter() - start) / len(tx))
-    return _lines(frequency_hz, options.samples, snapshots, seconds)
+        solved = [simulator.paths(tx[i : i + size], frequencies) for i in range(0, len(tx), size)]
+        costs.append((time.perf_counter() - start) / len(tx))
+        snapshots.append(np.concatenate([np.array([[p.snapshot() for p in row] for row in one]) for one in solved], 1))
+    return _lines(options, snapshots, costs)
 
 
-def _lines(frequency_hz: float, samples: Sequence[int], snapshots: list[np.ndarray], seconds: list[float]) -> list[str]:
+def _lines(options: Options, snapshots: Sequence[Complex[np.ndarray, "freq tx elements"]], costs: Sequence[float]) -> list[str]:
+    elements = jnp.asarray(ArraySettings().element_positions())
     lines = []
-    for count, snapshot, second in zip(samples, snapshots, seconds, strict=True):
-        same = correlation(snapshot, snapshots[-1])
-        lines.append(f"| {frequency_hz / 1e9:g} | {count:,} | {np.median(same):.4f} | {same.min():.4f} | {second:.3f} |")
+    for i, ghz in enumerate(options.frequencies):
+        best = snapshots[-1][i]
+        truth = np.asarray(snapshot_to_pas(jnp.asarray(best), elements))
+        for effort, cost, snapshot in zip(options.effort, costs, snapshots, strict=True):
+            same = correlation(snapshot[i], best)
+            score = ssim(np.asarray(snapshot_to_pas(jnp.asarray(snapshot[i]), elements)), truth)
+            cells = (f"{options.scene} | {ghz:g} | {effort:g}", *(f"{v:.3f}" for v in (np.median(same), same.min())),
+                     *(f"{v:.3f}" for v in (np.median(score), np.percentile(score, 10))), f"{cost:.2f}")  # fmt: skip
+            lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
 def main() -> None:
     """Command line."""
     options = tyro.cli(Options)
+    if not options.effort or min(options.effort) <= 0 or options.tx < 1:
+        raise UserError("--effort and --tx must be positive")
     ensure_backend()
-    print("| GHz | samples | median correlation | lowest | seconds a TX |\n|---|---|---|---|---|")
-    for ghz in options.frequencies:
-        print("\n".join(convergence(options, ghz * 1e9)), flush=True)
+    print("| scene | GHz | effort | median correlation | lowest | median SSIM | 10th percentile | seconds a TX |")
+    print("|---|---|---|---|---|---|---|---|")
+    print("\n".join(convergence(options)))
 
 
 if __name__ == "__main__":

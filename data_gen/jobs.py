@@ -1,9 +1,9 @@
-"""The long part of a generation, cut into chunks that survive an interruption.
+"""The long part of a generation, cut into batches that survive an interruption.
 
-A chunk is one batch of transmitters at one frequency, or the ceilings of one frequency. Its result is a file in a work folder,
-written whole or not at all; the folder's name contains a checksum of everything that decides a result, so a run finds what an
-earlier one with the same settings left, and never anything else. Chunks are independent: their order, the number of processes
-and interruptions do not change a bit.
+A batch is some transmitters at all frequencies. Its result is a file in a work folder, written whole or not at all; the
+folder's name contains a checksum of everything that decides a result, so a run finds what an earlier one with the same
+settings left, and never anything else. Batches are independent: neither their order nor the number of processes nor an
+interruption changes a bit.
 """
 
 import concurrent.futures
@@ -12,9 +12,9 @@ import importlib.metadata
 import json
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,15 +23,19 @@ from jaxtyping import Float
 
 from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
-from data_gen.settings import SolverSettings
+from data_gen.settings import ArraySettings, SolverSettings
 from wbgs_jax.errors import UserError
-from wbgs_jax.files import atomic_write, read_json, write_json
+from wbgs_jax.files import atomic_write
 
 if TYPE_CHECKING:
-    from data_gen.solve import Simulator
+    from data_gen.solve import Simulator, TxPaths
 
 PACKAGES = ("sionna-rt", "mitsuba", "drjit", "numpy")
 """Packages whose version may change a result."""
+
+Results = dict[str, np.ndarray]
+"""Arrays by name, the first axis that of the transmitters: `snapshots` (tx, freq, elements) complex64, `n_paths` (tx, freq),
+`line_of_sight` (tx, freq) bool, `delay_spread_s` (tx, freq) and `ceilings` (tx, freq, ceilings), NaN where not measured."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +46,15 @@ class Job:
     settings: SolverSettings
     tx_positions: Float[np.ndarray, "tx 3"]
     """World frame, metres."""
+    frequencies_hz: tuple[float, ...]
+    array: ArraySettings = field(default_factory=ArraySettings)
     ceiling_tx: tuple[int, ...] = ()
     """Which transmitters the ceilings are measured on."""
 
-    def batch(self, index: int) -> Float[np.ndarray, "batch 3"]:
-        """Transmitter positions of one batch."""
+    def batch(self, index: int) -> range:
+        """Indices of the transmitters of one batch."""
         size = self.settings.tx_per_call
-        return self.tx_positions[index * size : (index + 1) * size]
+        return range(index * size, min((index + 1) * size, len(self.tx_positions)))
 
     @property
     def n_batches(self) -> int:
@@ -56,25 +62,18 @@ class Job:
         return -(-len(self.tx_positions) // self.settings.tx_per_call)
 
     def digest(self, backend: str) -> str:
-        """Checksum of the scene, the transmitters, the settings and the versions; frequencies are in the chunks' names."""
+        """Checksum of the scene, the transmitters, the array, the frequencies, the settings and the versions."""
         decides = {
-            "mesh": self.spec.mesh_sha256(), "rx": self.spec.rx_position, "settings": asdict(self.settings),
+            "mesh": self.spec.mesh_sha256(), "rx": self.spec.rx_position, "orientation": self.spec.rx_orientation,
+            "settings": asdict(self.settings), "array": asdict(self.array), "frequencies": self.frequencies_hz,
             "tx": self.tx_positions.tolist(), "ceiling_tx": self.ceiling_tx, "versions": versions(), "backend": backend,
         }  # fmt: skip
         return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """One piece of work: a batch of transmitters at a frequency, or (batch None) the ceilings at a frequency."""
-
-    frequency_hz: float
-    batch: int | None
-
-    def file(self, folder: Path) -> Path:
-        """Where its result lies."""
-        name = "ceilings.json" if self.batch is None else f"{self.batch:04d}.npz"
-        return folder / f"{self.frequency_hz / 1e9:.9g}GHz" / name
+def batch_file(folder: Path, batch: int) -> Path:
+    """Where the result of a batch lies."""
+    return folder / f"{batch:04d}.npz"
 
 
 def versions() -> dict[str, str]:
@@ -82,22 +81,16 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
-def chunks(job: Job, frequencies_hz: tuple[float, ...]) -> list[Chunk]:
-    """All chunks, frequency by frequency because a new frequency recompiles."""
-    batches: list[int | None] = [*range(job.n_batches), *([None] if job.ceiling_tx else [])]
-    return [Chunk(f, b) for f in frequencies_hz for b in batches]
-
-
-def run(job: Job, todo: list[Chunk], folder: Path, workers: int, threads: int | None) -> Iterator[Chunk]:
-    """Compute chunks in `workers` processes with `threads` threads each, and yield every one when its file is written."""
+def run(job: Job, todo: list[int], folder: Path, workers: int, threads: int | None) -> Iterator[int]:
+    """Compute batches in `workers` processes with `threads` threads each, and yield every one when its file is written."""
     backend = find_backend()
     if workers == 1:
         _start(job, backend, threads)
-        yield from (_work(chunk, folder) for chunk in todo)
+        yield from (_work(batch, folder) for batch in todo)
         return
     context = multiprocessing.get_context("spawn")  # Dr.Jit and JAX have threads: a fork could hang
     with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (job, backend, threads)) as pool:
-        waiting = [pool.submit(_work, chunk, folder) for chunk in todo]
+        waiting = [pool.submit(_work, batch, folder) for batch in todo]
         try:
             for future in concurrent.futures.as_completed(waiting):
                 yield future.result()
@@ -120,40 +113,51 @@ def _start(job: Job, backend: tuple[str, str], threads: int | None) -> None:
 
     if threads is not None:
         dr.set_thread_count(threads)
-    _simulator, _job = Simulator(job.spec, job.settings), job
+    _simulator, _job = Simulator(job.spec, job.settings, job.array), job
 
 
 def _start_worker(job: Job, backend: tuple[str, str], threads: int | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets chunks in progress finish
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets batches in progress finish
     _start(job, backend, threads)
 
 
-def _work(chunk: Chunk, folder: Path) -> Chunk:
-    file = chunk.file(folder)
-    read_back = _simulator.set_frequency(chunk.frequency_hz)
-    if chunk.batch is None:
-        from data_gen.ceilings import measure
+def _work(batch: int, folder: Path) -> int:
+    chosen = _job.batch(batch)
+    by_frequency = _simulator.paths(_job.tx_positions[chosen], _job.frequencies_hz)
+    found = [_measure(_job, tx, [paths[i] for paths in by_frequency]) for i, tx in enumerate(chosen)]
+    if not any(one["n_paths"].any() for one in found):
+        raise UserError(
+            f"no path between the receiver and transmitters {chosen[0]} to {chosen[-1]}, at any frequency; "
+            "check the scene (units, up axis, a closed metal box?), the receiver's place and --tx-grid"
+        )
+    read_back = [_simulator.read_back_hz[f] for f in _job.frequencies_hz]
+    arrays: dict[str, Any] = {key: np.stack([one[key] for one in found]) for key in found[0]}
+    with atomic_write(batch_file(folder, batch)) as stream:
+        np.savez(stream, read_back_hz=read_back, **arrays)
+    return batch
 
-        write_json(file, measure(_simulator, _job.tx_positions[list(_job.ceiling_tx)]))
-        return chunk
-    paths = _simulator.paths(_job.batch(chunk.batch))
-    snapshots = np.stack([p.snapshot() for p in paths])
-    with atomic_write(file) as stream:
-        np.savez(stream, snapshots=snapshots, n_paths=[len(p.delays) for p in paths], frequency_hz=read_back)
-    return chunk
+
+def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
+    """The arrays of `Results` for one transmitter, of its paths at every frequency."""
+    from data_gen import ceilings
+
+    elements = job.array.element_positions()
+    nothing = np.full(len(ceilings.NAMES), np.nan)
+    measured = [ceilings.measure(p, elements) if tx in job.ceiling_tx else nothing for p in paths]
+    return {
+        "snapshots": np.stack([p.snapshot() for p in paths]),
+        "n_paths": np.array([len(p.delays) for p in paths]),
+        "line_of_sight": np.array([bool((p.order == 0).any()) for p in paths]),
+        "delay_spread_s": np.array([p.delay_spread() for p in paths]),
+        "ceilings": np.stack(measured),
+    }
 
 
-def collect(job: Job, frequencies_hz: tuple[float, ...], folder: Path) -> dict[str, Any]:
-    """Put the finished chunks together.
-
-    Returns:
-        snapshots (tx, freq, elements) complex64, n_paths (tx, freq) int64, read_back_hz and ceilings (one entry a frequency).
-    """
-    results = [[_load(Chunk(f, b).file(folder)) for b in range(job.n_batches)] for f in frequencies_hz]
-    stack: Callable[[str], np.ndarray] = lambda key: np.stack([np.concatenate([r[key] for r in row]) for row in results], 1)  # noqa: E731
-    ceilings = [read_json(Chunk(f, None).file(folder)) for f in frequencies_hz] if job.ceiling_tx else []
-    read_back = [float(row[0]["frequency_hz"]) for row in results]
-    return {"snapshots": stack("snapshots"), "n_paths": stack("n_paths"), "read_back_hz": read_back, "ceilings": ceilings}
+def collect(job: Job, folder: Path) -> Results:
+    """Put the finished batches together; `read_back_hz` (freq,) beside the arrays of `Results`."""
+    batches = [_load(batch_file(folder, b)) for b in range(job.n_batches)]
+    read_back = [b.pop("read_back_hz") for b in batches]
+    return {"read_back_hz": read_back[0], **{key: np.concatenate([b[key] for b in batches]) for key in batches[0]}}
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:

@@ -1,21 +1,58 @@
 """What decides the result of a solve, apart from the scene itself. Imports no simulator."""
 
 from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax.array import planar_array
 
 
 @dataclass(frozen=True)
 class SolverSettings:
     """Settings of Sionna RT's path solver. Line of sight, specular reflection and transmission are always on."""
 
-    max_depth: int = 4
-    """Interactions a path may have."""
-    samples_per_src: int = 400_000
-    """Rays that search for paths, for every transmitter (see README.md for the convergence)."""
+    max_depth: int = 6
+    """Interactions a path may have. Passing through a wall is one, through a piece of furniture two."""
+    samples_per_src: int = 300_000
+    """Rays from every transmitter, even over the sphere (the dataset card has the convergence)."""
+    rays_per_face: int = 32
+    """Rays aimed at every triangle of every solid ..."""
+    rays_per_mirrored_face: int = 4
+    """... and at its mirror image in every wall, floor and ceiling (`rays.py`)."""
     diffraction: bool = True
-    """First-order diffraction at the edges of furniture."""
-    max_paths_per_src: int = 60_000
+    """First-order diffraction at the edges of solids."""
+    diffraction_probability: float = 0.7
+    """Of the search: how often a ray that meets an edge is diffracted rather than reflected or transmitted."""
+    max_paths_per_src: int = 400_000
     """Room for candidate paths of one transmitter; a full buffer is an error, never a silent loss."""
     seed: int = 42
-    """Of the solver's choice between reflection and transmission."""
-    tx_per_call: int = 16
+    """Of the aimed rays and of the solver's choice between reflection and transmission."""
+    tx_per_call: int = 8
     """Transmitters traced together. It belongs to the settings: random numbers depend on the place in a batch."""
+
+
+@dataclass(frozen=True)
+class ArraySettings:
+    """The receiver's array. The default is that of the published sample (shapes and phases: `wbgs_jax/array.py`)."""
+
+    rows: int = 4
+    columns: int = 4
+    spacing: float = 0.5
+    """Between neighbouring elements, in wavelengths: the array follows the frequency."""
+    plane: Literal["yz", "xy", "xz"] = "yz"
+    """Plane of the receiver's local frame that the elements lie in."""
+    pattern: Literal["tr38901", "iso", "dipole", "hw_dipole"] = "tr38901"
+    """Of every element, boresight along local +x whatever the plane: directional (3GPP TR 38.901), isotropic, short or
+    half-wavelength dipole."""
+    polarization: Literal["V", "H"] = "V"
+
+    def element_positions(self) -> Float[np.ndarray, "elements 3"]:
+        """Local positions in wavelengths, centred on the origin.
+
+        In the y-z plane columns run along +y and rows down -z; in the x-y plane rows run along -x, in the x-z plane columns
+        along +x instead.
+        """
+        x, y, z = planar_array(self.rows, self.columns, self.spacing).T
+        return np.stack({"yz": (x, y, z), "xy": (z, y, x), "xz": (y, x, z)}[self.plane], -1)

@@ -1,6 +1,7 @@
-"""Traces one scene with Sionna RT and turns paths into snapshots that are bit-identical between runs.
+"""Traces a scene with Sionna RT and turns paths into snapshots that are bit-identical between runs.
 
 What the simulator leaves to its user, and this module does:
+* Rays are traced once for all frequencies: where paths run does not depend on the frequency, only what they carry does.
 * `scene.frequency` stays at 3.5 GHz unless set: it is set and read back.
 * `paths.a` carries no exp(-j 2 pi f tau): the carrier phase is applied here, with f * tau in float64.
 * Equal solves return equal paths in another order: paths are sorted before they are summed in complex128.
@@ -10,25 +11,21 @@ Import this module only after `data_gen.llvm.ensure_backend()`.
 """
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import drjit as dr
+import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
 from jaxtyping import Complex, Float, Int
-from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
 
 from data_gen.materials import check_frequency
-from data_gen.scenes.base import IDENTITY, SceneSpec
-from data_gen.settings import SolverSettings
-from wbgs_jax.array import planar_array
-from wbgs_jax.errors import UserError
+from data_gen.rays import RayLauncher
+from data_gen.scenes.base import SceneSpec
+from data_gen.settings import ArraySettings, SolverSettings
+from data_gen.trace import BalancedMaterial, PathTracer
 
-RX_ROWS = RX_COLUMNS = 4
-SPACING = 0.5
-"""Element spacing in wavelengths: the array follows the frequency."""
 FREQUENCY_TOLERANCE = 1e-6
 """Sionna holds the frequency in float32; more than this relative difference is a mistake."""
 
@@ -48,99 +45,87 @@ class TxPaths:
         """Coherent sum of the paths, complex64."""
         return self.coefficients.sum(0).astype(np.complex64)
 
+    def delay_spread(self) -> float:
+        """R.m.s. delay spread in seconds, weighted by power; 0 without a path."""
+        power = (np.abs(self.coefficients) ** 2).sum(-1)
+        if not power.sum() > 0:
+            return 0.0
+        mean = np.average(self.delays, weights=power)
+        return float(np.sqrt(np.average((self.delays - mean) ** 2, weights=power)))
+
 
 class Simulator:
-    """A scene loaded into Sionna RT. Set a frequency first: a new one recompiles, so loop over frequencies outside."""
+    """A scene loaded into Sionna RT."""
 
-    def __init__(self, spec: SceneSpec, settings: SolverSettings) -> None:
-        if spec.rx_orientation != IDENTITY:
-            raise UserError(f"scene {spec.name}: a turned receiver is not supported; use the identity orientation")
+    def __init__(self, spec: SceneSpec, settings: SolverSettings, array: ArraySettings | None = None) -> None:
         self.settings = settings
-        self.frequency_hz = 0.0
-        self._scene = _load(spec)
-        self._solver = rt.PathSolver(deterministic=True)
-        # The cap acts on candidates, which only the generator knows; `paths` keeps those that turned out to exist.
-        self._candidates = _CountingGenerator()
-        if not hasattr(self._solver, "_candidate_generator"):
-            raise UserError("full path buffers would go unseen with this sionna-rt; install 2.1 or 2.2")
-        self._solver._candidate_generator = self._candidates
+        self.array = array or ArraySettings()
+        self.read_back_hz: dict[float, float] = {}
+        """What the simulator reported (hertz, float32 inside) for every frequency that was asked."""
+        self._scene = _load(spec, self.array)
+        self._tracer = PathTracer(self._scene, RayLauncher(spec, settings), settings)
 
-    def set_frequency(self, frequency_hz: float) -> float:
-        """Set the carrier (hertz) of scene and materials; returns the value read back from the scene (float32 inside)."""
+    def paths(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]) -> list[list[TxPaths]]:
+        """All paths from every transmitter (world frame, metres) to the receiver: a list of transmitters a frequency (hertz).
+
+        Random numbers belong to the place in the batch: the same batch gives the same bits, another grouping almost the same.
+
+        Raises:
+            UserError: a frequency at which the materials are not defined, or a full path buffer.
+        """
+        for name in list(self._scene.transmitters):
+            self._scene.remove(name)
+        for i, position in enumerate(tx_positions):
+            self._scene.add(rt.Transmitter(f"tx{i}", position=[float(value) for value in position]))
+        self._set_frequency(frequencies_hz[0])
+        traced = self._tracer.trace()
+        result = []
+        for frequency in frequencies_hz:
+            self._set_frequency(frequency)
+            result.append(_by_transmitter(self._tracer.fields(traced), frequency, len(tx_positions)))
+        return result
+
+    def _set_frequency(self, frequency_hz: float) -> None:
         self._scene.frequency = check_frequency(frequency_hz)
         read_back = float(np.array(self._scene.frequency).item())
         if abs(read_back / frequency_hz - 1) > FREQUENCY_TOLERANCE:
             raise RuntimeError(f"asked Sionna RT for {frequency_hz} Hz, it reports {read_back} Hz")
-        self.frequency_hz = frequency_hz
-        return read_back
-
-    def paths(self, tx_positions: Float[np.ndarray, "tx 3"]) -> list[TxPaths]:
-        """All paths from every transmitter (world frame, metres) to the receiver at the frequency that was set.
-
-        Random numbers belong to the place in the batch: the same batch gives the same bits, another grouping almost the same.
-        """
-        if self.frequency_hz == 0:
-            raise RuntimeError("set a frequency first")
-        self._place_transmitters(tx_positions)
-        options = self.settings
-        found = self._solver(
-            self._scene, max_depth=options.max_depth, samples_per_src=options.samples_per_src, seed=options.seed,
-            max_num_paths_per_src=options.max_paths_per_src, synthetic_array=True, los=True, specular_reflection=True,
-            diffuse_reflection=False, refraction=True, diffraction=options.diffraction, edge_diffraction=False,
-        )  # fmt: skip
-        full = np.flatnonzero(self._candidates.per_source >= options.max_paths_per_src)
-        if len(full):
-            where = f"transmitter {full[0]} of the batch and {len(full) - 1} more"
-            raise UserError(f"more than {options.max_paths_per_src} candidate paths at {where}; raise --max-paths")
-        return _by_transmitter(found, self.frequency_hz, len(tx_positions))
-
-    def _place_transmitters(self, positions: Float[np.ndarray, "tx 3"]) -> None:
-        for name in list(self._scene.transmitters):
-            self._scene.remove(name)
-        for i, position in enumerate(positions):
-            self._scene.add(rt.Transmitter(f"tx{i}", position=[float(value) for value in position]))
+        self.read_back_hz[frequency_hz] = read_back
 
 
-class _CountingGenerator(SBDeterministicCandidateGenerator):
-    """Sionna's deterministic candidate generator, which also tells how many candidates every transmitter got."""
-
-    per_source: Int[np.ndarray, "tx"]
-
-    def __call__(self, mi_scene: Any, src_positions: Any, *args: Any, **kwargs: Any) -> Any:
-        paths = super().__call__(mi_scene, src_positions, *args, **kwargs)
-        paths.schedule()
-        dr.eval()
-        stored = int(np.array(paths.paths_counter).item())
-        sources = np.array(paths.source_indices)[:stored]
-        self.per_source = np.bincount(sources, minlength=dr.width(src_positions))
-        return paths
-
-
-def _load(spec: SceneSpec) -> rt.Scene:
+def _load(spec: SceneSpec, array: ArraySettings) -> rt.Scene:
     scene = rt.load_scene()
     objects = []
     with tempfile.TemporaryDirectory() as folder:
-        for part in spec.parts:
-            file = Path(folder) / f"{part.name}.ply"
+        for i, part in enumerate(spec.parts):  # numbered: a user's object may have a name that no file can have
+            file = Path(folder) / f"{i}.ply"
             part.mesh.export(file)
-            material = rt.ITURadioMaterial(f"{part.name}-material", part.material, thickness=part.thickness)
-            objects.append(rt.SceneObject(fname=str(file), name=part.name, radio_material=material))
+            material = BalancedMaterial(f"material-{i}", part.material, thickness=part.thickness)
+            material.encloses = part.kind == "shell"
+            objects.append(rt.SceneObject(fname=str(file), name=f"part-{i}", radio_material=material))
         scene.edit(add=objects)
-    spacing = {"vertical_spacing": SPACING, "horizontal_spacing": SPACING, "polarization": "V"}
-    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", **spacing)
-    scene.rx_array = rt.PlanarArray(num_rows=RX_ROWS, num_cols=RX_COLUMNS, pattern="tr38901", **spacing)
-    scene.add(rt.Receiver("rx", position=list(spec.rx_position), orientation=[0.0, 0.0, 0.0]))
-    elements = np.array(scene.rx_array.normalized_positions).T
-    if not np.array_equal(elements, planar_array(RX_ROWS, RX_COLUMNS, SPACING)):
-        raise RuntimeError("Sionna RT numbers the elements of its PlanarArray differently from wbgs_jax.array.planar_array")
+    one = {"num_rows": 1, "num_cols": 1}
+    scene.tx_array = rt.PlanarArray(**one, pattern="iso", polarization="V")
+    scene.rx_array = rt.PlanarArray(**one, pattern=array.pattern, polarization=array.polarization)
+    scene.rx_array.normalized_positions = mi.Point3f(np.asarray(array.element_positions(), np.float32).T)
+    scene.add(rt.Receiver("rx", position=list(spec.rx_position), orientation=_yaw_pitch_roll(spec.rx_orientation)))
     return scene
+
+
+def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
+    """Sionna's orientation (radians; R = Rz Ry Rx) of a unit quaternion (wxyz, local to world)."""
+    w, x, y, z = quaternion
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return [float(yaw), float(pitch), float(roll)]
 
 
 def _by_transmitter(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[TxPaths]:
     # a: (receiver, element, tx, tx element, path); tau, valid: (receiver, tx, path); interactions: (depth, receiver, tx, path).
-    if found.tau.shape[-1] == 0:
-        return [_sorted_paths(np.zeros((0, RX_ROWS * RX_COLUMNS), complex), np.zeros(0), np.zeros(0, int))] * n_tx
     real, imaginary = (np.array(x)[0, :, :, 0].astype(np.float64) for x in found.a)
+    if found.tau.shape[-1] == 0:
+        return [_sorted_paths(np.zeros((0, len(real)), complex), np.zeros(0), np.zeros(0, int))] * n_tx
     delays = np.array(found.tau)[0].astype(np.float64)
     carrier = np.exp(-2j * np.pi * np.mod(frequency_hz * delays, 1.0))
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]

@@ -6,7 +6,6 @@ therefore stands `GAP` above the floor and is built of boxes that are `JOINT` ap
 """
 
 import hashlib
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +14,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from data_gen.materials import THICKNESS, check_material
+from data_gen.scenes.geometry import Vec3, box_distance, crossings, distance, winding_number
 from wbgs_jax.errors import UserError
 
 GAP = 0.01
@@ -26,8 +26,12 @@ TX_CLEARANCE = 0.10
 RX_CLEARANCE = 0.50
 """A transmitter is at least this far (metres) from the receiver, and the receiver from every surface."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
-Vec3 = tuple[float, float, float]
+FREQUENCIES_HZ = tuple(ghz * 1e9 for ghz in (1.0, 2.4, 5.0, 10.0, 24.25, 37.0, 47.0, 60.0, 77.0, 94.0))
+"""The ten frequencies of the paper's Table 4, those of every scene."""
+FREQUENCIES_21_HZ = tuple(ghz * 1e9 for ghz in (1.0, *np.arange(5.0, 101.0, 5.0).tolist()))
+"""1, 5, 10, ..., 100 GHz: a finer sampling of the same band."""
+KINDS = ("shell", "partition", "solid")
+"""What a part is: a piece of the room's outer surface, a single sheet inside the room, or a closed body."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +43,21 @@ class Part:
     material: str
     thickness: float
     """Slab thickness in metres."""
-    closed: bool = True
-    """A solid (furniture) rather than a piece of the room's surface."""
+    kind: str = "solid"
+    """One of `KINDS`."""
+
+    @property
+    def closed(self) -> bool:
+        """A body with an inside, rather than a single sheet."""
+        return self.kind == "solid"
 
 
-def part(name: str, mesh: trimesh.Trimesh, material: str, thickness: float | None = None, closed: bool = True) -> Part:
+def part(name: str, mesh: trimesh.Trimesh, material: str, thickness: float | None = None, kind: str = "solid") -> Part:
     """A part with a checked material and, unless given, that material's default thickness (metres)."""
     check_material(material)
-    return Part(name, mesh, material, THICKNESS[material] if thickness is None else thickness, closed)
+    if kind not in KINDS:
+        raise ValueError(f"a part is one of {KINDS}, not {kind!r}")
+    return Part(name, mesh, material, THICKNESS[material] if thickness is None else thickness, kind)
 
 
 @dataclass(frozen=True)
@@ -58,29 +69,50 @@ class SceneSpec:
     rx_position: Vec3
     tx_grid: Float[np.ndarray, "candidates 3"]
     """Candidate transmitter positions; `accessible_tx` picks those that can be reached."""
-    frequencies_hz: tuple[float, ...]
+    frequencies_hz: tuple[float, ...] = FREQUENCIES_HZ
     rx_orientation: tuple[float, float, float, float] = IDENTITY
     description: str = field(default="")
 
     @property
-    def furniture(self) -> tuple[Part, ...]:
-        """The closed parts."""
+    def solids(self) -> tuple[Part, ...]:
+        """The closed bodies: furniture, door frames, pillars."""
         return tuple(p for p in self.parts if p.closed)
+
+    def triangles(self, *kinds: str) -> Float[np.ndarray, "m 3 3"]:
+        """Corners of all triangles of the parts of some kinds, of all kinds unless given."""
+        found = [np.asarray(p.mesh.triangles) for p in self.parts if p.kind in (kinds or KINDS)]
+        return np.concatenate([np.zeros((0, 3, 3)), *found])
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Lowest and highest corner of the room."""
         corners = np.concatenate([p.mesh.bounds for p in self.parts])
         return np.stack([corners.min(0), corners.max(0)])
 
+    def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
+        low, high = self.bounds()
+        outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # askew, to meet no edge of a wall
+        return crossings(self.triangles("shell"), points, outside) % 2 == 1
+
+    def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """From which points nothing, not even glass, hides the receiver."""
+        return crossings(self.triangles(), points, np.asarray(self.rx_position)) == 0
+
     def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points are inside a piece of furniture."""
-        inside = [np.abs(winding_number(p.mesh, points)) > 0.5 for p in self.furniture]
-        return np.any([np.zeros(len(points), bool), *inside], axis=0)
+        """Which points are inside a solid."""
+        inside = np.zeros(len(points), bool)
+        for p in self.solids:
+            near = box_distance(p.mesh, points) == 0
+            inside[near] |= np.abs(winding_number(p.mesh, points[near])) > 0.5
+        return inside
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance (metres) of every point to the nearest surface."""
-        each = [trimesh.proximity.closest_point_naive(p.mesh, points)[1] for p in self.parts]
-        return np.min(each, axis=0)
+        nearest = np.full(len(points), np.inf)
+        for p in self.parts:
+            closer = box_distance(p.mesh, points) < nearest  # the others need no look at the triangles
+            nearest[closer] = np.minimum(nearest[closer], distance(p.mesh, points[closer]))
+        return nearest
 
     def accessible_tx(self) -> Float[np.ndarray, "tx 3"]:
         """The candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.
@@ -90,9 +122,7 @@ class SceneSpec:
         """
         self.check_receiver()
         grid = np.asarray(self.tx_grid, np.float64)
-        low, high = self.bounds()
-        keep = ((grid > low) & (grid < high)).all(1)
-        keep &= ~self.inside_objects(grid) & (self.distance(grid) >= TX_CLEARANCE)
+        keep = self.in_room(grid) & ~self.inside_objects(grid) & (self.distance(grid) >= TX_CLEARANCE)
         keep &= np.linalg.norm(grid - self.rx_position, axis=1) >= RX_CLEARANCE
         if not keep.any():
             raise UserError(f"no transmitter position of scene {self.name} is accessible; change its grid or its furniture")
@@ -101,9 +131,7 @@ class SceneSpec:
     def check_receiver(self) -> None:
         """Raise a `UserError` when the receiver is outside the room, inside an object or too near to a surface."""
         point = np.asarray([self.rx_position], np.float64)
-        low, high = self.bounds()
-        outside = not ((point > low) & (point < high)).all()
-        if outside or self.inside_objects(point)[0] or self.distance(point)[0] < RX_CLEARANCE:
+        if not self.in_room(point)[0] or self.inside_objects(point)[0] or self.distance(point)[0] < RX_CLEARANCE:
             raise UserError(f"the receiver of scene {self.name} at {self.rx_position} is not {RX_CLEARANCE} m clear; move it")
 
     def mesh_arrays(self) -> dict[str, np.ndarray]:
@@ -130,20 +158,3 @@ def grid_3d(low: Vec3, high: Vec3, counts: tuple[int, int, int]) -> Float[np.nda
     """A uniform grid with both ends included, x slowest, z fastest."""
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-
-
-def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """How often a closed mesh goes around every point: 0 outside, 1 or -1 inside (sum of the triangles' solid angles)."""
-    a, b, c = (np.asarray(mesh.triangles)[None, :, i] - points[:, None] for i in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-    triple = np.einsum("nmi,nmi->nm", a, np.cross(b, c))
-    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    return np.arctan2(triple, below).sum(1) / (2 * np.pi)
-
-
-def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several bodies as one mesh."""
-    meshes = list(meshes)
-    offsets = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    faces = [np.asarray(m.faces) + start for m, start in zip(meshes, offsets, strict=False)]
-    return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)

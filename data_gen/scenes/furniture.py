@@ -1,24 +1,15 @@
-"""Furniture and room surfaces as meshes. Everything stands on the floor (z = GAP) centred on (x, y); metres, z up.
+"""Furniture as meshes. Everything stands on the floor (z = GAP) centred on (x, y); metres, z up.
 
 `facing` turns a piece about the vertical by quarter turns: 0 looks towards +y, 1 towards -x, 2 towards -y, 3 towards +x.
 """
 
-import itertools
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 import trimesh
 
-from data_gen.scenes.base import GAP, JOINT, Part, Vec3, merge, part
+from data_gen.scenes.base import GAP, JOINT
+from data_gen.scenes.geometry import box, merge
 
 LAMP_SIDES = 8  # a round shade would be hundreds of triangles and as many diffracting edges
-
-
-def box(low: Vec3, high: Vec3) -> trimesh.Trimesh:
-    """A closed axis-aligned box."""
-    mesh = trimesh.creation.box(extents=np.subtract(high, low))
-    mesh.apply_translation(np.add(low, high) / 2)
-    return mesh
 
 
 def place(mesh: trimesh.Trimesh, x: float, y: float, facing: int = 0) -> trimesh.Trimesh:
@@ -95,47 +86,65 @@ def prism(radius: float, bottom: float, top: float) -> trimesh.Trimesh:
     return mesh
 
 
-Rectangle = tuple[float, float, float, float]
-"""(u low, v low, u high, v high) in the coordinates of a wall, metres."""
+def bed(width: float, length: float = 2.0) -> trimesh.Trimesh:
+    """A bed whose foot is towards +y: base, mattress, pillow and a board behind the head."""
+    half, head, foot = width / 2, -length / 2, length / 2
+    start = head + 0.05 + JOINT
+    board = box((-half, head, 0), (half, head + 0.05, 0.85))
+    base = box((-half + 0.04, start, 0), (half - 0.04, foot - 0.04, 0.24))
+    mattress = box((-half, start, 0.24 + JOINT), (half, foot, 0.43))
+    pillow = box((-half + 0.08, start + 0.05, 0.43 + JOINT), (half - 0.08, start + 0.45, 0.49))
+    return merge([board, base, mattress, pillow])
 
 
-def wall(
-    name: str, corner: Vec3, along: Vec3, up: Vec3, size: tuple[float, float], material: str,
-    openings: Mapping[str, tuple[Rectangle, str]] | None = None,
-) -> list[Part]:  # fmt: skip
-    """A rectangular surface with doors or windows flush in it.
-
-    The rectangle is cut along the lines of all openings; a cell belongs to the opening that covers it, otherwise to the wall.
-    The parts meet at shared vertices, without a hole and without overlap.
-
-    Args:
-        corner, along, up: the point (0, 0) of the surface and its two unit directions.
-        size: lengths (metres) along the two directions.
-        openings: by name a rectangle in the surface's coordinates and a material.
-    """
-    openings = openings or {}
-    rectangles = [rectangle for rectangle, _ in openings.values()]
-    us = np.unique([0.0, size[0], *(r[i] for r in rectangles for i in (0, 2))])
-    vs = np.unique([0.0, size[1], *(r[i] for r in rectangles for i in (1, 3))])
-    cells: dict[str, list[Rectangle]] = {name: [], **{key: [] for key in openings}}
-    for u0, u1 in itertools.pairwise(us):
-        for v0, v1 in itertools.pairwise(vs):
-            cells[_owner(openings, (u0 + u1) / 2, (v0 + v1) / 2) or name].append((u0, v0, u1, v1))
-    materials = {name: material, **{key: value[1] for key, value in openings.items()}}
-    return [part(key, _sheet(found, corner, along, up), materials[key], closed=False) for key, found in cells.items()]
+def wardrobe(width: float, depth: float = 0.58, height: float = 2.0) -> trimesh.Trimesh:
+    """A wardrobe with two doors towards +y."""
+    half, front, leaf = width / 2, depth / 2, 0.02
+    body = box((-half, -front, 0), (half, front - leaf - JOINT, height))
+    doors = [box((a, front - leaf, 0.06), (a + half - 0.005, front, height)) for a in (-half, 0.005)]
+    return merge([body, *doors])
 
 
-def _owner(openings: Mapping[str, tuple[Rectangle, str]], u: float, v: float) -> str | None:
-    for key, ((u0, v0, u1, v1), _) in openings.items():
-        if u0 < u < u1 and v0 < v < v1:
-            return key
-    return None
+def desk(width: float, depth: float = 0.7, height: float = 0.74) -> trimesh.Trimesh:
+    """A desk whose sitter is on the +y side: board, a side panel and drawers."""
+    half, front, under = width / 2, depth / 2, height - 0.03 - JOINT
+    board = box((-half, -front, height - 0.03), (half, front, height))
+    panel = box((-half, -front, 0), (-half + 0.03, front, under))
+    drawers = box((half - 0.42, -front, 0.05), (half, front - 0.05, under))
+    return merge([board, panel, drawers])
 
 
-def _sheet(cells: Sequence[Rectangle], corner: Vec3, along: Vec3, up: Vec3) -> trimesh.Trimesh:
-    uv = np.array([[(a, b), (c, b), (c, d), (a, d)] for a, b, c, d in cells]).reshape(-1, 2)
-    vertices = np.asarray(corner) + uv[:, :1] * np.asarray(along) + uv[:, 1:] * np.asarray(up)
-    faces = (4 * np.arange(len(cells))[:, None] + np.array([[[0, 1, 2]], [[0, 2, 3]]])).reshape(-1, 3)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.merge_vertices()
-    return mesh
+def office_chair(seat: float = 0.46, height: float = 0.84) -> trimesh.Trimesh:
+    """A chair on one column whose sitter looks towards +y."""
+    base = box((-0.26, -0.26, 0.02), (0.26, 0.26, 0.06))
+    column = box((-0.03, -0.03, 0.06 + JOINT), (0.03, 0.03, seat - 0.06 - JOINT))
+    cushion = box((-0.24, -0.24, seat - 0.06), (0.24, 0.24, seat))
+    back = box((-0.22, -0.24, seat + JOINT), (0.22, -0.19, height))
+    return merge([base, column, cushion, back])
+
+
+def bench(width: float, depth: float = 0.35, height: float = 0.45) -> trimesh.Trimesh:
+    """A board on two side panels."""
+    half, front, under = width / 2, depth / 2, height - 0.04
+    board = box((-half, -front, under), (half, front, height))
+    panels = [box((a, -front + 0.03, 0), (a + 0.04, front - 0.03, under - JOINT)) for a in (-half + 0.1, half - 0.14)]
+    return merge([board, *panels])
+
+
+def monitor(bottom: float, width: float = 0.6) -> trimesh.Trimesh:
+    """A computer display on a foot that looks towards +y and stands on something `bottom` high."""
+    low = bottom + JOINT
+    foot = box((-0.13, -0.09, low), (0.13, 0.09, low + 0.02))
+    return merge([foot, box((-width / 2, -0.02, low + 0.02 + JOINT), (width / 2, 0.02, low + 0.38))])
+
+
+def counter(width: float, depth: float = 0.6, height: float = 0.85) -> trimesh.Trimesh:
+    """Kitchen base units with a worktop, looking towards +y."""
+    half, front = width / 2, depth / 2
+    units = box((-half, -front, 0), (half, front - 0.04, height - 0.04 - JOINT))
+    return merge([units, box((-half, -front, height - 0.04), (half, front, height))])
+
+
+def wall_cupboard(width: float, depth: float = 0.35, bottom: float = 1.45, top: float = 2.1) -> trimesh.Trimesh:
+    """A closed cupboard that hangs on a wall."""
+    return box((-width / 2, -depth / 2, bottom), (width / 2, depth / 2, top))

@@ -13,7 +13,8 @@ Plan (x to the right, y up); the receiver R looks along +x:
 """
 
 from data_gen.scenes.base import Part, SceneSpec, grid_3d, part
-from data_gen.scenes.furniture import cabinet, chair, lamp, place, screen, shelf, sofa, table, wall
+from data_gen.scenes.furniture import cabinet, chair, lamp, place, screen, shelf, sofa, table
+from data_gen.scenes.walls import wall
 
 WIDTH, DEPTH, HEIGHT = 10.0, 7.5, 3.0
 """Size of the room along x, y and z in metres."""
@@ -25,9 +26,6 @@ upper half of the directions only."""
 TX_COUNTS = (15, 10, 6)
 TX_LOW, TX_HIGH = (-4.6, -3.35, 0.5), (4.6, 3.35, 2.6)
 """Corners of the grid of 900 candidates: 0.4 m from the walls, from seat height to near the ceiling."""
-
-FREQUENCIES_HZ = tuple(ghz * 1e9 for ghz in (1.0, 2.4, 5.0, 10.0, 24.25, 37.0, 47.0, 60.0, 77.0, 94.0))
-"""The ten frequencies of the paper's Table 4."""
 
 DINING = (2.4, 0.6)
 """Middle of the dining table."""
@@ -41,7 +39,6 @@ def scene1() -> SceneSpec:
         parts=(*_room(), *_furniture()),
         rx_position=RX_POSITION,
         tx_grid=grid_3d(TX_LOW, TX_HIGH, TX_COUNTS),
-        frequencies_hz=FREQUENCIES_HZ,
     )
 
 

@@ -1,32 +1,54 @@
 """The command line: an interrupted run goes on to the same bytes, and mistakes are told in one line."""
 
 import dataclasses
+import functools
 import importlib.util
 import json
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from data_gen import generate as module
 from data_gen import jobs, llvm
-from data_gen.generate import Options, generate
+from data_gen.generate import generate
+from data_gen.options import Options, make_job
 from data_gen.scenes import get_scene
+from data_gen.settings import ArraySettings, SolverSettings
 from wbgs_jax.array import planar_array
 from wbgs_jax.data.schema import load_scene
 from wbgs_jax.errors import UserError
 
 
 def options(folder, **changes):
-    """Two batches at two frequencies and the ceilings, as small as it gets."""
+    """Three batches at two frequencies, as small as it gets."""
     quick = Options(
-        out=folder / "scene.npz", work=folder / "work", frequencies=(2.4, 60.0), samples=500, depth=1, max_paths=500, max_tx=20
+        out=folder / "scene.npz",
+        work=folder / "work",
+        frequencies=(2.4, 60.0),
+        samples=500,
+        depth=1,
+        max_paths=20_000,
+        max_tx=20,
     )
     return dataclasses.replace(quick, **changes)
 
 
+@pytest.fixture(autouse=True)
+def few_aimed_rays(monkeypatch):
+    """The search is not the subject here."""
+    few = functools.partial(SolverSettings, rays_per_face=1, rays_per_mirrored_face=0)
+    monkeypatch.setattr("data_gen.options.SolverSettings", few)
+
+
 @pytest.fixture(scope="module")
 def uninterrupted(simulator_backend, tmp_path_factory):
-    return generate(options(tmp_path_factory.mktemp("whole")))
+    with pytest.MonkeyPatch.context() as patch:
+        few_aimed_rays.__wrapped__(patch)
+        return generate(options(tmp_path_factory.mktemp("whole")))
 
 
 def test_the_scene_file_is_complete(uninterrupted):
@@ -39,14 +61,19 @@ def test_the_scene_file_is_complete(uninterrupted):
     meta = scene.meta
     assert meta["mesh_sha256"] == spec.mesh_sha256()
     assert [p["material"] for p in meta["parts"]] == [p.material for p in spec.parts]
-    assert meta["tx_candidates"] == 900 and meta["tx_kept"] == 20
+    assert meta["tx_candidates"] == 900 and meta["tx_kept"] == 20 and meta["tx_without_path"] == 0
     assert meta["solver"]["samples_per_src"] == 500 and meta["solver"]["max_depth"] == 1
+    assert meta["rx_array"]["pattern"] == "tr38901"
     np.testing.assert_allclose(meta["frequencies_read_back_hz"], scene.frequencies_hz, rtol=1e-6)
     assert set(meta["generator"]["versions"]) == set(jobs.PACKAGES)
     assert [entry["frequency_ghz"] for entry in meta["ceilings"]] == [2.4, 60.0]
     for entry in meta["ceilings"]:
         assert entry["order<=1"] == 1.0  # depth 1: nothing is left out
         assert entry["order<=0"] < 1 and entry["phase_blind"] < 1
+        assert 0 < entry["inverse_distance"] < 1
+    for entry in meta["channel"]:
+        assert entry["line_of_sight_share"] > 0.9 and entry["median_paths"] > 2 and entry["median_delay_spread_ns"] > 0
+        assert entry["power_db_p05"] < entry["power_db_p50"] < entry["power_db_p95"] < 0
     assert str(uninterrupted.parent) not in json.dumps(meta)
 
 
@@ -55,22 +82,41 @@ def test_interrupted_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, m
 
     original, calls = Simulator.paths, []
 
-    def interrupted(self, positions):
+    def interrupted(self, positions, frequencies):
         calls.append(len(positions))
-        if len(calls) == 3:
+        if len(calls) == 2:
             raise KeyboardInterrupt
-        return original(self, positions)
+        return original(self, positions, frequencies)
 
     monkeypatch.setattr(Simulator, "paths", interrupted)
     with pytest.raises(KeyboardInterrupt):
         generate(options(tmp_path))
     assert not options(tmp_path).out.exists()
     resumed = generate(options(tmp_path))
-    # Per frequency two batches and one call for the ceilings: one call was lost, none repeated.
-    assert len(calls) == 6 + 1
+    assert calls == [8, 8, 8, 4]  # one batch was lost, none repeated
     assert resumed.read_bytes() == uninterrupted.read_bytes()
     generate(options(tmp_path))
-    assert len(calls) == 7
+    assert len(calls) == 4
+
+
+def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path):
+    """The real thing: SIGKILL in the middle of a run of the command, and the command again."""
+    program = (
+        "import functools, sys, tyro; import data_gen.options as o; from data_gen.generate import generate;"
+        "o.SolverSettings = functools.partial(o.SolverSettings, rays_per_face=1, rays_per_mirrored_face=0);"
+        "generate(tyro.cli(o.Options))"
+    )
+    arguments = ["--frequencies", "2.4", "60", "--samples", "500", "--depth", "1", "--max-paths", "20000", "--max-tx", "20"]
+    arguments += ["--out", str(tmp_path / "scene.npz"), "--work", str(tmp_path / "work")]
+    command = [sys.executable, "-c", program, *arguments]
+    first = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    while first.poll() is None and not list(tmp_path.glob("work/*/0000.npz")):
+        time.sleep(0.01)
+    first.kill()
+    first.wait()
+    assert not (tmp_path / "scene.npz").exists()
+    subprocess.run(command, check=True, capture_output=True)
+    assert (tmp_path / "scene.npz").read_bytes() == uninterrupted.read_bytes()
 
 
 @pytest.mark.slow
@@ -78,20 +124,51 @@ def test_two_processes_give_the_same_bytes(uninterrupted, tmp_path):
     assert generate(options(tmp_path, workers=2, threads=1)).read_bytes() == uninterrupted.read_bytes()
 
 
-def test_transmitters_without_a_path_are_counted(simulator_backend, tmp_path, monkeypatch):
-    def nothing(job, frequencies, folder):
-        return {"n_paths": np.array([[3, 0], [1, 1], [0, 0]])}
+def found_without(*lost):
+    """Results of 20 transmitters of which some have no path at one frequency."""
+    n_paths = np.ones((20, 2), int)
+    n_paths[list(lost), 1] = 0
+    return {
+        "read_back_hz": np.array([2.4e9, 60e9]), "n_paths": n_paths, "snapshots": np.ones((20, 2, 16), np.complex64),
+        "line_of_sight": n_paths > 0, "delay_spread_s": np.zeros((20, 2)), "ceilings": np.full((20, 2, 5), np.nan),
+    }  # fmt: skip
 
-    monkeypatch.setattr(jobs, "collect", nothing)
+
+@pytest.mark.parametrize("lost", [(), (3, 7)])
+def test_transmitters_without_a_path_are_left_out_and_counted(simulator_backend, tmp_path, monkeypatch, lost):
+    monkeypatch.setattr(jobs, "collect", lambda *_: found_without(*lost))
     monkeypatch.setattr(module, "_compute", lambda *_: None)
-    with pytest.raises(UserError, match="2 of 20 transmitters have no path"):
+    scene = load_scene(generate(options(tmp_path, ceilings=False)))
+    assert scene.meta["tx_without_path"] == len(lost) and len(scene.tx_positions) == 20 - len(lost)
+    kept = np.delete(make_job(options(tmp_path)).tx_positions, lost, 0)
+    np.testing.assert_array_equal(scene.tx_positions, kept)
+
+
+def test_no_path_at_all_is_told_after_the_first_batch(simulator_backend, tmp_path, monkeypatch):
+    from data_gen.solve import Simulator, TxPaths
+
+    nothing = TxPaths(np.zeros((0, 16), complex), np.zeros(0), np.zeros(0, int))
+
+    def paths(self, positions, frequencies):
+        self.read_back_hz = {f: f for f in frequencies}
+        return [[nothing] * len(positions) for _ in frequencies]
+
+    monkeypatch.setattr(Simulator, "paths", paths)
+    with pytest.raises(UserError, match="no path between the receiver and transmitters 0 to 7"):
         generate(options(tmp_path))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scene": 99}, "no scene 99"),
+        ({"scene": "99"}, "no scene 99"),
+        ({"scene": "nowhere.glb"}, "--rx"),
+        ({"materials": Path("m.toml")}, "scene of your own"),
+        ({"frequency_set": "21"}, "two ways"),
+        ({"rx_orientation": (0.0, 0.0, 0.0, 0.0)}, "quaternion"),
+        ({"array": ArraySettings(rows=0)}, "--array.rows"),
+        ({"array": ArraySettings(spacing=0)}, "--array.spacing"),
+        ({"scale": -1.0}, "--scale"),
         ({"frequencies": (200.0,)}, "200 GHz is outside"),
         ({"out": None}, "--out"),
         ({"workers": 0}, "--workers"),
@@ -113,20 +190,40 @@ def test_an_output_that_cannot_be_written_is_told_first(tmp_path):
         generate(options(tmp_path, out=tmp_path / "file" / "scene.npz"))
 
 
-def test_the_checksum_sees_settings_but_not_frequencies(monkeypatch):
+def test_released_files_are_not_replaced_by_others():
+    assert Options().default_out().name == "scene1.npz"
+    assert Options(scene="3", frequency_set="21").default_out().name == "scene3_21f.npz"
+    assert Options(scene="rooms/office.glb", samples=7).default_out() == Path("office.npz")
+    for changes in ({"samples": 7}, {"depth": 2}, {"diffraction": False}, {"array": ArraySettings(rows=8)}, {"max_tx": 3}):
+        with pytest.raises(UserError, match="--out"):
+            Options(**changes).default_out()
+
+
+def test_the_checksum_sees_everything_that_decides(monkeypatch):
     monkeypatch.setattr(jobs, "versions", lambda: {"sionna-rt": "any"})  # the simulator need not be installed
-    spec = get_scene(1)
-    job = module._job(Options(max_tx=5, frequencies=(5.0,)), spec)
-    assert job.digest("llvm") == module._job(Options(max_tx=5), spec).digest("llvm")
+    job = make_job(Options(max_tx=5))
     settings = [{"samples_per_src": 7}, {"max_depth": 2}, {"diffraction": False}, {"seed": 1}, {"tx_per_call": 2}]
     others = [dataclasses.replace(job, settings=dataclasses.replace(job.settings, **change)) for change in settings]
     others += [
         dataclasses.replace(job, tx_positions=job.tx_positions[:-1]),
-        dataclasses.replace(job, spec=dataclasses.replace(spec, rx_position=(0.0, 0.0, 1.0))),
-        dataclasses.replace(job, spec=dataclasses.replace(spec, parts=spec.parts[:-1])),
+        dataclasses.replace(job, frequencies_hz=job.frequencies_hz[:-1]),
+        dataclasses.replace(job, array=ArraySettings(pattern="iso")),
+        dataclasses.replace(job, spec=dataclasses.replace(job.spec, rx_position=(0.0, 0.0, 1.0))),
+        dataclasses.replace(job, spec=dataclasses.replace(job.spec, rx_orientation=(0.0, 0.0, 0.0, 1.0))),
+        dataclasses.replace(job, spec=dataclasses.replace(job.spec, parts=job.spec.parts[:-1])),
     ]
     digests = {job.digest("llvm"), job.digest("cuda"), *(other.digest("llvm") for other in others)}
     assert len(digests) == len(others) + 2
+    assert job.digest("llvm") == make_job(Options(max_tx=5, workers=3, threads=1)).digest("llvm")
+
+
+def test_another_array_is_in_the_file(simulator_backend, tmp_path):
+    array = ArraySettings(rows=2, columns=3, plane="xy", pattern="iso", spacing=0.4)
+    turned = (0.0, 0.0, 0.0, 2.0)
+    scene = load_scene(generate(options(tmp_path, max_tx=8, array=array, rx_orientation=turned)))
+    assert scene.snapshots.shape == (8, 2, 6)
+    np.testing.assert_array_equal(scene.element_positions, array.element_positions())
+    np.testing.assert_array_equal(scene.rx_orientation, [0, 0, 0, 1])
 
 
 @pytest.mark.skipif(importlib.util.find_spec("sionna") is None, reason="sionna-rt is not installed")

@@ -1,0 +1,91 @@
+"""What a user's meshes are (solids or sheets), and mistakes in them that a ray tracer would not report. Metres, z up."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+
+from data_gen.scenes.base import Part
+from data_gen.scenes.geometry import distance
+from wbgs_jax.errors import UserError
+
+TOUCH = 1e-4
+"""Metres: surfaces that are nearer lie on each other."""
+FLAT = 1e-3
+"""Metres: how far a wall may be from the side of the scene that it lies in."""
+MIN_VOLUME = 1e-9
+"""Cubic metres: what encloses less is two sheets back to back."""
+ROOM_SHARE = 0.9
+"""A room's own mesh has at least this part of the scene's length, width and height."""
+PLACES = np.array([(0.34, 0.33, 0.33), *itertools.permutations((0.79, 0.14, 0.07))])
+"""Where in a triangle it is looked for another surface, as weights of its corners."""
+LARGEST = 300
+"""So many triangles of an object are looked at, the largest."""
+
+
+def is_solid(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> bool:
+    """Whether a mesh is a closed body. One as large as the scene (`bounds`) is the room itself, hence a sheet around it."""
+    is_room = (mesh.extents > ROOM_SHARE * np.ptp(bounds, axis=0)).all()
+    return bool(mesh.is_watertight and abs(mesh.volume) > MIN_VOLUME and not is_room)
+
+
+def kind(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> str:
+    """What a part of this mesh is (`KINDS`) in a scene of these bounds; sheets in one of their six sides are the shell."""
+    if is_solid(mesh, bounds):
+        return "solid"
+    in_side = (np.abs(mesh.bounds - bounds[:, None]) < FLAT).all(1)
+    return "shell" if in_side.any() else "partition"
+
+
+def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A solid with its normals outward, whichever way a mirrored or careless export turned them."""
+    mesh = mesh.copy()
+    trimesh.repair.fix_normals(mesh, multibody=True)
+    return mesh
+
+
+def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, "edges"]:
+    """At which of its `face_adjacency_edges` a mesh turns back onto itself, so that two triangles lie on each other."""
+    vertices = np.asarray(mesh.vertices)
+    start, end = vertices[mesh.face_adjacency_edges].swapaxes(0, 1)
+    along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    arms = vertices[mesh.face_adjacency_unshared] - start[:, None]
+    arms -= np.einsum("eak,ek->ea", arms, along)[..., None] * along[:, None]
+    first, second = (arms / np.linalg.norm(arms, axis=2, keepdims=True)).swapaxes(0, 1)
+    return np.einsum("ek,ek->e", first, second) > 1 - 1e-6
+
+
+def check_surfaces(parts: Sequence[Part]) -> None:
+    """Raise a `UserError` when a part folds back onto itself or two sheets lie on each other.
+
+    A solid may touch a sheet, as furniture does that stands on the floor: the face in between is seen from nowhere.
+    """
+    for part in parts:
+        if (found := folds(part.mesh)).any():
+            where = place(part.mesh.vertices[part.mesh.face_adjacency_edges[found][0, 0]])
+            advice = "triangulate its faces on export and remove double ones"
+            raise UserError(f"object {part.name!r} folds back onto itself at {where}; {advice}")
+    for first, second in itertools.permutations([p for p in parts if not p.closed], 2):
+        if (points := _common(first.mesh, second.mesh)).any():
+            raise UserError(
+                f"objects {first.name!r} and {second.name!r} lie on each other, at {place(points[0])} for one; "
+                "cut a hole where the other is, or remove one"
+            )
+
+
+def _common(first: trimesh.Trimesh, second: trimesh.Trimesh) -> Float[np.ndarray, "points 3"]:
+    """Places on the first mesh where the second is, too, and parallel to it."""
+    largest = np.argsort(-first.area_faces, kind="stable")[:LARGEST]
+    points = (PLACES @ first.triangles[largest]).reshape(-1, 3)
+    normals = np.repeat(first.face_normals[largest], len(PLACES), axis=0)
+    near = ((points > second.bounds[0] - TOUCH) & (points < second.bounds[1] + TOUCH)).all(1)
+    points, normals = points[near], normals[near]
+    beside = distance(second, points + 10 * TOUCH * normals)  # a surface that only crosses stays near
+    return points[(distance(second, points) < TOUCH) & (beside > 9 * TOUCH)]
+
+
+def place(point: Sequence[float] | np.ndarray) -> str:
+    """A point for people, in metres."""
+    return f"({', '.join(f'{value:.4g}' for value in point)})"

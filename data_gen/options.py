@@ -1,0 +1,162 @@
+"""The command line of the generator, and the checked job that it asks for."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from data_gen.jobs import Job
+from data_gen.materials import check_material_frequencies
+from data_gen.own_scene import own_scene
+from data_gen.scenes import SceneSpec, get_scene
+from data_gen.scenes.base import FREQUENCIES_21_HZ
+from data_gen.settings import ArraySettings, SolverSettings
+from wbgs_jax.errors import UserError
+
+HERE = Path(__file__).parent
+SUBSET_SEED = 0
+CEILING_TX = 50
+"""Number of transmitters the ceilings are measured on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Which scene: one of `data_gen/scenes` by its number, or a file of the user's."""
+
+    scene: str = "1"
+    """Number of a scene of `data_gen/scenes`, or a file of your own: .glb, .obj, .ply or .xml (docs/own_scene.md)."""
+    materials: Path | None = None
+    """Own scene: materials of its objects (.toml)."""
+    rx: str | None = None
+    """Own scene: position of the receiver, x,y,z in metres."""
+    tx_grid: str | None = None
+    """Own scene: transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z."""
+    up: Literal["y", "z"] | None = None
+    """Own scene: the file's vertical axis."""
+    scale: float = 1.0
+    """Own scene: metres in one unit of the file."""
+    rx_orientation: tuple[float, float, float, float] | None = None
+    """Quaternion w x y z from the receiver's local frame to the world; that of the scene unless given."""
+
+    @property
+    def own(self) -> bool:
+        """Whether the scene is a file of the user's."""
+        return not self.scene.isdecimal()
+
+    def spec(self, frequencies_hz: tuple[float, ...] = ()) -> SceneSpec:
+        """The scene, checked, at these frequencies (hertz) or at its own.
+
+        Raises:
+            UserError: a mistake in the scene, the receiver, the transmitters or the materials.
+        """
+        spec = self._own_spec(frequencies_hz) if self.own else self._numbered_spec()
+        return spec if self.rx_orientation is None else dataclasses.replace(spec, rx_orientation=_unit(self.rx_orientation))
+
+    def _numbered_spec(self) -> SceneSpec:
+        if self.materials or self.rx or self.tx_grid or self.up or self.scale != 1:
+            raise UserError(
+                "--materials, --rx, --tx-grid, --up and --scale are for a scene of your own; give its file with --scene"
+            )
+        return get_scene(int(self.scene))
+
+    def _own_spec(self, frequencies_hz: tuple[float, ...]) -> SceneSpec:
+        if self.rx is None or self.tx_grid is None:
+            raise UserError(
+                "a scene of your own needs a receiver and transmitters: --rx x,y,z --tx-grid x0,y0,z0:x1,y1,z1:nx,ny,nz"
+            )
+        return own_scene(
+            Path(self.scene), self.materials, rx=self.rx, tx_grid=self.tx_grid, frequencies_hz=frequencies_hz, up=self.up,
+            scale=self.scale,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(SceneOptions):
+    """Generate a scene file with Sionna RT. The same command continues an interrupted run."""
+
+    out: Path | None = None
+    """Scene file to write; data_gen/released/scene<N>.npz or <name of your file>.npz unless given."""
+    frequencies: tuple[float, ...] = ()
+    """GHz; those of the frequency set unless given."""
+    frequency_set: Literal["10", "21"] = "10"
+    """The ten frequencies of the paper's Table 4, or 1, 5, 10, ..., 100 GHz."""
+    array: ArraySettings = field(default_factory=ArraySettings)
+    samples: int = SolverSettings.samples_per_src
+    """Rays that search for paths, for every transmitter, besides those aimed at edges."""
+    max_tx: int | None = None
+    """Take only this many of the transmitters, drawn at random by a fixed seed."""
+    depth: int = SolverSettings.max_depth
+    """Interactions a path may have."""
+    diffraction: bool = True
+    """First-order diffraction."""
+    ceilings: bool = True
+    """Measure what truncated and phase-blind predictors could reach."""
+    max_paths: int = SolverSettings.max_paths_per_src
+    """Room for candidate paths of one transmitter."""
+    workers: int = 1
+    """Processes."""
+    threads: int | None = None
+    """Threads of each process; all cores unless given."""
+    work: Path = HERE / "work"
+    """Folder for unfinished work."""
+
+    def default_out(self) -> Path:
+        """Where the scene file goes unless told. A part of a released scene must not replace it."""
+        if self.own:
+            return Path(f"{Path(self.scene).stem}.npz")
+        usual = Options()
+        same = ("frequencies", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "ceilings")
+        if any(getattr(self, name) != getattr(usual, name) for name in same):
+            raise UserError("with settings of your own the released file must not be replaced; give another one with --out")
+        return HERE / "released" / f"scene{self.scene}{'_21f' * (self.frequency_set == '21')}.npz"
+
+
+def make_job(options: Options) -> Job:
+    """Everything that decides the result, checked before hours are spent.
+
+    Raises:
+        UserError: a mistake in the scene, the receiver, the transmitters, the materials, the array or the frequencies.
+    """
+    _check_numbers(options)
+    if options.frequencies and options.frequency_set != "10":
+        raise UserError("--frequencies and --frequency-set are two ways to say one thing; give one of them")
+    frequencies = tuple(ghz * 1e9 for ghz in options.frequencies) or (
+        FREQUENCIES_21_HZ if options.frequency_set == "21" else ()
+    )
+    spec = options.spec(frequencies)
+    frequencies = frequencies or spec.frequencies_hz
+    check_material_frequencies([p.material for p in spec.parts], frequencies)
+    settings = SolverSettings(
+        max_depth=options.depth, samples_per_src=options.samples, diffraction=options.diffraction,
+        max_paths_per_src=options.max_paths,
+    )  # fmt: skip
+    tx = spec.accessible_tx()
+    if options.max_tx is not None and options.max_tx < len(tx):
+        tx = tx[np.sort(np.random.default_rng(SUBSET_SEED).permutation(len(tx))[: options.max_tx])]
+    chosen = np.unique(np.linspace(0, len(tx) - 1, CEILING_TX).round().astype(int)) if options.ceilings else ()
+    return Job(spec, settings, tx, frequencies, options.array, tuple(int(i) for i in chosen))
+
+
+def _check_numbers(options: Options) -> None:
+    numbers = {
+        name: getattr(options, name) for name in ("samples", "depth", "max_paths", "workers", "threads", "max_tx", "scale")
+    }
+    array = options.array
+    numbers |= {"array.rows": array.rows, "array.columns": array.columns}
+    for name, value in numbers.items():
+        if value is not None and not value >= (1 if isinstance(value, int) else 1e-9):
+            raise UserError(
+                f"--{name.replace('_', '-')} is {value}; it must be {'at least 1' if isinstance(value, int) else 'positive'}"
+            )
+    if array.spacing <= 0:
+        raise UserError(f"--array.spacing is {array.spacing} wavelengths; it must be positive")
+
+
+def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    length = float(np.linalg.norm(quaternion))
+    if not length > 0:
+        raise UserError("--rx-orientation is zero; give a quaternion w x y z, 1 0 0 0 for none")
+    w, x, y, z = (value / length for value in quaternion)
+    return w, x, y, z

@@ -1,0 +1,58 @@
+"""What a scene file's meta says about its content: how hard the scene is, and what its channels look like."""
+
+import numpy as np
+
+from data_gen.ceilings import NAMES
+from data_gen.jobs import Results
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.data.schema import TEST, SceneFile
+from wbgs_jax.metrics import ssim
+from wbgs_jax.references import references
+
+DIGITS = 4
+"""Decimals kept: far below the spread over transmitters, far above rounding noise."""
+
+
+def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
+    """Median SSIM by frequency: the ceilings, over the transmitters they were measured on, and the predictors that learn
+    nothing (`wbgs_jax.references`), over all test transmitters."""
+    learned_nothing = _references(scene)
+    rows = []
+    for i, frequency in enumerate(scene.frequencies_hz):
+        ceilings = zip(NAMES, np.nanmedian(found["ceilings"][:, i], 0), strict=True) if _measured(found) else ()
+        row = dict(ceilings) | {name: np.median(values[i]) for name, values in learned_nothing.items()}
+        rows.append({"frequency_ghz": float(frequency / 1e9), **{k: round(float(v), DIGITS) for k, v in row.items()}})
+    return rows
+
+
+def channel_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
+    """By frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the received power
+    of a 1 W transmitter at one element (5th, 50th and 95th percentile over transmitters, dB)."""
+    power_db = 10 * np.log10(np.mean(np.abs(scene.snapshots.astype(np.complex128)) ** 2, -1))
+    rows = []
+    for i, frequency in enumerate(scene.frequencies_hz):
+        p05, p50, p95 = np.percentile(power_db[:, i], (5, 50, 95))
+        row = {
+            "median_paths": np.median(found["n_paths"][:, i]), "line_of_sight_share": found["line_of_sight"][:, i].mean(),
+            "median_delay_spread_ns": 1e9 * np.median(found["delay_spread_s"][:, i]),
+            "power_db_p05": p05, "power_db_p50": p50, "power_db_p95": p95,
+        }  # fmt: skip
+        rows.append({"frequency_ghz": float(frequency / 1e9), **{k: round(float(v), DIGITS) for k, v in row.items()}})
+    return rows
+
+
+def _measured(found: Results) -> bool:
+    return bool(np.isfinite(found["ceilings"]).any())
+
+
+def _references(scene: SceneFile) -> dict[str, list[np.ndarray]]:
+    """SSIM of every reference on the test spectra: an array for every frequency. Nothing where there is nothing to compare."""
+    if not 0 < (scene.split == TEST).sum() < len(scene.split):
+        return {}
+    dataset = scene_dataset(scene)
+    by_frequency = [dataset.test[dataset.frequencies_hz[dataset.test] == f] for f in scene.frequencies_hz]
+    truths = [np.asarray(dataset.pas(chosen)) for chosen in by_frequency]
+    return {
+        name: [ssim(predict(chosen), truth) for chosen, truth in zip(by_frequency, truths, strict=True)]
+        for name, predict in references(dataset).items()
+    }
