@@ -51,9 +51,7 @@ def draw(scene: SceneFile, out: Path) -> None:
         for axis, image in zip(row, images, strict=True):
             axis.imshow(image, vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
             _mark(axis, scene, tx)
-            axis.set(
-                title=f"{frequency / 1e9:g} GHz" if row is axes[0] else "", xticks=range(-180, 181, 90), yticks=(0, 45, 90)
-            )
+            axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
         x, y, z = scene.tx_positions[tx]
         distance = np.linalg.norm(scene.tx_positions[tx] - scene.rx_position)
         row[0].set_ylabel(f"TX ({x:.1f}, {y:.1f}, {z:.1f})\n{distance:.1f} m away\nzenith (deg)", fontsize=8)
