@@ -13,9 +13,9 @@ from wbgs_jax.array import planar_array
 class SolverSettings:
     """Settings of Sionna RT's path solver. Line of sight, specular reflection and transmission are always on."""
 
-    max_depth: int = 6
+    max_depth: int = 5
     """Interactions a path may have. Passing through a wall is one, through a piece of furniture two."""
-    samples_per_src: int = 300_000
+    samples_per_src: int = 200_000
     """Rays from every transmitter, even over the sphere (the dataset card has the convergence)."""
     rays_per_face: int = 32
     """Rays aimed at every triangle of every solid ..."""

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
@@ -86,7 +87,8 @@ class Simulator:
         return result
 
     def _set_frequency(self, frequency_hz: float) -> None:
-        self._scene.frequency = check_frequency(frequency_hz)
+        # Opaque to the compiler: a literal would compile every kernel anew for every frequency.
+        self._scene.frequency = dr.opaque(mi.Float, check_frequency(frequency_hz))
         read_back = float(np.array(self._scene.frequency).item())
         if abs(read_back / frequency_hz - 1) > FREQUENCY_TOLERANCE:
             raise RuntimeError(f"asked Sionna RT for {frequency_hz} Hz, it reports {read_back} Hz")
@@ -108,13 +110,19 @@ def _load(spec: SceneSpec, array: ArraySettings) -> rt.Scene:
     scene.tx_array = rt.PlanarArray(**one, pattern="iso", polarization="V")
     scene.rx_array = rt.PlanarArray(**one, pattern=array.pattern, polarization=array.polarization)
     scene.rx_array.normalized_positions = mi.Point3f(np.asarray(array.element_positions(), np.float32).T)
-    scene.add(rt.Receiver("rx", position=list(spec.rx_position), orientation=_yaw_pitch_roll(spec.rx_orientation)))
+    scene.add(
+        rt.Receiver(
+            "rx", position=[float(value) for value in spec.rx_position], orientation=_yaw_pitch_roll(spec.rx_orientation)
+        )
+    )
     return scene
 
 
 def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
     """Sionna's orientation (radians; R = Rz Ry Rx) of a unit quaternion (wxyz, local to world)."""
     w, x, y, z = quaternion
+    if np.hypot(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) < 1e-6:  # straight up or down: yaw and roll are one
+        return [float(2 * np.arctan2(z, w)), float(np.copysign(np.pi / 2, w * y - z * x)), 0.0]
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

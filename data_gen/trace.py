@@ -3,6 +3,7 @@
 `sionna.rt.PathSolver` does both in one call, a call for every frequency. Where paths run does not depend on the frequency, and
 tracing is nearly all of the cost. The halves below are its own three stages (candidates, image method, fields), called in its
 own order; a test compares the result with the solver's, bit for bit. They are not public: `pyproject.toml` limits the versions.
+Only diffraction differs, where the solver is wrong (`utd.py`).
 
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
@@ -22,6 +23,7 @@ from sionna.rt.radio_materials.itu import itu_material
 from data_gen.materials import own_law
 from data_gen.rays import RayLauncher
 from data_gen.settings import SolverSettings
+from data_gen.utd import diffraction_matrix, end_unused_vertices
 from wbgs_jax.errors import UserError
 
 
@@ -61,6 +63,11 @@ class BalancedMaterial(rt.RadioMaterial):
         nothing = total == 0
         scale = dr.select(nothing, 1, dr.rcp(total))
         return reflect * scale, mi.Float(0), transmit * scale, nothing
+
+    def _diffraction_matrix(
+        self, to_world: Any, ki_local: Any, ko_local: Any, si: Any, eta: Any, wavenumber: Any
+    ) -> Any:  # fmt: skip
+        return diffraction_matrix(self.thickness, to_world, ki_local, ko_local, si, eta, wavenumber)
 
 
 @contextmanager
@@ -112,6 +119,7 @@ class PathTracer:
             diffraction_lit_region=True,
         )  # fmt: skip
         paths.discard_invalid()
+        end_unused_vertices(paths, targets[0])
         return paths
 
     def fields(self, traced: PathsBuffer) -> rt.Paths:

@@ -41,6 +41,7 @@ def test_small_data_sets_get_fewer_steps():
         ("optim", {"ssim_weight": 1.5}, "between 0 and 1"),
         ("wideband", {"gaussians": 3}, "at least 4"),
         ("wideband", {"tx_octaves": -1}, "tx-octaves"),
+        ("wideband", {"fusion": 4}, "fusion"),
         ("loop", {"keep_checkpoints": 0}, "keep-checkpoints"),
     ],
 )

@@ -49,31 +49,41 @@ def test_partwise_dense_starts_like_one_layer_of_the_whole_fan_in():
         assert float(kernel.std()) == pytest.approx((2 / 120) ** 0.5, rel=0.03)
 
 
-@pytest.mark.parametrize("skip", [1, 2, 9])
-def test_attenuation_network_layer_by_layer(rng, parts, skip):
-    network = AttenuationNetwork(width=8, depth=3, skip=skip)
-    params = randomised(rng, network.init(jax.random.key(0), parts))
+@pytest.mark.parametrize(("skip", "fusion"), [(1, 0), (2, 0), (9, 0), (1, 1), (1, 2), (2, 1), (9, 2)])
+def test_attenuation_network_layer_by_layer(rng, parts, skip, fusion):
+    network = AttenuationNetwork(width=8, depth=3, skip=skip, fusion=fusion)
+    params = randomised(rng, network.init(jax.random.key(0), parts[:1], parts[1:]))
     layers = params["params"]
-    inputs = concatenated(parts)
-    hidden = np.maximum(inputs @ stacked_kernel(layers["PartwiseDense_0"]) + layers["PartwiseDense_0"]["bias"], 0)
-    for i in (1, 2):
-        layer = layers[f"PartwiseDense_{i}"]
-        entering = np.concatenate([hidden, inputs], -1) if i == skip else hidden
-        assert stacked_kernel(layer).shape == (8 + 11 * (i == skip), 8)
+    own, query = concatenated(parts[:1]), concatenated(parts[1:])
+    hidden = np.zeros((N, B, 0))
+    for i in range(3):
+        entering = [hidden, *[own] * (i in (0, skip)), *[query] * (i == fusion or (i == skip and i > fusion))]
+        layer, entering = layers[f"PartwiseDense_{i}"], np.concatenate(entering, -1)
+        assert stacked_kernel(layer).shape == (entering.shape[-1], 8)
         hidden = np.maximum(entering @ stacked_kernel(layer) + layer["bias"], 0)
-    got_hidden, got_delta = network.apply(params, parts)
+    got_hidden, got_delta = network.apply(params, parts[:1], parts[1:])
     np.testing.assert_allclose(got_hidden, hidden, rtol=1e-3, atol=1e-3)
     expected = (hidden @ layers["Dense_0"]["kernel"] + layers["Dense_0"]["bias"])[..., 0]
     np.testing.assert_allclose(got_delta, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_layers_before_the_fusion_are_evaluated_once_a_gaussian(parts):
+    def operations(fusion):
+        network = AttenuationNetwork(width=64, depth=4, skip=9, fusion=fusion)
+        params = network.init(jax.random.key(0), parts[:1], parts[1:])
+        cost = jax.jit(network.apply).lower(params, parts[:1], parts[1:]).compile().cost_analysis()
+        return cost["flops"]
+
+    assert operations(3) < 0.6 * operations(0)
+
+
 def test_delta_f_is_zero_at_the_start_but_can_learn(parts):
     network = AttenuationNetwork(width=8, depth=3, skip=1)
-    params = network.init(jax.random.key(0), parts)
-    hidden, delta_f = network.apply(params, parts)
+    params = network.init(jax.random.key(0), parts[:1], parts[1:])
+    hidden, delta_f = network.apply(params, parts[:1], parts[1:])
     assert delta_f.shape == (N, B)
     assert not delta_f.any() and hidden.any()
-    gradient = jax.grad(lambda p: network.apply(p, parts)[1].sum())(params)["params"]["Dense_0"]["kernel"]
+    gradient = jax.grad(lambda p: network.apply(p, parts[:1], parts[1:])[1].sum())(params)["params"]["Dense_0"]["kernel"]
     assert gradient.any()
 
 

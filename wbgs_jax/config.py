@@ -28,6 +28,9 @@ class WidebandConfig:
     """Layers of the attenuation network (authors: 8)."""
     skip: int = 2
     """The layer at which the inputs enter again (authors: 4)."""
+    fusion: int = 0
+    """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
+    all queries. 0: the paper's form."""
     radiance_widths: tuple[int, ...] = (64, 32)
     """Units of the radiance network's layers (authors: 128, 64)."""
     gaussian_octaves: int = 6
@@ -190,6 +193,10 @@ def check(settings: Settings) -> None:
     steps, block = settings.optim.steps, settings.loop.epoch_steps
     if steps % block:
         raise UserError(f"--optim.steps {steps} is not a multiple of --loop.epoch-steps {block}; change one of them")
+    if not 0 <= settings.wideband.fusion < settings.wideband.depth:
+        raise UserError(
+            f"--wideband.fusion is {settings.wideband.fusion}; it is the number of a layer, 0 to {settings.wideband.depth - 1}"
+        )
     for name in ("gaussian", "tx", "frequency"):
         if getattr(settings.wideband, f"{name}_octaves") < 0:
             raise UserError(f"--wideband.{name}-octaves is negative; give 0 or more")

@@ -31,21 +31,32 @@ class PartwiseDense(nn.Module):
 
 
 class AttenuationNetwork(nn.Module):
-    """(P(G), P(TX), f) -> (h, delta_f). Input parts re-enter before layer `skip`, as in the authors' code and NeRF."""
+    """(P(G), P(TX), f) -> (h, delta_f). Inputs re-enter before layer `skip`, as in the authors' code and NeRF.
+
+    The query enters at layer `fusion`: layers before it see the Gaussian alone and cost N instead of N x B evaluations. At 0
+    it is the paper's network.
+    """
 
     width: int
     depth: int
     skip: int
+    fusion: int = 0
 
     @nn.compact
-    def __call__(self, parts: Sequence[Float[Array, "_ _ _"]]) -> tuple[Float[Array, "n b width"], Float[Array, "n b"]]:
-        hidden = nn.relu(PartwiseDense(self.width)(parts))
-        for layer in range(1, self.depth):
-            inputs = [hidden, *parts] if layer == self.skip else [hidden]
-            hidden = nn.relu(PartwiseDense(self.width)(inputs))
+    def __call__(
+        self, gaussian: Sequence[Float[Array, "_ _ _"]], query: Sequence[Float[Array, "_ _ _"]]
+    ) -> tuple[Float[Array, "n b width"], Float[Array, "n b"]]:
+        hidden: list[Float[Array, "_ _ _"]] = []
+        for layer in range(self.depth):
+            inputs = list(hidden)
+            if layer in (0, self.skip):
+                inputs += gaussian
+            if layer == self.fusion or (layer == self.skip and layer > self.fusion):
+                inputs += query
+            hidden = [nn.relu(PartwiseDense(self.width)(inputs))]
         # Zero at the start: the final attenuation begins as delta_o, and delta_f learns a correction (paper, section 4.5).
-        delta_f = nn.Dense(1, kernel_init=nn.initializers.zeros_init())(hidden)[..., 0]
-        return hidden, delta_f
+        delta_f = nn.Dense(1, kernel_init=nn.initializers.zeros_init())(hidden[0])[..., 0]
+        return hidden[0], delta_f
 
 
 class RadianceNetwork(nn.Module):

@@ -88,11 +88,11 @@ def _initial_networks(key: Key[Array, ""], untrained: WidebandParams) -> dict[st
     """Initial weights; the inputs matter by their shapes only."""
     centre = untrained.frame.centre
     receiver = Receiver(centre, jnp.array([1.0, 0, 0, 0], centre.dtype), jnp.zeros((1, 3), centre.dtype))
-    parts, frequency = _inputs(untrained, receiver, Query(centre[None], jnp.full((1,), 1e9, centre.dtype)))
+    gaussian, both, frequency = _inputs(untrained, receiver, Query(centre[None], jnp.full((1,), 1e9, centre.dtype)))
     key_attenuation, key_radiance = jax.random.split(key)
     attenuation_network, radiance_network = _networks(untrained.config)
     outputs: Any
-    outputs, attenuation = attenuation_network.init_with_output(key_attenuation, parts)
+    outputs, attenuation = attenuation_network.init_with_output(key_attenuation, gaussian, both)
     return {"attenuation": attenuation, "radiance": radiance_network.init(key_radiance, [outputs[0], *frequency])}
 
 
@@ -117,8 +117,8 @@ def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Ar
 def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
     """Final attenuation delta and signal Sig of every Gaussian and query (paper, equations 1-3 and section 4.5)."""
     attenuation_network, radiance_network = _networks(params.config)
-    parts, frequency = _inputs(params, receiver, query)
-    outputs: Any = attenuation_network.apply(params.networks["attenuation"], parts)
+    gaussian, both, frequency = _inputs(params, receiver, query)
+    outputs: Any = attenuation_network.apply(params.networks["attenuation"], gaussian, both)
     hidden, delta_f = outputs
     signal: Any = radiance_network.apply(params.networks["radiance"], [hidden, *frequency])
     delta = attenuation_activation(params.gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
@@ -126,25 +126,27 @@ def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tup
 
 
 def _networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
-    return AttenuationNetwork(config.width, config.depth, config.skip), RadianceNetwork(config.radiance_widths)
+    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion)
+    return attenuation, RadianceNetwork(config.radiance_widths)
 
 
-def _inputs(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[list[Array], list[Array]]:
-    """Encoded inputs: the attenuation network's parts, and the radiance network's frequency part (empty if switched off)."""
+def _inputs(
+    params: WidebandParams, receiver: Receiver, query: Query
+) -> tuple[list[Float[Array, "n 1 _"]], list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
+    """Encoded inputs: what depends on the Gaussian alone and the rest, for the attenuation network, and the frequency, for the
+    radiance network (empty if switched off)."""
     config, frame = params.config, jax.lax.stop_gradient(params.frame)
     means = params.gaussians.means
     scaled_means = (means - frame.centre) / frame.half_extent
     scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
-    parts = [
-        positional_encoding(scaled_means, config.gaussian_octaves)[:, None, :],
-        positional_encoding(scaled_tx, config.tx_octaves)[None, :, :],
-    ]
+    gaussian = [positional_encoding(scaled_means, config.gaussian_octaves)[:, None, :]]
+    both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
     if config.relative:
-        parts.append(_relative_features(means, receiver, query, frame.half_extent))
+        both.append(_relative_features(means, receiver, query, frame.half_extent))
     encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
     if config.attenuation_frequency:
-        parts.append(encoded)
-    return parts, [encoded] if config.radiance_frequency else []
+        both.append(encoded)
+    return gaussian, both, [encoded] if config.radiance_frequency else []
 
 
 def _length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
