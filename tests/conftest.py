@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
+os.environ.setdefault("WBGS_CACHE", "")  # command lines under test leave nothing in the home folder
 
 import numpy as np
 import pytest

@@ -21,6 +21,7 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax import metrics, pictures
+from wbgs_jax.compilation import use_compilation_cache
 from wbgs_jax.config import to_dict
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
@@ -146,6 +147,7 @@ def table(report: dict[str, Any]) -> Table:
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m wbgs_jax.eval")
+    use_compilation_cache()
     trained = load_trained(command.run)
     dataset = trained.config.dataset() if command.data is None else load_dataset(command.data, seed=trained.config.seed)
     console = Console(file=sys.stderr, markup=False, soft_wrap=True)

@@ -10,6 +10,7 @@ from typing import Annotated
 import jax
 import tyro
 
+from wbgs_jax.compilation import use_compilation_cache
 from wbgs_jax.config import PRESETS, Settings, check
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
@@ -93,6 +94,7 @@ def default_folder(dataset: Dataset, config: RunConfig) -> Path:
 def main() -> None:
     """Entry point."""
     command = parse(sys.argv[1:])
+    use_compilation_cache()
     config = run_config(command)
     dataset = config.dataset()
     folder = command.out or default_folder(dataset, config)
