@@ -7,6 +7,7 @@
 A killed run loses at most the batches in progress: the same command goes on where it stopped and ends with the same bytes.
 """
 
+import os
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import tyro
 
 from data_gen import jobs, statistics
-from data_gen.llvm import find_backend
+from data_gen.llvm import CUDA, find_backend
 from data_gen.options import Options, make_job
 from data_gen.own_scene import describe
 from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
@@ -27,6 +28,8 @@ from wbgs_jax.progress import CountProgress
 
 TEST_FRACTION = 0.2
 SPLIT_SEED = 0
+MAX_WORKERS = 4
+"""More would want more memory than a laptop has."""
 
 
 def generate(options: Options) -> Path:
@@ -41,7 +44,7 @@ def generate(options: Options) -> Path:
     out = _writable(options.out or options.default_out())
     backend, _ = find_backend()
     folder = options.work / f"{job.spec.name}-{job.digest(backend)}"
-    _compute(job, folder, options)
+    _compute(job, folder, *_processes(options, backend))
     save_scene(out, _assemble(job, folder, backend))
     return out
 
@@ -55,12 +58,19 @@ def _writable(out: Path) -> Path:
     return out
 
 
-def _compute(job: jobs.Job, folder: Path, options: Options) -> None:
+def _processes(options: Options, backend: str) -> tuple[int, int | None]:
+    """Processes and threads of each (None: as many as Dr.Jit likes)."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = options.workers or (1 if backend == CUDA else min(max(cores // 2, 1), MAX_WORKERS))
+    return workers, options.threads or (None if workers == 1 else -(-cores // workers))
+
+
+def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None) -> None:
     todo = [batch for batch in range(job.n_batches) if not jobs.batch_file(folder, batch).exists()]
     if not todo:
         return
     with CountProgress(f"{job.spec.name}, batches", job.n_batches, job.n_batches - len(todo)) as progress:
-        for _ in jobs.run(job, todo, folder, options.workers, options.threads):
+        for _ in jobs.run(job, todo, folder, workers, threads):
             progress.advance()
 
 

@@ -95,10 +95,10 @@ class Options(SceneOptions):
     """Measure what truncated and phase-blind predictors could reach."""
     max_paths: int = SolverSettings.max_paths_per_src
     """Room for candidate paths of one transmitter."""
-    workers: int = 1
-    """Processes."""
+    workers: int | None = None
+    """Processes, of about 2.5 GB each; unless given, half as many as there are cores, four at most, and one with a GPU."""
     threads: int | None = None
-    """Threads of each process; all cores unless given."""
+    """Threads of each process; unless given, as many as keep all cores busy."""
     work: Path = HERE / "work"
     """Folder for unfinished work."""
 
@@ -110,7 +110,8 @@ class Options(SceneOptions):
         same = ("frequencies", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "ceilings")
         if any(getattr(self, name) != getattr(usual, name) for name in same):
             raise UserError("with settings of your own the released file must not be replaced; give another one with --out")
-        return HERE / "released" / f"scene{self.scene}{'_21f' * (self.frequency_set == '21')}.npz"
+        suffix = "_21f" if self.frequency_set == "21" else ""
+        return HERE / "released" / f"scene{self.scene}{suffix}.npz"
 
 
 def make_job(options: Options) -> Job:
@@ -126,6 +127,8 @@ def make_job(options: Options) -> Job:
         FREQUENCIES_21_HZ if options.frequency_set == "21" else ()
     )
     spec = options.spec(frequencies)
+    if options.frequency_set == "21":  # another data set of the same room
+        spec = dataclasses.replace(spec, name=f"{spec.name}_21f")
     frequencies = frequencies or spec.frequencies_hz
     check_material_frequencies([p.material for p in spec.parts], frequencies)
     settings = SolverSettings(

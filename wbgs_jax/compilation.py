@@ -21,8 +21,8 @@ def use_compilation_cache() -> Path | None:
 
     JAX's own setting (`JAX_COMPILATION_CACHE_DIR`) goes first.
     """
-    if jax.config.jax_compilation_cache_dir is not None:
-        return Path(jax.config.jax_compilation_cache_dir)
+    if own := getattr(jax.config, "jax_compilation_cache_dir", None):
+        return Path(own)
     wanted = os.environ.get(VARIABLE, str(Path.home() / ".cache" / "wbgs-jax"))
     if not wanted:
         return None

@@ -107,7 +107,7 @@ def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path):
         "generate(tyro.cli(o.Options))"
     )
     arguments = ["--frequencies", "2.4", "60", "--samples", "500", "--depth", "1", "--max-paths", "20000", "--max-tx", "20"]
-    arguments += ["--out", str(tmp_path / "scene.npz"), "--work", str(tmp_path / "work")]
+    arguments += ["--workers", "1", "--out", str(tmp_path / "scene.npz"), "--work", str(tmp_path / "work")]
     command = [sys.executable, "-c", program, *arguments]
     first = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     while first.poll() is None and not list(tmp_path.glob("work/*/0000.npz")):
@@ -215,6 +215,14 @@ def test_the_checksum_sees_everything_that_decides(monkeypatch):
     digests = {job.digest("llvm"), job.digest("cuda"), *(other.digest("llvm") for other in others)}
     assert len(digests) == len(others) + 2
     assert job.digest("llvm") == make_job(Options(max_tx=5, workers=3, threads=1)).digest("llvm")
+
+
+def test_all_cores_are_used_within_the_memory_of_a_laptop(monkeypatch):
+    for cores, expected in ((1, (1, None)), (2, (1, None)), (4, (2, 2)), (7, (3, 3)), (64, (4, 16))):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, n=cores: range(n), raising=False)
+        assert module._processes(Options(), "llvm") == expected
+        assert module._processes(Options(workers=3, threads=1), "llvm") == (3, 1)
+        assert module._processes(Options(), "cuda") == (1, None)
 
 
 def test_another_array_is_in_the_file(simulator_backend, tmp_path):
