@@ -93,6 +93,7 @@ def test_the_whole_command_and_the_checks_of_the_guide(simulator_backend, tmp_pa
         options = Options(
             scene=str(ROOM), materials=TOML, rx=RX, tx_grid=GRID, frequencies=(2.4, 60.0), work=tmp_path / "work",
             out=tmp_path / "runs" / f"{name}.npz", samples=samples, depth=1, max_paths=2000, max_tx=20, diffraction=False,
+            workers=1,
         )  # fmt: skip
         scene = load_scene(generate(options))
     assert scene.snapshots.shape == (20, 2, 16) and (np.abs(scene.snapshots).max(-1) > 0).all()
