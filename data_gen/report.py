@@ -22,7 +22,7 @@ CEILINGS = {
 """Columns: key in the meta and heading."""
 CHANNEL = {
     "line_of_sight_share": "in sight", "median_paths": "paths", "median_delay_spread_ns": "delay spread (ns)",
-    "power_db_p05": "power 5 % (dB)", "power_db_p50": "50 %", "power_db_p95": "95 %",
+    "gain_db_p05": "gain 5 % (dB)", "gain_db_p50": "50 %", "gain_db_p95": "95 %",
 }  # fmt: skip
 
 

@@ -26,16 +26,16 @@ def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
 
 
 def channel_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
-    """By frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the received power
-    of a 1 W transmitter at one element (5th, 50th and 95th percentile over transmitters, dB)."""
-    power_db = 10 * np.log10(np.mean(np.abs(scene.snapshots.astype(np.complex128)) ** 2, -1))
+    """By frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the path gain to an
+    element (5th, 50th and 95th percentile over transmitters, dB)."""
+    gain_db = 10 * np.log10(np.mean(np.abs(scene.snapshots.astype(np.complex128)) ** 2, -1))
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
-        p05, p50, p95 = np.percentile(power_db[:, i], (5, 50, 95))
+        p05, p50, p95 = np.percentile(gain_db[:, i], (5, 50, 95))
         row = {
             "median_paths": np.median(found["n_paths"][:, i]), "line_of_sight_share": found["line_of_sight"][:, i].mean(),
             "median_delay_spread_ns": 1e9 * np.median(found["delay_spread_s"][:, i]),
-            "power_db_p05": p05, "power_db_p50": p50, "power_db_p95": p95,
+            "gain_db_p05": p05, "gain_db_p50": p50, "gain_db_p95": p95,
         }  # fmt: skip
         rows.append({"frequency_ghz": float(frequency / 1e9), **{k: round(float(v), DIGITS) for k, v in row.items()}})
     return rows

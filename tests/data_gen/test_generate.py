@@ -73,7 +73,7 @@ def test_the_scene_file_is_complete(uninterrupted):
         assert 0 < entry["inverse_distance"] < 1
     for entry in meta["channel"]:
         assert entry["line_of_sight_share"] > 0.9 and entry["median_paths"] > 2 and entry["median_delay_spread_ns"] > 0
-        assert entry["power_db_p05"] < entry["power_db_p50"] < entry["power_db_p95"] < 0
+        assert entry["gain_db_p05"] < entry["gain_db_p50"] < entry["gain_db_p95"] < 0
     assert str(uninterrupted.parent) not in json.dumps(meta)
 
 
