@@ -7,6 +7,8 @@ positions in wavelengths.
 * splatting onto a receiver's hemisphere: `project`, `geometry_plan`, `render_splats`, `render_dense`
 * the antenna array: `planar_array`, `steering_vector`, `cbf`, `snapshot_to_pas`, `pas_directions`
 * data on the host: `load_dataset`, `load_scene`, `make_surface`, `surface_from_points`
+* a trained field: `load_trained`, `predictor`, `predict_many`, `predict_blocks`, `predict_map`, `map_queries`,
+  `export_field`, `load_exported` (docs/inference.md)
 """
 
 from wbgs_jax.array import cbf, pas_directions, planar_array, snapshot_to_pas, steering_vector
@@ -27,18 +29,26 @@ __all__ = [
     "WidebandConfig",
     "__version__",
     "cbf",
+    "export_field",
     "frequency_encoding",
     "geometry_plan",
     "image_loss",
     "load_dataset",
+    "load_exported",
     "load_scene",
+    "load_trained",
     "make_query",
     "make_receiver",
     "make_surface",
+    "map_queries",
     "measure_capacity",
     "pas_directions",
     "planar_array",
     "positional_encoding",
+    "predict_blocks",
+    "predict_many",
+    "predict_map",
+    "predictor",
     "project",
     "render_dense",
     "render_splats",
@@ -50,9 +60,17 @@ __all__ = [
 ]
 
 _HOST = {
+    "export_field": "wbgs_jax.export",
     "load_dataset": "wbgs_jax.data",
+    "load_exported": "wbgs_jax.export",
     "load_scene": "wbgs_jax.data",
+    "load_trained": "wbgs_jax.runs",
     "make_surface": "wbgs_jax.data.surface",
+    "map_queries": "wbgs_jax.inference",
+    "predict_blocks": "wbgs_jax.inference",
+    "predict_many": "wbgs_jax.inference",
+    "predict_map": "wbgs_jax.inference",
+    "predictor": "wbgs_jax.inference",
     "surface_from_points": "wbgs_jax.data.surface",
 }
 

@@ -17,7 +17,7 @@ LARGEST_COORDINATE_M = 1e5
 """Larger numbers are millimetres by mistake, or no indoor scene."""
 
 
-def check_array(name: str, value: Any, shape: tuple[int | str, ...]) -> None:
+def check_array(name: str, value: Any, shape: tuple[Any, ...]) -> None:
     """Raise unless `value` is a real floating-point array of a shape; strings in `shape` name free axes."""
     if not hasattr(value, "shape") or not hasattr(value, "dtype"):
         raise TypeError(f"{name} is a {type(value).__name__}; give an array of shape {_text(shape)}")
@@ -60,5 +60,5 @@ def concrete(value: Any) -> np.ndarray | None:
     return None if isinstance(value, jax.core.Tracer | jax.ShapeDtypeStruct) else np.asarray(value)
 
 
-def _text(shape: tuple[int | str, ...]) -> str:
+def _text(shape: tuple[Any, ...]) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"

@@ -1,0 +1,179 @@
+"""Ask a trained field for spectra, or export it:
+
+python -m wbgs_jax.predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
+python -m wbgs_jax.predict --run RUN --export field.zip
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+import wbgs_jax
+from wbgs_jax.compilation import use_compilation_cache
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.encoding import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
+from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.export import export_field
+from wbgs_jax.files import atomic_write
+from wbgs_jax.inference import BLOCK, predict_many, predictor, scene_box, trained_band
+from wbgs_jax.runs import TrainedField, load_trained
+
+SHOWN = 12
+"""Spectra in a picture."""
+SUFFIXES = {"out": ".npz", "picture": ".png", "export": ".zip"}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Ask a trained field for the spectra of transmitters, or export it."""
+
+    run: Path
+    """Run folder."""
+    tx: tuple[str, ...] = ()
+    """Transmitters, each as x,y,z in metres (world frame)."""
+    ghz: tuple[float, ...] = ()
+    """Frequencies, 1 to 100; every transmitter is asked at every one of them."""
+    out: Path | None = None
+    """Write the spectra to this .npz file."""
+    picture: Path | None = None
+    """Draw the spectra (the first 12) into this .png file."""
+    export: Path | None = None
+    """Write the field to this .zip file, which runs without its training code (docs/inference.md)."""
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """The answer: every transmitter at every frequency."""
+
+    pas: Float[np.ndarray, "tx freq 90 360"]
+    """float32."""
+    tx_positions: Float[np.ndarray, "tx 3"]
+    frequencies_hz: Float[np.ndarray, "freq"]
+
+
+def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
+    """Positions in metres from "x,y,z" each; anything else is a `UserError`."""
+
+    def parse(word: str) -> list[float]:
+        try:
+            values = [float(part) for part in word.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not np.isfinite(values).all():
+            raise UserError(f"--tx {word} is no position; give x,y,z in metres, such as --tx 1.0,2.5,1.5")
+        return values
+
+    return np.array([parse(word) for word in words]).reshape(-1, 3)
+
+
+def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, "freq"]:
+    """Hertz; outside the band of the model is a `UserError`."""
+    low, high = MIN_FREQUENCY_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
+    if wrong := [f for f in ghz if not low <= f <= high]:
+        raise UserError(f"--ghz {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
+    return np.array(ghz) * 1e9
+
+
+def check(command: Command) -> None:
+    """A command line that asks for nothing, or for half of something, is a `UserError`."""
+    for name, suffix in SUFFIXES.items():
+        path = getattr(command, name)
+        if path is not None and path.suffix != suffix:
+            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
+    asks, writes = bool(command.tx or command.ghz), bool(command.out or command.picture)
+    if not (asks or writes or command.export):
+        raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
+    if (asks or writes) and not (command.tx and command.ghz and writes):
+        raise UserError("spectra need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+
+
+def doubts(dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]) -> list[str]:
+    """Why some of the answers should not be trusted: one line each."""
+    (low, high), band = scene_box(dataset), trained_band(dataset)
+    box = f"the box of {dataset.name}, {_point(low)} to {_point(high)}"
+    lines = [f"TX {_point(tx)} lies outside {box}" for tx in tx_positions if ((tx < low) | (tx > high)).any()]
+    trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
+    lines += [f"{f / 1e9:g} GHz lies outside {trained}" for f in frequencies_hz if not band[0] <= f <= band[1]]
+    return lines
+
+
+def _point(position: Float[np.ndarray, "3"]) -> str:
+    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
+
+
+def ask(
+    trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]
+) -> Spectra:
+    """The spectra of every transmitter at every frequency."""
+    shape = len(tx_positions), len(frequencies_hz)
+    tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
+    pas = predict_many(predictor(trained, dataset.receiver), tx, frequency, block=min(BLOCK, len(tx)))
+    return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz)
+
+
+def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: Dataset) -> None:
+    """`pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, and where they come from as JSON text in `meta`."""
+    source = {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **vars(spectra), meta=np.array(json.dumps(source)))
+
+
+def draw(spectra: Spectra) -> Figure:
+    """The first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter side by side or below each other."""
+    images = spectra.pas.reshape(-1, *spectra.pas.shape[2:])[:SHOWN]
+    columns = min(2, len(images))
+    rows = -(-len(images) // columns)
+    figure = Figure(figsize=(5.5 * columns, 1.9 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for i, axis in enumerate(axes.flat):
+        if i >= len(images):
+            axis.axis("off")
+            continue
+        tx, frequency = divmod(i, len(spectra.frequencies_hz))
+        shown = axis.imshow(images[i], vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
+        axis.set_title(f"{spectra.frequencies_hz[frequency] / 1e9:g} GHz, TX {_point(spectra.tx_positions[tx])}", fontsize=9)
+        axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
+    figure.supxlabel("azimuth [deg]", fontsize=9)
+    figure.supylabel("zenith [deg]", fontsize=9)
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="normalised amplitude")
+    return figure
+
+
+def say(line: str) -> None:
+    """A line for people, on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m wbgs_jax.predict")
+    check(command)
+    tx_positions, frequencies_hz = positions(command.tx), frequencies(command.ghz)
+    use_compilation_cache()
+    trained = load_trained(command.run)
+    dataset = trained.config.dataset()
+    if command.export:
+        export_field(trained, command.export, dataset=dataset)
+        say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
+    if not (command.out or command.picture):
+        return
+    for line in doubts(dataset, tx_positions, frequencies_hz):
+        say(f"warning: {line}; the field was not trained there")
+    spectra = ask(trained, dataset, tx_positions, frequencies_hz)
+    if command.out:
+        write_spectra(command.out, spectra, trained, dataset)
+        say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
+    if command.picture:
+        with atomic_write(command.picture) as stream:
+            draw(spectra).savefig(stream, format="png", dpi=110)
+        say(f"picture: {command.picture}")
+
+
+if __name__ == "__main__":
+    run_command(main)
