@@ -60,8 +60,8 @@ lint: setup  ## ruff
 typecheck: setup  ## mypy
 	$(PY) -m mypy
 
-bench: setup  ## measure this machine: experiments/results/bench_<device>.json
-	$(PY) -m experiments.bench
+bench: setup  ## measure this machine, compare: make bench [GATE=1 to fail on a regression] [ARGS="--only renderer --update"]
+	$(PY) -m experiments.bench $(if $(filter-out 0,$(GATE)),--gate) $(ARGS)
 
 clean:  ## remove caches; runs, data and .venv stay
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist
