@@ -14,7 +14,7 @@ Plan (x to the right, y up); the receiver R looks along +x:
 
 from data_gen.scenes.base import Part, SceneSpec, grid_3d, part
 from data_gen.scenes.furniture import cabinet, chair, lamp, place, screen, shelf, sofa, table
-from data_gen.scenes.walls import wall
+from data_gen.scenes.walls import box_room
 
 WIDTH, DEPTH, HEIGHT = 10.0, 7.5, 3.0
 """Size of the room along x, y and z in metres."""
@@ -43,20 +43,16 @@ def scene1() -> SceneSpec:
 
 
 def _room() -> list[Part]:
-    x, y = WIDTH / 2, DEPTH / 2
     windows = {
         "window_left": ((1.2, 0.9, 3.2, 2.3), "glass"),
         "window_right": ((6.8, 0.9, 8.8, 2.3), "glass"),
     }
     door = {"door": ((0.9, 0.0, 1.8, 2.05), "wood")}
-    return [
-        *wall("floor", (-x, -y, 0), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "wood"),
-        *wall("ceiling", (-x, -y, HEIGHT), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "ceiling_board"),
-        *wall("wall_north", (-x, y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "concrete", windows),
-        *wall("wall_south", (-x, -y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "plasterboard", door),
-        *wall("wall_west", (-x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard"),
-        *wall("wall_east", (x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard"),
-    ]
+    materials = {
+        "floor": "wood", "ceiling": "ceiling_board", "wall_north": "concrete", "wall_south": "plasterboard",
+        "wall_west": "plasterboard", "wall_east": "plasterboard",
+    }  # fmt: skip
+    return box_room((WIDTH, DEPTH, HEIGHT), materials, {"wall_north": windows, "wall_south": door})
 
 
 def _furniture() -> list[Part]:

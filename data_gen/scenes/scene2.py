@@ -31,7 +31,7 @@ from data_gen.scenes.furniture import (
     wall_cupboard,
     wardrobe,
 )
-from data_gen.scenes.walls import Door, inner_wall, wall
+from data_gen.scenes.walls import Door, box_room, inner_wall
 
 WIDTH, DEPTH, HEIGHT = 11.0, 8.5, 2.7
 """Outline and height along x, y and z in metres."""
@@ -59,7 +59,6 @@ def scene2() -> SceneSpec:
 
 
 def _shell() -> list[Part]:
-    x, y = WIDTH / 2, DEPTH / 2
     north = {
         "window_study": ((0.8, 0.9, 2.4, 2.2), "glass"),
         "door": ((4.7, 0.0, 5.6, 2.05), "wood"),
@@ -67,14 +66,11 @@ def _shell() -> list[Part]:
     }
     south = {"window_living": ((1.9, 0.9, 3.9, 2.2), "glass")}
     east = {"window_bedroom": ((1.9, 0.9, 3.5, 2.2), "glass")}
-    return [
-        *wall("floor", (-x, -y, 0), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "wood"),
-        *wall("ceiling", (-x, -y, HEIGHT), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "concrete"),
-        *wall("wall_north", (-x, y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "concrete", north),
-        *wall("wall_south", (-x, -y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "concrete", south),
-        *wall("wall_west", (-x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard"),
-        *wall("wall_east", (x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard", east),
-    ]
+    materials = {
+        "floor": "wood", "ceiling": "concrete", "wall_north": "concrete", "wall_south": "concrete",
+        "wall_west": "plasterboard", "wall_east": "plasterboard",
+    }  # fmt: skip
+    return box_room((WIDTH, DEPTH, HEIGHT), materials, {"wall_north": north, "wall_south": south, "wall_east": east})
 
 
 def _inner_walls() -> list[Part]:

@@ -27,7 +27,7 @@ from data_gen.scenes.furniture import (
     wall_cupboard,
     wardrobe,
 )
-from data_gen.scenes.walls import Door, inner_wall, wall
+from data_gen.scenes.walls import Door, box_room, inner_wall
 
 WIDTH, DEPTH, HEIGHT = 18.0, 6.0, 2.8
 """Outline and height along x, y and z in metres."""
@@ -55,7 +55,6 @@ def scene4() -> SceneSpec:
 
 
 def _shell() -> list[Part]:
-    x, y = WIDTH / 2, DEPTH / 2
     north = {
         "window_office": ((4.9, 0.9, 7.4, 2.3), "glass"),
         "window_meeting": ((8.5, 0.9, 11.6, 2.3), "glass"),
@@ -63,14 +62,11 @@ def _shell() -> list[Part]:
     }
     south = {"door": ((2.6, 0.0, 3.6, 2.1), "glass")}
     east = {"window_corridor": ((0.3, 0.9, 1.5, 2.3), "glass")}
-    return [
-        *wall("floor", (-x, -y, 0), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "concrete"),
-        *wall("ceiling", (-x, -y, HEIGHT), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "ceiling_board"),
-        *wall("wall_north", (-x, y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "concrete", north),
-        *wall("wall_south", (-x, -y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "concrete", south),
-        *wall("wall_west", (-x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard"),
-        *wall("wall_east", (x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard", east),
-    ]
+    materials = {
+        "floor": "concrete", "ceiling": "ceiling_board", "wall_north": "concrete", "wall_south": "concrete",
+        "wall_west": "plasterboard", "wall_east": "plasterboard",
+    }  # fmt: skip
+    return box_room((WIDTH, DEPTH, HEIGHT), materials, {"wall_north": north, "wall_south": south, "wall_east": east})
 
 
 def _inner_walls() -> list[Part]:

@@ -15,7 +15,7 @@ Plan (x to the right, y up); the receiver R looks along +x:
 from data_gen.scenes.base import GAP, Part, SceneSpec, grid_3d, part
 from data_gen.scenes.furniture import bed, cabinet, desk, lamp, monitor, office_chair, place, shelf, wardrobe
 from data_gen.scenes.geometry import box
-from data_gen.scenes.walls import wall
+from data_gen.scenes.walls import box_room
 
 WIDTH, DEPTH, HEIGHT = 7.0, 5.5, 2.6
 """Size of the room along x, y and z in metres."""
@@ -39,18 +39,14 @@ def scene6() -> SceneSpec:
 
 
 def _shell() -> list[Part]:
-    x, y = WIDTH / 2, DEPTH / 2
     north = {"window_north": ((2.9, 0.9, 4.6, 2.2), "glass")}
     east = {"window_east": ((1.2, 0.9, 3.2, 2.2), "glass")}
     south = {"door": ((5.6, 0.0, 6.5, 2.05), "wood")}
-    return [
-        *wall("floor", (-x, -y, 0), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "wood"),
-        *wall("ceiling", (-x, -y, HEIGHT), (1, 0, 0), (0, 1, 0), (WIDTH, DEPTH), "concrete"),
-        *wall("wall_north", (-x, y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "plasterboard", north),
-        *wall("wall_south", (-x, -y, 0), (1, 0, 0), (0, 0, 1), (WIDTH, HEIGHT), "plasterboard", south),
-        *wall("wall_west", (-x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "plasterboard"),
-        *wall("wall_east", (x, -y, 0), (0, 1, 0), (0, 0, 1), (DEPTH, HEIGHT), "concrete", east),
-    ]
+    materials = {
+        "floor": "wood", "ceiling": "concrete", "wall_north": "plasterboard", "wall_south": "plasterboard",
+        "wall_west": "plasterboard", "wall_east": "concrete",
+    }  # fmt: skip
+    return box_room((WIDTH, DEPTH, HEIGHT), materials, {"wall_north": north, "wall_south": south, "wall_east": east})
 
 
 def _furniture() -> list[Part]:

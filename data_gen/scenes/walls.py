@@ -71,6 +71,32 @@ def wall(
     ]
 
 
+def box_room(
+    size: Vec3, materials: Mapping[str, str], openings: Mapping[str, Mapping[str, tuple[Rectangle, str | None]]] | None = None
+) -> list[Part]:
+    """Floor, ceiling and four walls of a room whose floor is centred on the origin.
+
+    Args:
+        size: along x, y and z in metres.
+        materials: of "floor", "ceiling", "wall_north" (+y), "wall_south", "wall_west" and "wall_east" (+x).
+        openings: doors and windows of these surfaces, as in `wall`.
+    """
+    width, depth, height = size
+    x, y = width / 2, depth / 2
+    along_x, along_y, upwards = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+    surfaces: dict[str, tuple[Vec3, Vec3, Vec3, Vec2]] = {
+        "floor": ((-x, -y, 0), along_x, along_y, (width, depth)),
+        "ceiling": ((-x, -y, height), along_x, along_y, (width, depth)),
+        "wall_north": ((-x, y, 0), along_x, upwards, (width, height)),
+        "wall_south": ((-x, -y, 0), along_x, upwards, (width, height)),
+        "wall_west": ((-x, -y, 0), along_y, upwards, (depth, height)),
+        "wall_east": ((x, -y, 0), along_y, upwards, (depth, height)),
+    }
+    openings = openings or {}
+    walls = (wall(name, *where, materials[name], openings.get(name)) for name, where in surfaces.items())
+    return list(itertools.chain.from_iterable(walls))
+
+
 def _owner(openings: Mapping[str, tuple[Rectangle, str | None]], u: float, v: float) -> str | None:
     for key, ((u0, v0, u1, v1), _) in openings.items():
         if u0 < u < u1 and v0 < v < v1:
