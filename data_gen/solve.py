@@ -27,6 +27,9 @@ from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
 from data_gen.trace import BalancedMaterial, PathTracer
 
+WEAK = 1e-10
+"""Amplitude, relative to a transmitter's strongest path, below which paths are not counted. Whether the simulator keeps a path
+that carries next to nothing is chance: some of its threads round denormal numbers to zero, some do not."""
 FREQUENCY_TOLERANCE = 1e-6
 """Sionna holds the frequency in float32; more than this relative difference is a mistake."""
 
@@ -45,6 +48,12 @@ class TxPaths:
     def snapshot(self) -> Complex[np.ndarray, "elements"]:
         """Coherent sum of the paths, complex64."""
         return self.coefficients.sum(0).astype(np.complex64)
+
+    def strong(self) -> "TxPaths":
+        """The paths that are not `WEAK`: the same in every run."""
+        amplitude = np.abs(self.coefficients).max(-1)
+        kept = amplitude > WEAK * amplitude.max(initial=0)
+        return TxPaths(self.coefficients[kept], self.delays[kept], self.order[kept])
 
     def delay_spread(self) -> float:
         """R.m.s. delay spread in seconds, weighted by power; 0 without a path."""

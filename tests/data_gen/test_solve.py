@@ -196,3 +196,14 @@ def test_frequency_is_read_back_and_checked():
         assert abs(reported / asked - 1) < 1e-6
     with pytest.raises(UserError, match="140 GHz"):
         simulator.paths(tx, (10e9, 140e9))
+
+
+def test_strong_paths_leave_out_what_carries_nothing():
+    from data_gen.solve import TxPaths
+
+    coefficients = np.array([[1e-6, 0], [0, 2e-15], [1e-17, 1e-17], [1e-40, 0]], complex)
+    strong = TxPaths(coefficients, np.arange(4) * 1e-9, np.arange(4)).strong()
+    assert strong.order.tolist() == [0, 1] and strong.delays.tolist() == [0, 1e-9]
+    np.testing.assert_array_equal(strong.coefficients, coefficients[:2])
+    nothing = TxPaths(np.zeros((0, 16), complex), np.zeros(0), np.zeros(0, int))
+    assert len(nothing.strong().delays) == 0 and nothing.delay_spread() == 0
