@@ -57,7 +57,8 @@ def state(rng):
     logits = np.array([0.0, 0.5, -1.0, -9.0, 0.2, 0.3])
     # Sums over the visible steps: 0.9, 3, 4, 9 and 50 a step; the unseen one has no gradient.
     gradient, visible = np.array([9.0, 6, 8, 18, 0, 50]), np.array([10.0, 2, 2, 2, 0, 1])
-    made = make_state(rng, rng.normal(size=(6, 3)), log_scales, rng.normal(size=(6, 4)), logits, gradient, visible)
+    means = rng.normal(size=(6, 3)) * 0.5 + [0, 0, 2.5]  # above the receiver's horizon, where training sees them
+    made = make_state(rng, means, log_scales, rng.normal(size=(6, 4)), logits, gradient, visible)
     gaussians = dataclasses.replace(made.params.gaussians, alive=made.params.gaussians.alive.at[DEAD].set(0))
     return dataclasses.replace(made, params=dataclasses.replace(made.params, gaussians=gaussians))
 
