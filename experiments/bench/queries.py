@@ -1,0 +1,31 @@
+"""Answering queries with a field of the device's preset, its geometry folded in."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from experiments.bench.timing import Effort, Report, interleaved, say, timed
+from experiments.bench.training import start_run
+from wbgs_jax.inference import BLOCK, make_predictor
+
+QUERIES = 1000
+
+
+def measure(report: Report, effort: Effort) -> None:
+    """Throughput with the images in the host's memory, latency of one query, compilation."""
+    count = 2 * BLOCK if effort.quick else QUERIES
+    say(f"queries: {count} in blocks of {BLOCK}")
+    with tempfile.TemporaryDirectory() as folder:
+        run = start_run(effort, Path(folder))
+    index = np.random.default_rng(effort.seed).choice(run.dataset.test, count)
+    blocks = [run.dataset.query(np.resize(index[i : i + BLOCK], BLOCK)) for i in range(0, count, BLOCK)]
+    single = run.dataset.query(index[:1])
+    predictor = make_predictor(run.field, run.state.params, run.dataset.receiver)
+    first = timed(lambda: predictor(blocks[0]))
+    seconds = interleaved(
+        {"all": lambda: [np.asarray(predictor(block)) for block in blocks], "single": lambda: predictor(single)}, effort
+    )
+    report.add(f"compile_s_queries_b{BLOCK}", first, "s", "lower")
+    report.add_sample("queries_per_s", count / seconds["all"], "1/s", "higher")
+    report.add_time("single_query", seconds["single"])

@@ -1,0 +1,87 @@
+"""What the renderers are given: random Gaussians around a receiver, attenuation and signal of some queries."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wbgs_jax import (
+    Capacity,
+    Gaussians,
+    Receiver,
+    geometry_plan,
+    make_receiver,
+    measure_capacity,
+    project,
+    render_dense,
+    render_splats,
+)
+
+Render = Callable[[Gaussians, Float[Array, "n b"], Float[Array, "n b"]], Float[Array, "b 90 360"]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """N Gaussians and B queries."""
+
+    gaussians: Gaussians
+    receiver: Receiver
+    attenuation: Float[Array, "n b"]
+    signal: Float[Array, "n b"]
+    cotangent: Float[Array, "b 90 360"]
+    capacity: Capacity
+
+    def inputs(self, b: int) -> tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"], Float[Array, "b 90 360"]]:
+        """Inputs of compiled functions, for the first b queries."""
+        return self.gaussians, self.attenuation[:, :b], self.signal[:, :b], self.cotangent[:b]
+
+    def tiled(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
+        """The project's renderer, geometry included."""
+        return render_splats(geometry_plan(gaussians, self.receiver, self.capacity), attenuation, signal)
+
+    def dense(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
+        """The reference."""
+        return render_dense(project(gaussians, self.receiver), attenuation, signal)
+
+    def compile_forward(self, render: Render, b: int) -> jax.stages.Compiled:
+        """A renderer."""
+        return jax.jit(lambda *inputs: render(*inputs[:3])).lower(*self.inputs(b)).compile()
+
+    def compile_gradient(self, render: Render, b: int) -> jax.stages.Compiled:
+        """A renderer's forward and backward."""
+
+        def objective(gaussians, attenuation, signal, cotangent):
+            return jnp.sum(render(gaussians, attenuation, signal) * cotangent)
+
+        return jax.jit(jax.grad(objective, argnums=(0, 1, 2))).lower(*self.inputs(b)).compile()
+
+
+def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:
+    """Directions even over the hemisphere, footprints of 2-10 degrees (3 sigma), distances of 1-6 m."""
+    cosine, azimuth, distance = rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(1, 6, n)
+    sine = np.sqrt(1 - cosine**2)
+    means = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], -1) * distance[:, None]
+    sigma = np.deg2rad(rng.uniform(2, 10, n)) / 3 * distance
+    log_scales = np.log(sigma[:, None] * rng.uniform(0.6, 1.4, (n, 3)))
+    arrays = (means, log_scales, rng.normal(size=(n, 4)), np.zeros(n), np.ones(n))
+    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
+
+
+def random_scene(n: int, b: int, seed: int) -> Scene:
+    """A scene for up to b queries."""
+    rng = np.random.default_rng([seed, n])
+    gaussians, receiver = random_gaussians(rng, n), make_receiver([0.0, 0.0, 0.0])
+    attenuation, signal = (jnp.asarray(rng.uniform(0, 0.6, (n, b)), jnp.float32) for _ in range(2))
+    cotangent = jnp.asarray(rng.normal(size=(b, 90, 360)), jnp.float32)
+    capacity = measure_capacity(project(gaussians, receiver), 1.05)
+    return Scene(gaussians, receiver, attenuation, signal, cotangent, capacity)
+
+
+def temporary_gb(compiled: jax.stages.Compiled) -> float:
+    """Memory that a compiled function takes beyond its inputs and outputs."""
+    analysis = compiled.memory_analysis()
+    assert analysis is not None, "every backend with XLA knows"
+    return analysis.temp_size_in_bytes / 1e9
