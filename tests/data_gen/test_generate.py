@@ -33,6 +33,7 @@ def options(folder, **changes):
         depth=1,
         max_paths=20_000,
         max_tx=20,
+        workers=1,
     )
     return dataclasses.replace(quick, **changes)
 
