@@ -142,13 +142,12 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
     from data_gen import ceilings
 
     elements, nothing = job.array.element_positions(), np.full(len(ceilings.NAMES), np.nan)
-    strong = [p.strong() for p in paths]
     return {
         "snapshots": np.stack([p.snapshot() for p in paths]),
-        "n_paths": np.array([len(p.delays) for p in strong]),
-        "line_of_sight": np.array([bool((p.order == 0).any()) for p in strong]),
-        "delay_spread_s": np.array([p.delay_spread() for p in strong]),
-        "ceilings": np.stack([ceilings.measure(p, elements) if tx in job.ceiling_tx else nothing for p in strong]),
+        "n_paths": np.array([len(p.delays) for p in paths]),
+        "line_of_sight": np.array([bool((p.order == 0).any()) for p in paths]),
+        "delay_spread_s": np.array([p.delay_spread() for p in paths]),
+        "ceilings": np.stack([ceilings.measure(p, elements) if tx in job.ceiling_tx else nothing for p in paths]),
     }
 
 

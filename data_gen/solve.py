@@ -27,9 +27,9 @@ from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
 from data_gen.trace import BalancedMaterial, PathTracer
 
-WEAK = 1e-10
-"""Amplitude, relative to a transmitter's strongest path, below which paths are not counted. Whether the simulator keeps a path
-that carries next to nothing is chance: some of its threads round denormal numbers to zero, some do not."""
+FAINT = 1e-15
+"""Amplitude (-300 dB) below which a path is left out. Whether the simulator keeps a path whose power is a denormal number is
+chance, because some of its threads round those to zero: a sum with it may differ in its last bit, and so would the checksum."""
 FREQUENCY_TOLERANCE = 1e-6
 """Sionna holds the frequency in float32; more than this relative difference is a mistake."""
 
@@ -48,12 +48,6 @@ class TxPaths:
     def snapshot(self) -> Complex[np.ndarray, "elements"]:
         """Coherent sum of the paths, complex64."""
         return self.coefficients.sum(0).astype(np.complex64)
-
-    def strong(self) -> "TxPaths":
-        """The paths that are not `WEAK`: the same in every run."""
-        amplitude = np.abs(self.coefficients).max(-1)
-        kept = amplitude > WEAK * amplitude.max(initial=0)
-        return TxPaths(self.coefficients[kept], self.delays[kept], self.order[kept])
 
     def delay_spread(self) -> float:
         """R.m.s. delay spread in seconds, weighted by power; 0 without a path."""
@@ -148,6 +142,7 @@ def _by_transmitter(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[TxP
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]
     valid = np.array(found.valid)[0]
     order = (np.array(found.interactions)[:, 0] != rt.InteractionType.NONE).sum(0)
+    valid &= np.abs(coefficients).max(-1) > FAINT
     return [_sorted_paths(coefficients[i, valid[i]], delays[i, valid[i]], order[i, valid[i]]) for i in range(n_tx)]
 
 

@@ -198,12 +198,12 @@ def test_frequency_is_read_back_and_checked():
         simulator.paths(tx, (10e9, 140e9))
 
 
-def test_strong_paths_leave_out_what_carries_nothing():
-    from data_gen.solve import TxPaths
+def test_faint_paths_are_left_out():
+    """What is left of a wave after a long way: as much as behind twenty walls of concrete."""
+    from data_gen.solve import FAINT
 
-    coefficients = np.array([[1e-6, 0], [0, 2e-15], [1e-17, 1e-17], [1e-40, 0]], complex)
-    strong = TxPaths(coefficients, np.arange(4) * 1e-9, np.arange(4)).strong()
-    assert strong.order.tolist() == [0, 1] and strong.delays.tolist() == [0, 1e-9]
-    np.testing.assert_array_equal(strong.coefficients, coefficients[:2])
-    nothing = TxPaths(np.zeros((0, 16), complex), np.zeros(0), np.zeros(0, int))
-    assert len(nothing.strong().delays) == 0 and nothing.delay_spread() == 0
+    simulator, wavelength = free_space(), SPEED_OF_LIGHT / FREQUENCIES[0]
+    limit = wavelength / (4 * np.pi) / FAINT  # metres, at a gain of 0 dBi
+    near, far = (simulator.paths(np.array([[limit * share, 0.0, 0.0]]), FREQUENCIES[:1])[0][0] for share in (0.01, 100.0))
+    assert len(near.delays) == 1
+    assert len(far.delays) == 0 and far.delay_spread() == 0 and not far.snapshot().any()
