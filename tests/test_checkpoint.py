@@ -12,7 +12,7 @@ from wbgs_jax import checkpoint
 from wbgs_jax.errors import UserError
 from wbgs_jax.types import Query
 
-METADATA = {"gaussian_capacity": 64, "tile_capacity": {"entries": 4096, "jobs": 1024}, "seconds": 0.1}
+METADATA = {"sizes": {"gaussians": 64}, "tile_capacity": {"entries": 4096, "jobs": 1024}, "seconds": 0.1}
 
 
 @pytest.fixture

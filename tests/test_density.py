@@ -198,7 +198,7 @@ def test_capacity_buckets_hold_what_they_must_and_are_few():
 
 def test_training_goes_on_after_a_control_and_leaves_padding_alone(state):
     data = training_data(tiny_dataset())
-    epoch = make_epoch(wideband, OPTIMIZER, Capacity(16384, 2048), SETTINGS.optim.ssim_weight)
+    epoch = make_epoch(wideband, OPTIMIZER, Capacity(16384, 2048), SETTINGS.optim)
     edited, _ = control(state)
     # The epoch takes its argument's memory.
     before = jax.tree.map(np.array, edited.params.gaussians)

@@ -12,7 +12,7 @@ from wbgs_jax.config import PRESETS, Settings, from_dict, to_dict
 from wbgs_jax.data.surface import make_surface
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import wideband
-from wbgs_jax.runs import RunConfig, abstract_params, difference, load_trained, read_config, write_config
+from wbgs_jax.runs import RunConfig, difference, load_trained, read_config, write_config
 
 CONFIG = RunConfig("scene.npz", "wideband", "smoke", 3, 2.4, PRESETS["smoke"])
 
@@ -107,11 +107,12 @@ def test_settings_survive_a_dictionary():
     assert from_dict(json.loads(json.dumps(to_dict(settings)))) == settings
 
 
-def test_abstract_parameters_have_the_shapes_of_real_ones():
+def test_the_skeleton_of_parameters_has_the_shapes_of_real_ones():
     settings = tiny_settings()
     surface = jax.tree.map(jnp.asarray, make_surface(tiny_dataset(), 20, seed=0))
     params = jax.jit(wideband.init, static_argnums=(2, 3))(jax.random.key(0), surface, settings.wideband, 32)
-    abstract = abstract_params(wideband, settings, "wideband", 32)
+    assert wideband.sizes(params) == {"gaussians": 32}
+    abstract = wideband.skeleton(settings.wideband, {"gaussians": 32})
     assert jax.tree.structure(abstract) == jax.tree.structure(params)
     for a, b in zip(jax.tree.leaves(abstract), jax.tree.leaves(params), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)

@@ -1,6 +1,7 @@
 """The jitted epoch and the host's answer to what it reports: nothing half-done is ever kept."""
 
 import dataclasses
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from synthetic import make_epoch, tiny_dataset, tiny_scene, tiny_settings
 
 from wbgs_jax.data.layout import export_layout, load_layout
 from wbgs_jax.errors import UserError
-from wbgs_jax.fields import wideband
+from wbgs_jax.fields import Observation, wideband
 from wbgs_jax.splat import Capacity, project
 from wbgs_jax.splat.tiles import build_tile_jobs
 from wbgs_jax.train_step import loss_and_gradients, training_data
@@ -93,7 +94,7 @@ def test_the_statistics_are_sums_of_the_positional_gradients(tmp_path, dataset):
     run = new_run(dataset, tmp_path)
     index = jnp.asarray(run.batches(0, 1)[0])
     gradients = jax.jit(loss_and_gradients, static_argnums=(0, 4, 5))
-    _, (d_params, d_means2d) = gradients(wideband, run.state.params, run.data, index, run.capacity, 0.2)
+    _, (d_params, d_means2d) = gradients(wideband, run.state.params, run.data, index, run.capacity, SETTINGS.optim)
     state, _ = run.run_epoch(run.state, run.data, jnp.tile(index, (LENGTH, 1)), first(LENGTH - 1))
     expected = np.hypot(d_means2d[:, 0] * 180, d_means2d[:, 1] * 45)  # pixels -> -1..1 across the image
     np.testing.assert_allclose(state.density.gradient_norm, expected, rtol=1e-3, atol=1e-7)
@@ -173,17 +174,15 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
     """The loss alone can look healthy: its value is finite, its derivative is not."""
     run = new_run(dataset, tmp_path)
 
-    class Cusp:
+    def observe(params, memory, receiver, query, *_):
         """sqrt at zero: value 0, slope infinite."""
+        flat = jnp.sqrt(0 * params.gaussians.opacity_logits[0])
+        jobs = wideband.plan(params, receiver, run.capacity).geometry.jobs
+        return Observation(jnp.full((query.frequency_hz.shape[0], 90, 360), 0.5) + flat, jobs=jobs)
 
-        init, plan = staticmethod(wideband.init), staticmethod(wideband.plan)
-
-        @staticmethod
-        def render(params, plan, query):
-            flat = jnp.sqrt(0 * params.gaussians.opacity_logits[0])
-            return jnp.full((query.frequency_hz.shape[0], 90, 360), 0.5) + flat
-
-    epoch = make_epoch(Cusp(), run.optimizer, run.capacity, 0.2)
+    cusp = ModuleType("cusp")
+    cusp.__dict__.update(vars(wideband) | {"observe": observe})
+    epoch = make_epoch(cusp, run.optimizer, run.capacity, SETTINGS.optim)
     before = snapshot(run.state)
     state, report = epoch(run.state, run.data, jnp.asarray(run.batches(0, LENGTH)), first(0))
     assert bool(report.stopped) and int(report.good_steps) == 0 and not report.overflow

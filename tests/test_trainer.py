@@ -107,7 +107,7 @@ def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninter
     """The density control of step 4 lies before the checkpoint of step 4."""
     shutil.copytree(uninterrupted(settings), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / str(STEPS))
-    capacity = checkpoint.load_metadata(tmp_path / "run" / "checkpoints", 4)["gaussian_capacity"]
+    capacity = checkpoint.load_metadata(tmp_path / "run" / "checkpoints", 4)["sizes"]["gaussians"]
     assert capacity == 64 if settings is SETTINGS else capacity > 64
     assert train(dataset, "wideband", settings, 0, tmp_path / "run", resume=True).steps == STEPS
     assert_same_run(dataset, tmp_path / "run", uninterrupted(settings), settings)

@@ -41,7 +41,7 @@ def make_run(folder: Path) -> Path:
     scene = folder.with_suffix(".npz")
     save_scene(scene, tiny_scene())
     write_config(folder, run_config(scene))
-    metadata = {"gaussian_capacity": SETTINGS.wideband.gaussians, "seconds": 1.0}
+    metadata = {"sizes": {"gaussians": SETTINGS.wideband.gaussians}, "seconds": 1.0}
     checkpoint.save(folder / "checkpoints", STEP, State(make_params()), metadata, keep=1)
     return folder
 

@@ -36,7 +36,8 @@ def save(folder: Path, step: int, state: Any, metadata: dict[str, Any], keep: in
     target = (folder / str(step)).absolute()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        host = {key: np.asarray(leaf) for key, leaf in _flatten(state).items()}  # loads on any device
+        # Host arrays load on any device; Orbax refuses empty ones.
+        host = {key: np.asarray(leaf) for key, leaf in _flatten(state).items() if np.size(leaf)}
         ocp.save(target, host, custom_metadata=metadata, overwrite=True)
     except OSError as error:
         raise UserError(
@@ -64,6 +65,7 @@ def load(folder: Path, step: int, like: Any, prefix: str = "") -> Any:
     with _explained(path):
         found = ocp.load(path.absolute())
     wanted = {prefix + key: leaf for key, leaf in _flatten(like).items()}
+    found |= {key: np.zeros(leaf.shape) for key, leaf in wanted.items() if 0 in leaf.shape}
     if any(key not in found or np.shape(found[key]) != leaf.shape for key, leaf in wanted.items()):
         raise UserError(f"checkpoint {path} does not fit this configuration; start a new run in another OUT")
     leaves = [jax.numpy.asarray(found[key], leaf.dtype) for key, leaf in wanted.items()]

@@ -53,6 +53,37 @@ class WidebandConfig:
 
 
 @dataclass(frozen=True)
+class WaveConfig:
+    """The coherent field (fields/wave.py)."""
+
+    max_facets: int = 3000
+    """The largest planar pieces of the mesh; the rest is left out."""
+    mirror_areas: tuple[float, ...] = (0.0, 0.05, 1.0)
+    """Square metres: the smallest facet in a chain of 1, 2 and 3 reflections."""
+    mirror_area_after_edge: float = 0.5
+    """Square metres: the smallest mirror behind a diffracting edge ..."""
+    mirror_area_before_edge: float = 3.0
+    """... and in front of it."""
+    plain_tried: int = 512
+    """Candidates without diffraction that are cut with all facets, and how many of them are kept."""
+    plain_kept: int = 128
+    diffracted_tried: int = 1024
+    diffracted_kept: int = 256
+    permittivity: float = 4.0
+    """What all materials start with: relative permittivity ..."""
+    conductivity: float = 0.02
+    """... conductivity at 1 GHz, S/m ..."""
+    slope: float = 1.0
+    """... its exponent over frequency ..."""
+    thickness: float = 0.1
+    """... and metres, where the scene does not say."""
+    survival: float = 0.7
+    """Amplitude that diffracted waves keep at every further meeting, at the start."""
+    residual_weight: float = 0.1
+    """Weight of the facets' mean squared residuals."""
+
+
+@dataclass(frozen=True)
 class OptimConfig:
     """Loss, optimiser groups and schedules; every learning rate decays by a cosine to `final_fraction` of itself."""
 
@@ -74,6 +105,16 @@ class OptimConfig:
     log_scales_lr: float = 5e-3
     quats_lr: float = 1e-3
     opacity_lr: float = 2.5e-2
+    materials_lr: float = 3e-2
+    """Logarithms of permittivity and conductivity, of the wave field."""
+    thickness_lr: float = 1.5e-3
+    """Logarithm of metres: at 100 GHz a thousandth of a wall turns the phase by a tenth of a radian."""
+    residual_lr: float = 6e-3
+    """Facets' residuals, survival and gain."""
+    snapshot_weight: float = 0.5
+    """Weight of 1 - correlation of snapshots, where field and data have them ..."""
+    power_weight: float = 0.01
+    """... and of the squared error of their log amplitude."""
     final_fraction: float = 0.01
 
 
@@ -116,6 +157,7 @@ class Settings:
     """Everything that makes a run, but the data and the seed."""
 
     wideband: WidebandConfig = field(default_factory=WidebandConfig)
+    wave: WaveConfig = field(default_factory=WaveConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)

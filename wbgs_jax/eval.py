@@ -14,20 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
+from jaxtyping import Array, Complex
 from rich.console import Console
 from rich.table import Table
 
 import wbgs_jax
-from wbgs_jax import metrics, pictures
+from wbgs_jax import channel, metrics, pictures
 from wbgs_jax.compilation import use_compilation_cache
 from wbgs_jax.config import to_dict
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.files import write_json
-from wbgs_jax.inference import BLOCK, make_predictor, predict_spectra
+from wbgs_jax.inference import BLOCK, make_predictor, observations
 from wbgs_jax.references import references
 from wbgs_jax.runs import TrainedField, load_trained
 
@@ -53,15 +55,28 @@ def evaluate(trained: TrainedField, dataset: Dataset) -> tuple[dict[str, Any], n
     test = dataset.test
     if not len(test):
         raise UserError(f"{dataset.name} has no test spectra; choose another split")
-    predicted = predict_spectra(trained.field, trained.params, dataset, test)
+    seen = list(observations(trained.field, trained.params, dataset, test))
+    predicted = np.concatenate([np.asarray(one.pas) for one in seen])
     truth = np.asarray(dataset.pas(test))
     frequencies = dataset.frequencies_hz[test]
     report = {"scene": dataset.name, "field": trained.config.field} | metrics.score(predicted, truth, frequencies)
+    if seen[0].snapshots is not None and dataset.snapshots is not None:
+        snapshots = jnp.concatenate([one.snapshots for one in seen if one.snapshots is not None])
+        report |= score_snapshots(snapshots, jnp.asarray(dataset.snapshots[test]))
     report |= time_queries(trained, dataset)
     report["references"] = {
         name: metrics.score(np.asarray(predictor(test)), truth, frequencies) for name, predictor in references(dataset).items()
     }
     return report, predicted
+
+
+def score_snapshots(predicted: Complex[Array, "n elements"], truth: Complex[Array, "n elements"]) -> dict[str, float]:
+    """Medians of the correlation |y^H y_hat| / (|y| |y_hat|) and of the power error (dB)."""
+    error = jnp.abs(channel.received_power_db(predicted) - channel.received_power_db(truth))
+    return {
+        "snapshot_correlation": float(jnp.median(channel.correlation(truth, predicted))),
+        "power_error_db": float(jnp.median(error)),
+    }
 
 
 def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
@@ -101,9 +116,15 @@ def provenance(trained: TrainedField) -> dict[str, Any]:
         "seed": trained.config.seed,
         "steps": trained.step,
         "training_seconds": round(trained.seconds, 1),
-        "gaussians": int(np.asarray(trained.params.gaussians.alive).sum()),
+        **trained.field.sizes(trained.params),
+        **_alive(trained.params),
         "settings": to_dict(trained.config.settings),
     }
+
+
+def _alive(params: Any) -> dict[str, int]:
+    """Living Gaussians, where there are any: fewer than there is room for."""
+    return {"gaussians": int(np.asarray(params.gaussians.alive).sum())} if hasattr(params, "gaussians") else {}
 
 
 def _training_arguments(trained: TrainedField) -> list[str]:
@@ -165,6 +186,9 @@ def main() -> None:
         print(json.dumps(report, allow_nan=False))
     else:
         Console(width=None if sys.stdout.isatty() else 140).print(table(report))
+        if "snapshot_correlation" in report:
+            alike, error = report["snapshot_correlation"], report["power_error_db"]
+            print(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")
         print(
             f"{report['ms_per_pas']:.2f} ms a PAS in blocks of {BLOCK}, {report['ms_per_pas_single']:.2f} ms for a single query"
         )

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax.array import PAS_SHAPE
 from wbgs_jax.checks import check_query
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.fields import Field
+from wbgs_jax.fields import Field, Observation
 from wbgs_jax.runs import TrainedField
 from wbgs_jax.types import Query, Receiver
 
@@ -138,8 +138,27 @@ def predict_map(
 
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:
     """Predicted spectra (float32) of some of a dataset's queries."""
-    predict = make_predictor(field, params, dataset.receiver)
-    return _collect(len(index), _blocks(len(index), BLOCK, lambda i: predict(dataset.query(index[i]))))
+    return _collect(len(index), (np.asarray(seen.pas) for seen in observations(field, params, dataset, index)))
+
+
+def observations(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Iterator[Observation]:
+    """What a field shows of some of a dataset's queries, block by block. What it can remember of a transmitter is computed
+    once for all frequencies."""
+    _, first, place = np.unique(dataset.tx_index[index], return_index=True, return_inverse=True)
+    positions = jnp.asarray(dataset.tx_positions[index[first]], jnp.float32)
+    memory = field.remember(params, dataset.receiver, positions)
+    if memory is None:
+        predict = make_predictor(field, params, dataset.receiver)
+        for images in _blocks(len(index), BLOCK, lambda i: predict(dataset.query(index[i]))):
+            yield Observation(jnp.asarray(images))
+        return
+    observe = jax.jit(field.observe)
+    for start in range(0, len(index), BLOCK):
+        chosen = np.minimum(np.arange(start, start + BLOCK), len(index) - 1)  # the last query fills the last block up
+        query, tx_index = dataset.query(index[chosen]), jnp.asarray(place[chosen], jnp.int32)
+        seen = observe(params, memory, dataset.receiver, query, tx_index, None, None)
+        left = len(index) - start
+        yield Observation(seen.pas[:left], None if seen.snapshots is None else seen.snapshots[:left])
 
 
 def scene_box(dataset: Dataset) -> Float[np.ndarray, "2 3"]:

@@ -5,9 +5,12 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 _WINDOW, _SIGMA = 11, 1.5
+FAINTEST = 1e-12
+"""Power relative to the truth's, below which predictions are all the same to the loss: a prediction of nearly nothing has no
+gradient that leads anywhere."""
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -39,6 +42,26 @@ def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"]) -> Float[Array, "
     luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
     structure = (2 * covariance + _C2) / (var_a + var_b + _C2)
     return jnp.mean(luminance * structure, axis=(-2, -1))
+
+
+def snapshot_loss(
+    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(1 - correlation, squared error of the log amplitude), means over snapshots.
+
+    The correlation |y^H y_hat|^2 / (|y|^2 |y_hat|^2) is blind to a common phase and scale; the amplitude is that of the whole
+    array, in nepers.
+    """
+    scale = jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
+    unit_truth, relative = truth / scale, predicted / scale
+    power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
+    product = jnp.sum(unit_truth.conj() * relative, -1)
+    return jnp.mean(1 - squared_magnitude(product) / power), jnp.mean((0.5 * jnp.log(power)) ** 2)
+
+
+def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
+    """|z|^2 with a gradient that is finite at 0."""
+    return z.real**2 + z.imag**2
 
 
 def image_loss(

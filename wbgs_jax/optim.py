@@ -8,15 +8,25 @@ import optax
 from wbgs_jax.config import OptimConfig
 
 FROZEN = "frozen"
-_GAUSSIAN_GROUPS = ("means", "log_scales", "quats", "opacity_logits")
+_BY_NAME = {
+    "means": "means",
+    "log_scales": "log_scales",
+    "quats": "quats",
+    "opacity_logits": "opacity_logits",
+    "log_thickness": "thickness",
+    "materials": "materials",
+    "residual": "residual",
+    "log_survival": "residual",
+    "log_gain": "residual",
+}
 
 
 def parameter_group(path: tuple[Any, ...]) -> str:
-    """The group of a parameter from its place in the tree; what is neither network nor Gaussian shape is not trained."""
+    """The group of a parameter from its place in the tree; what has no group is not trained."""
     names = [str(getattr(entry, "name", getattr(entry, "key", ""))) for entry in path]
     if "networks" in names:
         return "networks"
-    return next((group for group in _GAUSSIAN_GROUPS if group in names), FROZEN)
+    return next((_BY_NAME[name] for name in reversed(names) if name in _BY_NAME), FROZEN)
 
 
 def make_optimizer(config: OptimConfig) -> optax.GradientTransformation:
@@ -30,6 +40,9 @@ def make_optimizer(config: OptimConfig) -> optax.GradientTransformation:
         "log_scales": config.log_scales_lr,
         "quats": config.quats_lr,
         "opacity_logits": config.opacity_lr,
+        "materials": config.materials_lr,
+        "thickness": config.thickness_lr,
+        "residual": config.residual_lr,
     }
     groups: dict[str, optax.GradientTransformation] = {name: optax.adam(decay(rate), eps=1e-15) for name, rate in rates.items()}
     groups["networks"] = optax.adamw(decay(config.network_lr), weight_decay=config.network_weight_decay)

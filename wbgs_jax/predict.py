@@ -1,20 +1,27 @@
 """Ask a trained field for spectra, or export it:
 
 python -m wbgs_jax.predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
+python -m wbgs_jax.predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
 python -m wbgs_jax.predict --run RUN --export field.zip
 """
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 import wbgs_jax
+from wbgs_jax import channel
+from wbgs_jax.array import cbf, pas_directions, steering_vector
 from wbgs_jax.compilation import use_compilation_cache
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.encoding import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
@@ -23,6 +30,8 @@ from wbgs_jax.export import export_field
 from wbgs_jax.files import atomic_write
 from wbgs_jax.inference import BLOCK, predict_many, predictor, scene_box, trained_band
 from wbgs_jax.runs import TrainedField, load_trained
+from wbgs_jax.types import Query, Receiver
+from wbgs_jax.wave.transfer import Arrivals, snapshot
 
 SHOWN = 12
 """Spectra in a picture."""
@@ -39,8 +48,10 @@ class Command:
     """Transmitters, each as x,y,z in metres (world frame)."""
     ghz: tuple[float, ...] = ()
     """Frequencies, 1 to 100; every transmitter is asked at every one of them."""
+    what: Literal["spectra", "snapshot", "power", "beamforming-gain", "k-factor", "delay-spread"] = "spectra"
+    """What to ask for: power angular spectra, or quantities of the channel, which the wave field knows."""
     out: Path | None = None
-    """Write the spectra to this .npz file."""
+    """Write the answers to this .npz file."""
     picture: Path | None = None
     """Draw the spectra (the first 12) into this .png file."""
     export: Path | None = None
@@ -90,7 +101,9 @@ def check(command: Command) -> None:
     if not (asks or writes or command.export):
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
     if (asks or writes) and not (command.tx and command.ghz and writes):
-        raise UserError("spectra need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+        raise UserError("answers need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+    if command.what != "spectra" and (command.picture or (asks and not command.out)):
+        raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
 
 
 def doubts(dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]) -> list[str]:
@@ -117,11 +130,61 @@ def ask(
     return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz)
 
 
+def ask_channel(
+    what: str, trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: np.ndarray
+) -> dict[str, np.ndarray]:
+    """{name with unit: values (tx, freq) or (tx, freq, elements)} of every transmitter at every frequency.
+
+    Raises:
+        UserError: the field knows no phases.
+    """
+    if not hasattr(trained.field, "channels"):
+        raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field wave")
+    field: Any = trained.field
+    plan = field.plan(trained.params, dataset.receiver)
+    name, measure = CHANNEL[what]
+
+    @jax.jit
+    def one(tx: Any, frequency: Any) -> Any:
+        found = field.channels(trained.params, plan, Query(tx[None], frequency[None]))
+        return measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver)
+
+    positions, frequencies = (jnp.asarray(a, jnp.float32) for a in (tx_positions, frequencies_hz))
+    rows = [[np.asarray(one(tx, f)) for f in frequencies] for tx in positions]
+    return {name: np.array(rows), "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
+
+
+def _beamforming_gain(arrivals: Arrivals, receiver: Receiver) -> Any:
+    y = snapshot(arrivals, receiver)
+    steering = steering_vector(receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
+    return channel.beamforming_gain_db(y, jnp.max(cbf(y, steering)))
+
+
+CHANNEL: dict[str, tuple[str, Callable[[Arrivals, Receiver], Any]]] = {
+    "snapshot": ("snapshots", snapshot),
+    "power": ("power_db", lambda arrivals, receiver: channel.received_power_db(snapshot(arrivals, receiver))),
+    "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
+    "k-factor": ("k_factor_db", lambda arrivals, _: channel.k_factor_db(arrivals)),
+    "delay-spread": ("delay_spread_s", lambda arrivals, _: channel.delay_spread_s(arrivals)),
+}
+"""Name in the file, and how it follows from what arrives."""
+
+
+def write_channel(path: Path, answer: dict[str, np.ndarray], trained: TrainedField, dataset: Dataset) -> None:
+    """The answer's arrays, and where they come from as JSON text in `meta`."""
+    arrays: dict[str, Any] = answer
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(_source(trained, dataset))))
+
+
+def _source(trained: TrainedField, dataset: Dataset) -> dict[str, Any]:
+    return {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
+
+
 def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: Dataset) -> None:
     """`pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, and where they come from as JSON text in `meta`."""
-    source = {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **vars(spectra), meta=np.array(json.dumps(source)))
+        np.savez_compressed(stream, **vars(spectra), meta=np.array(json.dumps(_source(trained, dataset))))
 
 
 def draw(spectra: Spectra) -> Figure:
@@ -165,6 +228,11 @@ def main() -> None:
         return
     for line in doubts(dataset, tx_positions, frequencies_hz):
         say(f"warning: {line}; the field was not trained there")
+    if command.what != "spectra":
+        assert command.out is not None, "checked"
+        write_channel(command.out, ask_channel(command.what, trained, dataset, tx_positions, frequencies_hz), trained, dataset)
+        say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
+        return
     spectra = ask(trained, dataset, tx_positions, frequencies_hz)
     if command.out:
         write_spectra(command.out, spectra, trained, dataset)

@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
 import wbgs_jax
 from wbgs_jax import checkpoint
 from wbgs_jax.config import Settings, from_dict, to_dict
@@ -19,7 +16,6 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.files import read_json, write_json
-from wbgs_jax.types import Surface
 
 
 @dataclass(frozen=True)
@@ -86,16 +82,6 @@ def difference(a: RunConfig, b: RunConfig) -> str:
     return next((f"{key}: {left[key]}, not {right[key]}" for key in left if left[key] != right[key]), "")
 
 
-def abstract_params(field: Field, settings: Settings, field_name: str, capacity: int) -> Any:
-    """Shapes of a field's parameters for a Gaussian capacity."""
-
-    def init() -> Any:
-        surface = Surface(jnp.zeros((capacity, 3)), jnp.zeros(capacity))
-        return field.init(jax.random.key(0), surface, getattr(settings, field_name), capacity)
-
-    return jax.eval_shape(init)
-
-
 def load_trained(folder: Path) -> TrainedField:
     """The field of a run's newest checkpoint."""
     config = read_config(folder)
@@ -104,6 +90,6 @@ def load_trained(folder: Path) -> TrainedField:
         raise UserError(f"{folder} holds no checkpoint yet; train on with the same command and --resume")
     metadata = checkpoint.load_metadata(folder / "checkpoints", steps[-1])
     field = get_field(config.field)
-    like = abstract_params(field, config.settings, config.field, int(metadata["gaussian_capacity"]))
+    like = field.skeleton(getattr(config.settings, config.field), metadata["sizes"])
     params = checkpoint.load(folder / "checkpoints", steps[-1], like, prefix=".params")
     return TrainedField(config, field, params, steps[-1], float(metadata["seconds"]))

@@ -16,9 +16,10 @@ import optax
 from jaxtyping import Array, Bool, Complex, Float, Int, UInt8
 
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH, cbf, normalise, pas_directions, steering_vector
+from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field
-from wbgs_jax.losses import image_loss
+from wbgs_jax.losses import image_loss, snapshot_loss
 from wbgs_jax.pytree import pytree
 from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver
@@ -55,6 +56,10 @@ class TrainingData:
     snapshots: Complex[Array, "n elements"] | None
     steering: Complex[Array, "90 360 elements"] | None
     images: UInt8[Array, "n 90 360"] | None
+    tx_index: Int[Array, "n"]
+    """Transmitter of every spectrum."""
+    memory: Any = None
+    """What the field remembers of the transmitters (`fields.Field.remember`)."""
 
     def pas(self, index: Int[Array, "b"]) -> Float[Array, "b 90 360"]:
         """Observed spectra."""
@@ -95,6 +100,7 @@ def training_data(dataset: Dataset) -> TrainingData:
         snapshots=None if dataset.snapshots is None else jnp.asarray(dataset.snapshots, jnp.complex64),
         steering=steering,
         images=None if dataset.images is None else jnp.asarray(dataset.images),
+        tx_index=jnp.asarray(dataset.tx_index, jnp.int32),
     )
 
 
@@ -103,31 +109,42 @@ def empty_density_stats(n: int) -> DensityStats:
     return DensityStats(jnp.zeros(n), jnp.zeros((n, 3)), jnp.zeros(n))
 
 
+def gaussian_count(params: Any) -> int:
+    """Room for Gaussians; 0 for a field without them, to which density control does not apply."""
+    return params.gaussians.means.shape[0] if hasattr(params, "gaussians") else 0
+
+
 def init_state(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
     """The state before the first step."""
-    density = empty_density_stats(params.gaussians.means.shape[0])
+    density = empty_density_stats(gaussian_count(params))
     return TrainState(params, optimizer.init(params), density, jnp.zeros((), jnp.int32))
 
 
 def loss_and_gradients(
-    field: Field, params: Any, data: TrainingData, index: Int[Array, "b"], capacity: Capacity, ssim_weight: float
+    field: Field, params: Any, data: TrainingData, index: Int[Array, "b"], capacity: Capacity | None, optim: OptimConfig
 ):
-    """((loss, (ssim, jobs)), (d params, d means2d)) of one batch."""
-    probe = jnp.zeros((params.gaussians.means.shape[0], 2))
+    """((loss, (ssim, jobs)), (d params, d means2d)) of one batch; jobs are None for a field that does not splat."""
+    probe = jnp.zeros((gaussian_count(params), 2))
 
     def objective(params, probe):
-        plan = field.plan(params, data.receiver, capacity, probe)
         query = jax.tree.map(lambda a: a[index], data.query)
-        loss, ssim = image_loss(field.render(params, plan, query), data.pas(index), ssim_weight)
-        return loss, (ssim, plan.geometry.jobs)
+        seen = field.observe(params, data.memory, data.receiver, query, data.tx_index[index], capacity, probe)
+        loss, ssim = image_loss(seen.pas, data.pas(index), optim.ssim_weight)
+        if seen.snapshots is not None and data.snapshots is not None:
+            unlike, louder = snapshot_loss(seen.snapshots, data.snapshots[index])
+            loss += optim.snapshot_weight * unlike + optim.power_weight * louder
+        return loss + seen.penalty, (ssim, seen.jobs)
 
     return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, probe)
 
 
-def _add_density(stats: DensityStats, mean_gradient, means2d_gradient) -> DensityStats:
+def _add_density(stats: DensityStats, gradients: Any, means2d_gradient: Float[Array, "n 2"]) -> DensityStats:
+    if not stats.visible.size:
+        return stats
     to_normalised = jnp.array([PAS_WIDTH / 2, PAS_HEIGHT / 2])
     norm = jnp.linalg.norm(means2d_gradient * to_normalised, axis=-1)
-    return DensityStats(stats.gradient_norm + norm, stats.mean_gradient + mean_gradient, stats.visible + (norm > 0))
+    mean_gradient = stats.mean_gradient + gradients.gaussians.means
+    return DensityStats(stats.gradient_norm + norm, mean_gradient, stats.visible + (norm > 0))
 
 
 def _all_finite(tree: Any) -> Bool[Array, ""]:
@@ -137,7 +154,9 @@ def _all_finite(tree: Any) -> Bool[Array, ""]:
 EpochFunction = Callable[[TrainState, TrainingData, Int[Array, "k b"], Int[Array, ""]], tuple[TrainState, EpochReport]]
 
 
-def make_epoch(field: Field, optimizer: optax.GradientTransformation, capacity: Capacity, ssim_weight: float) -> EpochFunction:
+def make_epoch(
+    field: Field, optimizer: optax.GradientTransformation, capacity: Capacity | None, optim: OptimConfig
+) -> EpochFunction:
     """A jitted epoch: (state, data, batches (K, B), first step to run) -> (state, report). The state is donated."""
 
     def step(data: TrainingData, first: Int[Array, ""], carry, batch):
@@ -145,15 +164,16 @@ def make_epoch(field: Field, optimizer: optax.GradientTransformation, capacity: 
         index, position = batch
 
         def run(state: TrainState):
-            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(
-                field, state.params, data, index, capacity, ssim_weight
-            )
-            ok = _all_finite((loss, gradients)) & ~jobs.overflow
+            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(field, state.params, data, index, capacity, optim)
+            overflow, needed = jnp.zeros((), bool), jnp.zeros(2, jnp.int32)
+            if jobs is not None:
+                overflow, needed = jobs.overflow, jnp.stack([jobs.required_entries, jobs.required_jobs])
+            ok = _all_finite((loss, gradients)) & ~overflow
             updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.params)
-            density = _add_density(state.density, gradients.gaussians.means, probe)
+            density = _add_density(state.density, gradients, probe)
             new = TrainState(optax.apply_updates(state.params, updates), optimizer_state, density, state.step + 1)
             state = jax.tree.map(lambda a, b: jnp.where(ok, a, b), new, state)
-            return state, loss, ssim, ok, jobs.overflow, jnp.stack([jobs.required_entries, jobs.required_jobs])
+            return state, loss, ssim, ok, overflow, needed
 
         def pass_by(state: TrainState):
             nan = jnp.full((), jnp.nan)

@@ -21,7 +21,7 @@ from jaxtyping import Int
 from wbgs_jax import checkpoint, density, metrics
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import make_surface
+from wbgs_jax.data.surface import make_mesh, make_surface
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.files import atomic_write
@@ -29,7 +29,7 @@ from wbgs_jax.inference import predict_spectra
 from wbgs_jax.optim import make_optimizer
 from wbgs_jax.progress import TrainingProgress
 from wbgs_jax.splat import Capacity, fit_capacity
-from wbgs_jax.train_step import EpochReport, TrainState, init_state, make_epoch, training_data
+from wbgs_jax.train_step import EpochReport, TrainingData, TrainState, gaussian_count, init_state, make_epoch, training_data
 
 TILE_SLACK = 1.4
 """Room in the tile lists for footprints that grow during training."""
@@ -59,29 +59,36 @@ class Run:
     def __init__(self, dataset: Dataset, field_name: str, settings: Settings, seed: int, folder: Path):
         self.dataset, self.field_name, self.settings, self.seed, self.folder = dataset, field_name, settings, seed, folder
         self.field: Field = get_field(field_name)
-        self.data = training_data(dataset)
         self.optimizer = make_optimizer(settings.optim)
         self.checkpoints = folder / "checkpoints"
         self.seconds = 0.0
         self.compilations = 0
         self.state, self.capacity = self._start()
+        self.data = self._remember()
         self._build()
         rng = np.random.default_rng([seed, 1])
         count = min(settings.loop.evaluate_spectra, len(dataset.test))
         self.watched = np.sort(rng.choice(dataset.test, count, replace=False))
 
-    def _start(self) -> tuple[TrainState, Capacity]:
-        config = getattr(self.settings, self.field_name)
+    def _start(self) -> tuple[TrainState, Capacity | None]:
+        config, key = getattr(self.settings, self.field_name), jax.random.key(self.seed)
+        if self.field.STARTS_FROM == "mesh":
+            return init_state(self.field.init(key, make_mesh(self.dataset), config), self.optimizer), None
         surface = make_surface(self.dataset, config.gaussians, self.seed, config.sampling)
-        capacity = density.capacity_bucket(len(surface.points))
-        params = self.field.init(jax.random.key(self.seed), surface, config, capacity)
+        params = self.field.init(key, surface, config, density.capacity_bucket(len(surface.points)))
         jobs = self.field.plan(params, self.dataset.receiver).geometry.jobs
-        capacity_of_tiles = fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), TILE_SLACK)
-        return init_state(params, self.optimizer), capacity_of_tiles
+        return init_state(params, self.optimizer), fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), TILE_SLACK)
+
+    def _remember(self) -> TrainingData:
+        """The data on the device, with what the field can compute of the transmitters once."""
+        data = training_data(self.dataset)
+        _, first = np.unique(self.dataset.tx_index, return_index=True)
+        positions = jnp.asarray(self.dataset.tx_positions[first], jnp.float32)
+        return dataclasses.replace(data, memory=self.field.remember(self.state.params, self.dataset.receiver, positions))
 
     def _build(self) -> None:
         """(Re)make the jitted epoch for the present tile capacity."""
-        self.run_epoch = make_epoch(self.field, self.optimizer, self.capacity, self.settings.optim.ssim_weight)
+        self.run_epoch = make_epoch(self.field, self.optimizer, self.capacity, self.settings.optim)
         self.compilations += 1
 
     @property
@@ -91,7 +98,9 @@ class Run:
 
     @property
     def alive(self) -> int:
-        """Living Gaussians."""
+        """Living Gaussians; 0 for a field without them."""
+        if not gaussian_count(self.state.params):
+            return 0
         return int(np.asarray(self.state.params.gaussians.alive).sum())
 
     def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
@@ -122,6 +131,7 @@ class Run:
         if report.overflow:
             entries, jobs = (int(n) for n in report.required)
             grown = fit_capacity(entries, jobs, TILE_SLACK)
+            assert self.capacity is not None, "only splats overflow"
             self.capacity = Capacity(max(grown.entries, self.capacity.entries), max(grown.jobs, self.capacity.jobs))
             self._build()
             return
@@ -135,7 +145,12 @@ class Run:
     def control(self) -> None:
         """Density control where the schedule asks for it."""
         config, step = self.settings.density, self.step
-        if not config.every or step < config.start or step > config.stop_fraction * self.settings.optim.steps:
+        if (
+            not gaussian_count(self.state.params)
+            or not config.every
+            or step < config.start
+            or step > config.stop_fraction * self.settings.optim.steps
+        ):
             return
         if step % config.every == 0:
             before = self.state.params.gaussians.means.shape
@@ -165,8 +180,8 @@ class Run:
     def save(self) -> None:
         """Write a checkpoint of the present step."""
         metadata = {
-            "gaussian_capacity": self.state.params.gaussians.means.shape[0],
-            "tile_capacity": dataclasses.asdict(self.capacity),
+            "sizes": self.field.sizes(self.state.params),
+            "tile_capacity": dataclasses.asdict(self.capacity) if self.capacity else None,
             "seconds": self.seconds,
         }
         checkpoint.save(self.checkpoints, self.step, self.state, metadata, self.settings.loop.keep_checkpoints)
@@ -178,24 +193,15 @@ class Run:
         if not steps:
             return False
         metadata = checkpoint.load_metadata(self.checkpoints, steps[-1])
-        capacity = int(metadata["gaussian_capacity"])
-        like = jax.eval_shape(lambda state: _with_gaussian_capacity(state, capacity), self.state)
+        params = self.field.skeleton(getattr(self.settings, self.field_name), metadata["sizes"])
+        like = jax.eval_shape(lambda params: init_state(params, self.optimizer), params)
         self.state = checkpoint.load(self.checkpoints, steps[-1], like)
-        self.capacity, self.seconds = Capacity(**metadata["tile_capacity"]), float(metadata["seconds"])
+        self.seconds = float(metadata["seconds"])
+        if metadata["tile_capacity"]:
+            self.capacity = Capacity(**metadata["tile_capacity"])
         self._build()
         self.compilations = 1
         return True
-
-
-def _with_gaussian_capacity(state: TrainState, capacity: int) -> TrainState:
-    """The state's structure with another number of Gaussians."""
-
-    def resize(path, leaf):
-        names = [str(getattr(entry, "name", "")) for entry in path]
-        per_gaussian = ("gaussians" in names or "density" in names) and leaf.ndim > 0
-        return jnp.zeros((capacity, *leaf.shape[1:]), leaf.dtype) if per_gaussian else leaf
-
-    return jax.tree_util.tree_map_with_path(resize, state)
 
 
 def _forget_later_metrics(path: Path, step: int) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wbgs_jax.array import planar_array
 from wbgs_jax.pytree import pytree
@@ -56,6 +56,21 @@ class Surface:
     """World frame, metres."""
     spacing: Float[Array, "n"]
     """Mean distance to the 3 nearest other points, metres."""
+
+
+@pytree
+class Mesh:
+    """A scene's surfaces, for fields that know where they are."""
+
+    vertices: Float[Array, "v 3"]
+    """World frame, metres."""
+    faces: Int[Array, "t 3"]
+    cluster: Int[Array, "t"]
+    """Material of every triangle: what shares a cluster shares its properties."""
+    thickness: Float[Array, "m"]
+    """Of every material, metres; 0 where it is not known."""
+    directivity: Float[Array, ""]
+    """Of the receiver's elements: 1 for 3GPP TR 38.901, 0 for isotropic ones."""
 
 
 def make_receiver(position: Any, orientation: Any = (1.0, 0.0, 0.0, 0.0), element_positions: Any = None) -> Receiver:

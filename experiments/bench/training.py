@@ -65,7 +65,7 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         return loss(wideband.render(params, plan(params), query), data)
 
     def gradient(params, data):
-        return loss_and_gradients(run.field, params, data, index, capacity, optim.ssim_weight)
+        return loss_and_gradients(run.field, params, data, index, capacity, optim)
 
     def optimiser(gradients, state):
         updates, moments = run.optimizer.update(gradients, state.optimizer, state.params)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.schema import TEST, TRAIN, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.errors import UserError
@@ -57,7 +57,20 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         images=None,
         vertices=scene.vertices,
         faces=scene.faces,
+        materials=_materials(scene),
+        element_pattern=str(scene.meta.get("rx_array", {}).get("pattern", "")),
     )
+
+
+def _materials(scene: SceneFile) -> Materials | None:
+    """Parts of one material and thickness are one material. None if the file does not name its parts."""
+    parts = scene.meta.get("parts", [])
+    if len(parts) <= int(scene.face_part.max(initial=-1)):
+        return None
+    labels = [(str(part.get("material", part.get("name", i))), float(part.get("thickness", 0))) for i, part in enumerate(parts)]
+    kinds = sorted(set(labels))
+    cluster = np.array([kinds.index(label) for label in labels], np.int32)[scene.face_part]
+    return Materials(cluster, tuple(f"{name} {thickness:g}" for name, thickness in kinds), np.array([t for _, t in kinds]))
 
 
 def released_scenes() -> dict[str, Path]:

@@ -11,6 +11,18 @@ from wbgs_jax.types import Query, Receiver
 
 
 @dataclass(frozen=True)
+class Materials:
+    """Which triangles share a material. Not its electrical properties: those are for a field to find out."""
+
+    cluster: Int[np.ndarray, "faces"]
+    """int32: the material of every triangle."""
+    names: tuple[str, ...]
+    """A label of every material."""
+    thickness: Float[np.ndarray, "materials"]
+    """Metres; 0 where it is not known."""
+
+
+@dataclass(frozen=True)
 class Dataset:
     """Spectra of one scene with a fixed receiver; spectrum i was observed for query i."""
 
@@ -32,6 +44,10 @@ class Dataset:
     """The scene's surface in the world frame, metres, float32; empty where no mesh is known."""
     faces: Int[np.ndarray, "faces 3"]
     """int32 triangles; empty where only points are known."""
+    materials: Materials | None = None
+    """What the triangles are made of, as far as it is known."""
+    element_pattern: str = ""
+    """Of the receiver's elements, such as "tr38901" or "iso"; empty where it is not known."""
 
     def __len__(self) -> int:
         return len(self.frequencies_hz)

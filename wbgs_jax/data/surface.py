@@ -8,9 +8,10 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, Materials
+from wbgs_jax.errors import UserError
 from wbgs_jax.geometry import to_local
-from wbgs_jax.types import Surface
+from wbgs_jax.types import Mesh, Surface
 
 MESH_SIZED = (20_000, 70_000)
 """Bounds of the number of points when it is left to the mesh."""
@@ -23,6 +24,9 @@ BELOW_HORIZON = -0.1
 """Cosine of the largest zenith angle at which points start: a little below the horizon, for footprints that reach above it."""
 BOX_MARGIN = 1.0
 """Metres around transmitters and receiver in which points are drawn where no surface is known."""
+
+DIRECTIVITY = {"tr38901": 1.0}
+"""Exponent of the gain of 3GPP TR 38.901 by element pattern; 0 for all others."""
 
 
 def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampling = "solid_angle") -> Surface:
@@ -59,6 +63,24 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
     if np.count_nonzero(weight) < count:
         weight = weight + 1e-12
     return np.asarray(candidates)[rng.choice(len(candidates), count, replace=False, p=weight / weight.sum())]
+
+
+def make_mesh(dataset: Dataset) -> Mesh:
+    """The surfaces themselves, for fields that know where they are.
+
+    Raises:
+        UserError: only points are known, or nothing.
+    """
+    if not len(dataset.faces):
+        raise UserError(f"{dataset.name} has no mesh, only points; the wave field needs surfaces: train --field wideband")
+    materials = dataset.materials or Materials(np.zeros(len(dataset.faces), np.int32), ("",), np.zeros(1))
+    return Mesh(
+        jnp.asarray(dataset.vertices, jnp.float32),
+        jnp.asarray(dataset.faces, jnp.int32),
+        jnp.asarray(materials.cluster, jnp.int32),
+        jnp.asarray(materials.thickness, jnp.float32),
+        jnp.asarray(DIRECTIVITY.get(dataset.element_pattern, 0.0), jnp.float32),
+    )
 
 
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:

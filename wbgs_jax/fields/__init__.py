@@ -1,29 +1,42 @@
 """The models, one file each, behind one small interface.
 
-A field is a module of pure functions
+A field is a module of pure functions. What users of a trained field need:
 
-    init(key, surface, config, capacity=None)                  -> params  a pytree with `gaussians` (density control)
-    plan(params, receiver, capacity=None, means2d_offset=None) -> plan    with `geometry.jobs` (overflow); query-independent
-    render(params, plan, query)                            -> PAS (b, 90, 360)
+    plan(params, receiver, ...)        -> plan    what is independent of the query
+    render(params, plan, query)        -> PAS (b, 90, 360)
+
+What training needs besides:
+
+    STARTS_FROM                        "points" (types.Surface) or "mesh" (types.Mesh)
+    init(key, start, config, capacity) -> params  a pytree of floats; with `gaussians` if density control applies
+    remember(params, receiver, tx)     -> memory  what can be computed once for all training steps, on the host
+    observe(params, memory, ...)       -> Observation of the spectra of a batch
+    sizes(params), skeleton(config, sizes)        the shapes of a checkpoint
 
 Trainer, evaluation and experiments know nothing else about a model.
 """
 
-from typing import Any, Protocol, runtime_checkable
+from types import ModuleType
+from typing import Any, Literal, Protocol, cast, runtime_checkable
 
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax.errors import UserError
-from wbgs_jax.fields import wideband
+from wbgs_jax.fields import wave, wideband
+from wbgs_jax.fields.observation import Observation
 from wbgs_jax.splat import Capacity
-from wbgs_jax.types import Query, Receiver, Surface
+from wbgs_jax.types import Query, Receiver
+
+__all__ = ["FIELDS", "Field", "Observation", "get_field"]
 
 
 @runtime_checkable
 class Field(Protocol):
     """The seam between models and everything else."""
 
-    def init(self, key: Key[Array, ""], surface: Surface, config: Any, capacity: int | None = None) -> Any: ...
+    STARTS_FROM: Literal["points", "mesh"]
+
+    def init(self, key: Key[Array, ""], start: Any, config: Any, capacity: int | None = None) -> Any: ...
 
     def plan(
         self,
@@ -35,12 +48,29 @@ class Field(Protocol):
 
     def render(self, params: Any, plan: Any, query: Query) -> Float[Array, "b 90 360"]: ...
 
+    def remember(self, params: Any, receiver: Receiver, tx_positions: Float[Array, "tx 3"]) -> Any: ...
 
-FIELDS: dict[str, Field] = {"wideband": wideband}
+    def observe(
+        self,
+        params: Any,
+        memory: Any,
+        receiver: Receiver,
+        query: Query,
+        tx_index: Int[Array, "b"],
+        capacity: Capacity | None,
+        means2d_offset: Float[Array, "n 2"] | None,
+    ) -> Observation: ...
+
+    def sizes(self, params: Any) -> dict[str, int]: ...
+
+    def skeleton(self, config: Any, sizes: dict[str, int]) -> Any: ...
+
+
+FIELDS: dict[str, ModuleType] = {"wideband": wideband, "wave": wave}
 
 
 def get_field(name: str) -> Field:
     """The field of a name; an unknown one is a `UserError`."""
     if name not in FIELDS:
         raise UserError(f"unknown field {name!r}; choose one of: {', '.join(FIELDS)}")
-    return FIELDS[name]
+    return cast(Field, FIELDS[name])

@@ -12,18 +12,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax.array import steering_vector
 from wbgs_jax.checks import check_query, check_receiver, check_surface
 from wbgs_jax.config import WidebandConfig
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
+from wbgs_jax.fields.observation import Observation
 from wbgs_jax.geometry import to_local
 from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, attenuation_activation, signal_activation
 from wbgs_jax.pytree import pytree, static
 from wbgs_jax.splat import Capacity, GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.types import Gaussians, Query, Receiver, Surface
 
+STARTS_FROM = "points"
 MAX_ATTENUATION = 0.99
 INITIAL_ATTENUATION = 0.3
 
@@ -112,6 +114,36 @@ def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Ar
     check_query(query)
     attenuation, signal = em_features(params, plan.receiver, query)
     return render_splats(plan.geometry, attenuation, signal)
+
+
+def remember(params: WidebandParams, receiver: Receiver, tx_positions: Float[Array, "tx 3"]) -> None:
+    """Nothing: Gaussians move in every step."""
+
+
+def observe(
+    params: WidebandParams,
+    memory: None,
+    receiver: Receiver,
+    query: Query,
+    tx_index: Int[Array, "b"],
+    capacity: Capacity | None,
+    means2d_offset: Float[Array, "n 2"] | None,
+) -> Observation:
+    """The spectra of a training batch."""
+    planned = plan(params, receiver, capacity, means2d_offset)
+    return Observation(render(params, planned, query), jobs=planned.geometry.jobs)
+
+
+def sizes(params: WidebandParams) -> dict[str, int]:
+    """What decides the shapes of the parameters, besides the configuration."""
+    return {"gaussians": params.gaussians.means.shape[0]}
+
+
+def skeleton(config: WidebandConfig, sizes: dict[str, int]) -> WidebandParams:
+    """The shapes of parameters."""
+    n = sizes["gaussians"]
+    shaped: Any = jax.eval_shape(lambda: init(jax.random.key(0), Surface(jnp.zeros((n, 3)), jnp.zeros(n)), config, n))
+    return shaped
 
 
 def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
