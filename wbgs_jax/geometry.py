@@ -7,7 +7,7 @@ Pixel coordinates are continuous: pixel (row i, column j) of a PAS samples the p
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
 
@@ -31,8 +31,9 @@ def rotation_matrix(quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
 
 
-def to_local(vectors: Float[Array, "*n 3"], orientation: Float[Array, "4"]) -> Float[Array, "*n 3"]:
-    """World vectors in the local frame; the quaternion `orientation` (wxyz) turns local vectors into world ones."""
+def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) -> Inexact[Array, "*n 3"]:
+    """World vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into world
+    ones."""
     return vectors @ rotation_matrix(orientation)
 
 

@@ -7,10 +7,10 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wbgs_jax.pytree import pytree
-from wbgs_jax.wave.facets import CORNERS, ODD, WELD, Facets
+from wbgs_jax.wave.facets import CORNERS, ODD, WELD, AnyArray, Facets
 
 SHARPEST = 0.05
 """Edges that turn by less than this angle (radians) are part of a smooth surface."""
@@ -22,15 +22,15 @@ GAP = 0.006
 class Edges:
     """E straight wedges, open to the outside by more than half a turn."""
 
-    start: Float[Array, "e 3"]
+    start: Float[AnyArray, "e 3"]
     """World frame, metres."""
-    direction: Float[Array, "e 3"]
+    direction: Float[AnyArray, "e 3"]
     """Unit vector; with the 0-face's normal it gives the tangent (normal x direction) that points into that face."""
-    length: Float[Array, "e"]
-    normal_0: Float[Array, "e 3"]
+    length: Float[AnyArray, "e"]
+    normal_0: Float[AnyArray, "e 3"]
     """Outward normals of the two faces."""
-    normal_n: Float[Array, "e 3"]
-    facet: Int[Array, "e"]
+    normal_n: Float[AnyArray, "e 3"]
+    facet: Int[AnyArray, "e"]
     """The 0-face; both are of one part."""
 
 
@@ -92,4 +92,4 @@ def _line(point, along, part: int) -> tuple[int, ...]:
     first = along[np.argmax(np.abs(along) > 1e-3)]
     along = along if first > 0 else -along
     foot = point - (point @ along) * along
-    return (part, *np.round(along * 1e3 + ODD).astype(int), *np.round(foot * 1e3 + ODD).astype(int))
+    return (part, *(int(i) for i in np.round(np.concatenate([along, foot]) * 1e3 + ODD)))

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax.pytree import pytree
 
+AnyArray = Array | np.ndarray
+"""Geometry is found in NumPy, in double precision, and used in JAX."""
 CORNERS = 4
 WELD = 1e-5
 """Metres: corners nearer than this are one."""
@@ -26,12 +28,12 @@ Polygon = list[int]
 class Facets:
     """F planar convex polygons. A triangle repeats its last corner."""
 
-    corners: Float[Array, "f 4 3"]
+    corners: Float[AnyArray, "f 4 3"]
     """World frame, metres, counter-clockwise around the normal."""
-    normal: Float[Array, "f 3"]
-    offset: Float[Array, "f"]
+    normal: Float[AnyArray, "f 3"]
+    offset: Float[AnyArray, "f"]
     """Distance of the plane from the origin along the normal, metres."""
-    part: Int[Array, "f"]
+    part: Int[AnyArray, "f"]
     """Which part of the scene it belongs to."""
 
 

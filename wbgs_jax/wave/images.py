@@ -9,11 +9,11 @@ image: occlusion is the business of `paths.py`.
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from wbgs_jax.pytree import pytree
 from wbgs_jax.wave.edges import Edges
-from wbgs_jax.wave.facets import CORNERS, Facets, areas
+from wbgs_jax.wave.facets import CORNERS, AnyArray, Facets, areas
 
 SIDE = 1e-4
 """Metres: points nearer to a plane than this are on neither side."""
@@ -23,9 +23,9 @@ SIDE = 1e-4
 class Chains:
     """All chains of one order m >= 1."""
 
-    facet: Int[Array, "chains m"]
+    facet: Int[AnyArray, "chains m"]
     """In the order in which the wave meets them."""
-    image: Float[Array, "chains m 3"]
+    image: Float[AnyArray, "chains m 3"]
     """Where the wave heads for before it meets facet j: the receiver, mirrored in facets m ... j."""
 
 
@@ -34,11 +34,11 @@ class DiffractedChains:
     """Pairs of a mirror and an edge. A mirror behind the edge can be seen from the receiver; one in front of it may be any
     large facet, because the transmitter may be anywhere."""
 
-    after: Int[Array, "a 2"]
+    after: Int[AnyArray, "a 2"]
     """(facet, edge): first diffracted, then reflected."""
-    after_image: Float[Array, "a 3"]
+    after_image: Float[AnyArray, "a 3"]
     """The receiver mirrored in the facet."""
-    before: Int[Array, "b 2"]
+    before: Int[AnyArray, "b 2"]
     """(facet, edge): first reflected, then diffracted."""
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax.pytree import pytree
 from wbgs_jax.wave.edges import Edges
-from wbgs_jax.wave.facets import CORNERS, Facets
+from wbgs_jax.wave.facets import CORNERS, AnyArray, Facets
 from wbgs_jax.wave.images import Chains, DiffractedChains
 
 MAX_ORDER = 3
@@ -54,9 +54,9 @@ class Paths:
 class Outline:
     """The edges of all facets: a point of the plane is inside where inward . point >= offset for all four."""
 
-    inward: Float[Array, "f 4 3"]
+    inward: Float[AnyArray, "f 4 3"]
     """Zero for an edge of no length."""
-    offset: Float[Array, "f 4"]
+    offset: Float[AnyArray, "f 4"]
 
 
 class Candidates(NamedTuple):
@@ -73,7 +73,7 @@ class Candidates(NamedTuple):
 class Search:
     """What a receiver's paths are searched in: independent of the transmitter."""
 
-    receiver: Float[Array, "3"]
+    receiver: Float[AnyArray, "3"]
     facets: Facets
     outline: Outline
     edges: Edges
@@ -158,7 +158,7 @@ def _meet(start, goal, normal, offset):
     return start + jnp.clip(share, 0, 1)[..., None] * (goal - start), valid
 
 
-def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
     """Whether points of a facet's plane lie inside its edges."""
     return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
 

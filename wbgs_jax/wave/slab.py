@@ -16,24 +16,24 @@ DAMPING = 1 - 1e-4
 class SlabCoefficients(NamedTuple):
     """Amplitude coefficients for the electric field across (TE) and in (TM) the plane of incidence."""
 
-    reflect_te: Complex[Array, "*n"]
-    reflect_tm: Complex[Array, "*n"]
-    transmit_te: Complex[Array, "*n"]
-    transmit_tm: Complex[Array, "*n"]
+    reflect_te: Complex[Array, "*#n"]
+    reflect_tm: Complex[Array, "*#n"]
+    transmit_te: Complex[Array, "*#n"]
+    transmit_tm: Complex[Array, "*#n"]
 
 
 def complex_permittivity(
-    permittivity: Float[Array, "*n"], conductivity: Float[Array, "*n"], frequency_hz: Float[Array, "*n"]
-) -> Complex[Array, "*n"]:
+    permittivity: Float[Array, "*#n"], conductivity: Float[Array, "*#n"], frequency_hz: Float[Array, "*#n"]
+) -> Complex[Array, "*#n"]:
     """eps_r - j sigma / (eps_0 omega); conductivity in S/m."""
     return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * VACUUM_PERMITTIVITY)
 
 
 def slab_coefficients(
-    cosine: Float[Array, "*n"],
-    permittivity: Complex[Array, "*n"],
-    thickness: Float[Array, "*n"],
-    frequency_hz: Float[Array, "*n"],
+    cosine: Float[Array, "*#n"],
+    permittivity: Complex[Array, "*#n"],
+    thickness: Float[Array, "*#n"],
+    frequency_hz: Float[Array, "*#n"],
 ) -> SlabCoefficients:
     """Coefficients of a slab of a thickness (metres) at the cosine of the angle of incidence (0..1).
 

@@ -44,8 +44,8 @@ def transition(root: Float[Array, "*n"]) -> Complex[Array, "*n"]:
 
 
 def _cotangent_transition(
-    angle: Float[Array, "*n"], n: Float[Array, "*n"], root_kl: Float[Array, "*n"]
-) -> Complex[Array, "*n"]:
+    angle: Float[Array, "*#n"], n: Float[Array, "*#n"], root_kl: Float[Array, "*#n"]
+) -> Complex[Array, "*#n"]:
     """cot(angle) F(kL a), finite through the shadow boundary at angle = 0 (modulo pi)."""
     angle = angle - jnp.pi * jnp.round(angle / jnp.pi)
     angle = jnp.where(jnp.abs(angle) < 1e-6, 1e-6, angle)
@@ -54,13 +54,13 @@ def _cotangent_transition(
 
 
 def wedge_coefficients(
-    phi_in: Float[Array, "*n"],
-    phi_out: Float[Array, "*n"],
-    n: Float[Array, "*n"],
-    sin_beta: Float[Array, "*n"],
-    kl: Float[Array, "*n"],
-    wavenumber: Float[Array, "*n"],
-) -> tuple[Complex[Array, "*n"], Complex[Array, "*n"], Complex[Array, "*n"]]:
+    phi_in: Float[Array, "*#n"],
+    phi_out: Float[Array, "*#n"],
+    n: Float[Array, "*#n"],
+    sin_beta: Float[Array, "*#n"],
+    kl: Float[Array, "*#n"],
+    wavenumber: Float[Array, "*#n"],
+) -> tuple[Complex[Array, "*#n"], Complex[Array, "*#n"], Complex[Array, "*#n"]]:
     """(D1 + D2, D3, D4), in square roots of metres.
 
     Args:
