@@ -4,6 +4,7 @@ Pure functions on pytrees, for use under `jax.jit`, `jax.vmap` and `jax.grad`. S
 positions in wavelengths.
 
 * the field of the paper: `wideband.init`, `wideband.plan`, `wideband.render`, `wideband.em_features`
+* the coherent field: `wave.init`, `wave.plan`, `wave.render`, `wave.snapshots`, `wave.channels` (docs/wave.md)
 * splatting onto a receiver's hemisphere: `project`, `geometry_plan`, `render_splats`, `render_dense`
 * the antenna array: `planar_array`, `steering_vector`, `cbf`, `snapshot_to_pas`, `pas_directions`
 * data on the host: `load_dataset`, `load_scene`, `make_surface`, `surface_from_points`
@@ -11,21 +12,30 @@ positions in wavelengths.
   `export_field`, `load_exported` (docs/inference.md)
 """
 
+import os
+import sys
+
+if any(argument.startswith("wbgs_jax.") for argument in sys.orig_argv):
+    # For our command lines, before JAX is loaded: XLA logs errors about tuning flags of cached programs, of no consequence.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
 from wbgs_jax.array import cbf, pas_directions, planar_array, snapshot_to_pas, steering_vector
-from wbgs_jax.config import WidebandConfig
+from wbgs_jax.config import WaveConfig, WidebandConfig
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
-from wbgs_jax.fields import wideband
+from wbgs_jax.fields import wave, wideband
 from wbgs_jax.losses import image_loss, ssim
 from wbgs_jax.splat import Capacity, geometry_plan, measure_capacity, project, render_dense, render_splats
-from wbgs_jax.types import Gaussians, Query, Receiver, Surface, make_query, make_receiver
+from wbgs_jax.types import Gaussians, Mesh, Query, Receiver, Surface, make_query, make_receiver
 from wbgs_jax.version import __version__
 
 __all__ = [
     "Capacity",
     "Gaussians",
+    "Mesh",
     "Query",
     "Receiver",
     "Surface",
+    "WaveConfig",
     "WidebandConfig",
     "__version__",
     "cbf",
@@ -37,6 +47,7 @@ __all__ = [
     "load_exported",
     "load_scene",
     "load_trained",
+    "make_mesh",
     "make_query",
     "make_receiver",
     "make_surface",
@@ -56,6 +67,7 @@ __all__ = [
     "ssim",
     "steering_vector",
     "surface_from_points",
+    "wave",
     "wideband",
 ]
 
@@ -65,6 +77,7 @@ _HOST = {
     "load_exported": "wbgs_jax.export",
     "load_scene": "wbgs_jax.data",
     "load_trained": "wbgs_jax.runs",
+    "make_mesh": "wbgs_jax.data.surface",
     "make_surface": "wbgs_jax.data.surface",
     "map_queries": "wbgs_jax.inference",
     "predict_blocks": "wbgs_jax.inference",

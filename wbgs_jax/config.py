@@ -28,7 +28,7 @@ class WidebandConfig:
     """Layers of the attenuation network (authors: 8)."""
     skip: int = 2
     """The layer at which the inputs enter again (authors: 4)."""
-    fusion: int = 0
+    fusion: int = 1
     """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
     all queries. 0: the paper's form."""
     radiance_widths: tuple[int, ...] = (64, 32)
@@ -105,11 +105,11 @@ class OptimConfig:
     log_scales_lr: float = 5e-3
     quats_lr: float = 1e-3
     opacity_lr: float = 2.5e-2
-    materials_lr: float = 3e-2
+    materials_lr: float = 1e-2
     """Logarithms of permittivity and conductivity, of the wave field."""
-    thickness_lr: float = 1.5e-3
+    thickness_lr: float = 1e-3
     """Logarithm of metres: at 100 GHz a thousandth of a wall turns the phase by a tenth of a radian."""
-    residual_lr: float = 6e-3
+    residual_lr: float = 5e-3
     """Facets' residuals, survival and gain."""
     snapshot_weight: float = 0.5
     """Weight of 1 - correlation of snapshots, where field and data have them ..."""
@@ -175,12 +175,27 @@ PRESETS: dict[str, Settings] = {
     "cpu": Settings(),
     # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
     "gpu": Settings(
-        wideband=WidebandConfig(gaussians=0, width=128, depth=8, skip=4, radiance_widths=(128, 64)),
+        wideband=WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64)),
         optim=OptimConfig(steps=20_000, batch=8, network_lr=8e-4),
         density=DensityConfig(max_gaussians=100_000, reset_every=3000),
         loop=LoopConfig(epoch_steps=100, checkpoint_every=2000),
     ),
 }
+
+
+WAVE_STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
+"""The wave field has a few numbers a material to learn, not networks."""
+
+
+def preset_settings(preset: str, field: str) -> Settings:
+    """A preset as it suits a field."""
+    settings = PRESETS[preset]
+    if field != "wave":
+        return settings
+    steps = WAVE_STEPS[preset]
+    optim = dataclasses.replace(settings.optim, steps=steps, min_steps=steps // 2, batch=8)
+    loop = dataclasses.replace(settings.loop, evaluate_every=min(settings.loop.evaluate_every, steps // 2))
+    return dataclasses.replace(settings, optim=optim, loop=loop)
 
 
 def to_dict(settings: Settings) -> dict[str, Any]:

@@ -133,6 +133,10 @@ def _training_arguments(trained: TrainedField) -> list[str]:
     data = ["--data", source.name] if source.is_dir() else ["--scene", source.name]
     if config.frequency_ghz is not None:
         data += ["--frequency-ghz", f"{config.frequency_ghz:g}"]
+    if config.train_ghz:
+        data += ["--train-ghz", *(f"{f:g}" for f in config.train_ghz)]
+    if config.train_tx:
+        data += ["--train-tx", str(config.train_tx)]
     return [*data, "--field", config.field, "--preset", config.preset, "--seed", str(config.seed)]
 
 

@@ -13,6 +13,7 @@ from wbgs_jax import checkpoint
 from wbgs_jax.config import Settings, from_dict, to_dict
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import fewer_transmitters, unseen_frequencies
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.files import read_json, write_json
@@ -30,11 +31,18 @@ class RunConfig:
     frequency_ghz: float | None
     """Of a single-frequency folder that does not say."""
     settings: Settings
+    train_ghz: tuple[float, ...] = ()
+    """Train at these frequencies and test at the others; none: train and test at all."""
+    train_tx: int = 0
+    """Number of training transmitters; 0: all."""
 
     def dataset(self) -> Dataset:
         """Load the data the run was trained on."""
         frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
-        return load_dataset(self.source, frequency_hz=frequency, seed=self.seed)
+        dataset = load_dataset(self.source, frequency_hz=frequency, seed=self.seed)
+        if self.train_ghz:
+            dataset = unseen_frequencies(dataset, self.train_ghz)
+        return fewer_transmitters(dataset, self.train_tx, self.seed) if self.train_tx else dataset
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,7 @@ def read_config(folder: Path) -> RunConfig:
         values = {f.name: values[f.name] for f in dataclasses.fields(RunConfig)}
     except (KeyError, TypeError) as error:
         raise UserError(f"{path} lacks {error}; it belongs to another version of wbgs-jax: train again") from error
-    return RunConfig(**values | {"settings": from_dict(values["settings"])})
+    return RunConfig(**values | {"settings": from_dict(values["settings"]), "train_ghz": tuple(values["train_ghz"])})
 
 
 def difference(a: RunConfig, b: RunConfig) -> str:

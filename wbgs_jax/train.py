@@ -11,7 +11,7 @@ import jax
 import tyro
 
 from wbgs_jax.compilation import use_compilation_cache
-from wbgs_jax.config import PRESETS, Settings, check
+from wbgs_jax.config import PRESETS, Settings, check, preset_settings
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.fields import get_field
@@ -38,6 +38,10 @@ class Command:
     """Go on where the run folder's newest checkpoint ends; starts anew where there is none."""
     frequency_ghz: float | None = None
     """Frequency of a single-frequency folder that does not say."""
+    train_ghz: tuple[float, ...] = ()
+    """Train at these frequencies alone; the evaluation asks for the others (held-out transmitters, unseen frequencies)."""
+    train_tx: int = 0
+    """Train with this number of transmitters; 0: all that are not held out."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
     """Every setting of the preset can be overridden."""
 
@@ -48,16 +52,22 @@ def default_preset() -> str:
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command line; the preset is looked at first because it sets the defaults of everything else."""
-    preset = default_preset()
-    for i, argument in enumerate(arguments):
-        if argument.startswith("--preset"):
-            preset = argument.split("=", 1)[1] if "=" in argument else "".join(arguments[i + 1 : i + 2])
+    """The command line; field and preset are looked at first because they set the defaults of everything else."""
+    field, preset = _value(arguments, "--field", "wideband"), _value(arguments, "--preset", default_preset())
     if preset not in PRESETS:
         raise UserError(f"unknown preset {preset!r}; choose one of: {', '.join(PRESETS)}")
-    return tyro.cli(
-        Command, default=Command(preset=preset, settings=PRESETS[preset]), args=arguments, prog="python -m wbgs_jax.train"
-    )
+    default = Command(field=field, preset=preset, settings=preset_settings(preset, field))
+    return tyro.cli(Command, default=default, args=arguments, prog="python -m wbgs_jax.train")
+
+
+def _value(arguments: list[str], name: str, default: str) -> str:
+    """What follows an option on the command line."""
+    for i, argument in enumerate(arguments):
+        if argument == name:
+            return "".join(arguments[i + 1 : i + 2])
+        if argument.startswith(f"{name}="):
+            return argument.split("=", 1)[1]
+    return default
 
 
 def run_config(command: Command) -> RunConfig:
@@ -69,7 +79,8 @@ def run_config(command: Command) -> RunConfig:
     source = command.scene if command.data is None else command.data
     if Path(str(source)).exists():
         source = str(Path(str(source)).resolve())
-    return RunConfig(str(source), command.field, command.preset, command.seed, command.frequency_ghz, command.settings)
+    chosen = (command.field, command.preset, command.seed, command.frequency_ghz, command.settings)
+    return RunConfig(str(source), *chosen, tuple(command.train_ghz), command.train_tx)
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:

@@ -48,6 +48,28 @@ def select_frequencies(
     return dataclasses.replace(dataset, train=train, test=test)
 
 
+def unseen_frequencies(dataset: Dataset, train_ghz: Sequence[float]) -> Dataset:
+    """Training at some frequencies (GHz) alone, tests at all others and at held-out transmitters; the name says so."""
+    known = np.unique(dataset.frequencies_hz) / 1e9
+    others = [float(f) for f in known if not np.isclose(f, train_ghz, rtol=1e-6, atol=0).any()]
+    name = f"{dataset.name}_f" + "-".join(f"{f:g}" for f in train_ghz)
+    return dataclasses.replace(select_frequencies(dataset, train_ghz, others), name=name)
+
+
+def fewer_transmitters(dataset: Dataset, count: int, seed: int) -> Dataset:
+    """Training with `count` of the training transmitters; larger counts contain the smaller ones. The name says so.
+
+    Raises:
+        UserError: there are not so many.
+    """
+    known = np.unique(dataset.tx_index[dataset.train])
+    if not 0 < count <= len(known):
+        raise UserError(f"{dataset.name} has {len(known)} training transmitters; choose 1 to {len(known)} of them, not {count}")
+    chosen = np.random.default_rng([seed, 4]).permutation(known)[:count]
+    train = dataset.train[np.isin(dataset.tx_index[dataset.train], chosen)]
+    return dataclasses.replace(dataset, train=train, name=f"{dataset.name}_tx{count}")
+
+
 def _keep(dataset: Dataset, index: np.ndarray, wanted_ghz: Sequence[float] | None, role: str) -> np.ndarray:
     if wanted_ghz is None:
         return index

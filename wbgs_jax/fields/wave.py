@@ -25,7 +25,7 @@ from wbgs_jax.types import Mesh, Query, Receiver
 from wbgs_jax.wave.edges import Edges, edges_of_facets
 from wbgs_jax.wave.facets import Facets, facets_from_mesh, outline_of
 from wbgs_jax.wave.images import diffracted_chains, receiver_chains
-from wbgs_jax.wave.paths import REFLECTED, TRANSMITTED, Outline, Paths, Search, diffracted_paths, reflected_paths
+from wbgs_jax.wave.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Outline, Paths, Search, diffracted_paths, reflected_paths
 from wbgs_jax.wave.slab import complex_permittivity
 from wbgs_jax.wave.transfer import Arrivals, Slabs, arrivals, snapshot
 
@@ -57,9 +57,9 @@ class WaveParams:
     materials: Materials
     residual: Float[Array, "f 2"]
     """Logarithm of amplitude and phase (radians) by which a facet's reflection differs from its material's."""
-    log_survival: Float[Array, "2 2"]
-    """Logarithm of the amplitude that a meeting leaves beyond its slab, of (plain, diffracted) paths at (transmission,
-    reflection)."""
+    log_survival: Float[Array, "2 3"]
+    """Logarithm of the amplitude that a meeting leaves beyond its slab or wedge, of (plain, diffracted) paths at (transmission,
+    reflection, diffraction)."""
     directivity: Float[Array, ""]
     """Exponent of the receiver elements' gain: 1 for the element of 3GPP TR 38.901, 0 for isotropic ones."""
     log_gain: Float[Array, ""]
@@ -99,7 +99,7 @@ def init(key: Key[Array, ""], mesh: Mesh, config: WaveConfig, capacity: int | No
     return WaveParams(
         materials=materials,
         residual=jnp.zeros((len(facets.part), 2)),
-        log_survival=jnp.log(jnp.array([[1.0, 1.0], [config.survival, config.survival]])),
+        log_survival=jnp.log(jnp.array([[1.0, 1.0, 1.0], [config.survival, config.survival, 1.0]])),
         directivity=jnp.asarray(mesh.directivity, jnp.float32),
         log_gain=jnp.zeros(()),
         facets=jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), facets),
@@ -189,7 +189,7 @@ def skeleton(config: WaveConfig, sizes: dict[str, int]) -> WaveParams:
     return WaveParams(
         materials=Materials(*[shaped(m)] * 4),
         residual=shaped(f, 2),
-        log_survival=shaped(2, 2),
+        log_survival=shaped(2, 3),
         directivity=shaped(),
         log_gain=shaped(),
         facets=Facets(shaped(f, 4, 3), shaped(f, 3), shaped(f), shaped(f)),
@@ -252,7 +252,7 @@ def arrivals_at(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "k"]:
     """What the path loses or turns beyond its slabs."""
-    counts = jnp.stack([jnp.sum(paths.kind == kind, -1) for kind in (TRANSMITTED, REFLECTED)], -1)
+    counts = jnp.stack([jnp.sum(paths.kind == kind, -1) for kind in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
     reflects = paths.kind == REFLECTED
     residual = jnp.where(reflects[..., None], params.residual[jnp.where(reflects, paths.met, 0)], 0).sum(-2)
     return jnp.exp(counts @ params.log_survival[row] + residual[:, 0] + 1j * residual[:, 1])
