@@ -1,9 +1,11 @@
 """Choices made by measurement: one setting changed at a time, several seeds, everything else equal.
 
     python -m experiments.choices --data FOLDER|SCENE --steps 1000 --seeds 0 1 2 [--only relative_off area ...]
+    python -m experiments.choices --data 1 --seconds 60 --label batch --only default batch_4 batch_16
 
-Trains the `cpu` preset with fewer steps, scores all held-out spectra, and writes experiments/results/choices_<dataset>.json
-after every run; what is already there is skipped, so that an interrupted series goes on. docs/decisions.md quotes it.
+Trains the `cpu` preset with fewer steps, or each variant for the same time, scores all held-out spectra, and writes
+experiments/results/choices_<dataset>[_label].json (equal_time_... where --seconds is given) after every run; what is already
+there is skipped, so that an interrupted series goes on. docs/decisions.md and docs/performance.md quote it.
 """
 
 import dataclasses
@@ -27,10 +29,18 @@ from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
 from wbgs_jax.files import read_json, write_json
 from wbgs_jax.inference import predict_spectra
-from wbgs_jax.trainer import train
+from wbgs_jax.trainer import Run, train
 
 RESULTS = Path(__file__).parent / "results"
 Change = dict[str, Any]
+
+
+def batch(size: int) -> Change:
+    """Another batch; Adam's learning rates follow its square root."""
+    base = PRESETS["cpu"].optim
+    rates = ("network_lr", "means_lr", "log_scales_lr", "quats_lr", "opacity_lr")
+    return {"batch": size} | {rate: getattr(base, rate) * (size / base.batch) ** 0.5 for rate in rates}
+
 
 CHANGES: dict[str, tuple[Change, Change, Change]] = {
     # name: changes of (the field, the optimiser, density control)
@@ -48,9 +58,11 @@ CHANGES: dict[str, tuple[Change, Change, Change]] = {
     "gaussians_1000": ({"gaussians": 1000}, {}, {}),
     "gaussians_4000": ({"gaussians": 4000}, {}, {}),
     "width_128": ({"width": 128, "radiance_widths": (128, 64)}, {}, {}),
-    "fusion_1": ({"fusion": 1}, {}, {}),
+    "fusion_0": ({"fusion": 0}, {}, {}),
     "fusion_2": ({"fusion": 2}, {}, {}),
     "fusion_3": ({"fusion": 3}, {}, {}),
+    "batch_4": ({}, batch(4), {}),
+    "batch_16": ({}, batch(16), {}),
     "network_lr_3e-3": ({}, {"network_lr": 3e-3}, {}),
     "weight_decay_0.1": ({}, {"network_weight_decay": 0.1}, {}),
     "fixed_means": ({}, {"means_lr": 0.0}, {}),
@@ -67,11 +79,15 @@ class Command:
     data: str
     """Scene number, scene file or folder."""
     steps: int = 1000
+    seconds: float | None = None
+    """Train every change for about this long instead (compilation not counted), so that cheaper steps are more steps."""
     seeds: tuple[int, ...] = (0, 1, 2)
     only: tuple[str, ...] = ()
     """Names of changes; all by default."""
     train_ghz: tuple[float, ...] = ()
     """Train on these frequencies alone and score the others (held-out transmitters, unseen frequencies)."""
+    label: str = ""
+    """Appended to the file's name."""
     out: Path = RESULTS
 
 
@@ -90,7 +106,20 @@ def changed_settings(name: str, steps: int) -> Settings:
     shrunk = {key: shrink(getattr(base.density, key)) for key in ("every", "start", "reset_every")}
     control: DensityConfig = dataclasses.replace(base.density, **shrunk | density)
     loop = dataclasses.replace(base.loop, evaluate_every=10 * steps, checkpoint_every=10 * steps)
-    return Settings(wideband, optimiser, control, loop)
+    return dataclasses.replace(base, wideband=wideband, optim=optimiser, density=control, loop=loop)
+
+
+def steps_within(dataset: Dataset, name: str, seconds: float, seed: int) -> int:
+    """How many steps of a change take this long, in whole epochs."""
+    settings = changed_settings(name, PRESETS["cpu"].optim.steps)
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(dataset, "wideband", settings, seed, Path(folder))
+        run.epoch()  # compiles
+        begin = time.perf_counter()
+        run.epoch()
+        run.epoch()
+    block = settings.loop.epoch_steps
+    return max(1, round(seconds / (time.perf_counter() - begin) * 2)) * block
 
 
 def measure(dataset: Dataset, settings: Settings, seed: int) -> dict[str, Any]:
@@ -100,7 +129,13 @@ def measure(dataset: Dataset, settings: Settings, seed: int) -> dict[str, Any]:
     predicted = predict_spectra(get_field("wideband"), result.params, dataset, dataset.test)
     ssim = metrics.ssim(predicted, np.asarray(dataset.pas(dataset.test)))
     scores = {"median_ssim": round(float(np.median(ssim)), 4), "mean_ssim": round(float(np.mean(ssim)), 4)}
-    return {"seed": seed, **scores, "seconds": round(result.seconds, 1), "gaussians": result.gaussians}
+    return {
+        "seed": seed,
+        **scores,
+        "steps": result.steps,
+        "seconds": round(result.seconds, 1),
+        "gaussians": result.gaussians,
+    }
 
 
 def main() -> None:
@@ -115,13 +150,16 @@ def main() -> None:
         unseen = [f for f in np.unique(dataset.frequencies_hz) / 1e9 if not np.isclose(f, command.train_ghz).any()]
         dataset = select_frequencies(dataset, command.train_ghz, unseen)
         name += "_f" + "-".join(f"{f:g}" for f in command.train_ghz)
-    path = command.out / f"choices_{name}.json"
-    report: dict[str, Any] = {"dataset": name, "steps": command.steps, "changes": {}}
+    timed = command.seconds is not None
+    path = command.out / f"{'equal_time' if timed else 'choices'}_{name}{'_' * bool(command.label)}{command.label}.json"
+    effort, amount = ("seconds", command.seconds) if timed else ("steps", command.steps)
+    report: dict[str, Any] = {"dataset": name, effort: amount, "changes": {}}
     if path.exists():
         report = read_json(path)
-    if report["steps"] != command.steps:
+    if report[effort] != amount:
         raise UserError(
-            f"{path} holds runs of {report['steps']} steps, not {command.steps}; move it away or use --steps {report['steps']}"
+            f"{path} holds runs of {report[effort]:g} {effort}, not {amount:g}; move it away, give it a --label"
+            f" or use --{effort} {report[effort]:g}"
         )
     for seed in command.seeds:
         for change in names:
@@ -129,7 +167,8 @@ def main() -> None:
             if any(run["seed"] == seed for run in runs):
                 continue
             begin = time.perf_counter()
-            runs.append(measure(dataset, changed_settings(change, command.steps), seed) | environment())
+            steps = command.steps if command.seconds is None else steps_within(dataset, change, command.seconds, seed)
+            runs.append(measure(dataset, changed_settings(change, steps), seed) | environment())
             report["changes"][change]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
             write_json(path, report)
             print(

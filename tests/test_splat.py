@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax.geometry import AZIMUTH_PERIOD
-from wbgs_jax.splat import Capacity, Splats, geometry_plan, measure_capacity, project, render_dense, render_splats
+from wbgs_jax.splat import Capacity, Splats, composite, geometry_plan, measure_capacity, project, render_dense, render_splats
 from wbgs_jax.splat.project import SUPPORT
 from wbgs_jax.splat.tiles import CHUNK, build_tile_jobs
 from wbgs_jax.types import Gaussians, Receiver
@@ -74,6 +74,50 @@ def test_tiles_equal_the_dense_reference_in_value_and_every_gradient(rng, x64, p
     assert all(
         float(jnp.abs(g).max()) > 0 for g in (gradients[0].means, gradients[0].log_scales, gradients[0].quats, *gradients[2:])
     )
+
+
+def test_both_forms_draw_the_reference_whatever_the_spare_capacity(rng, x64):
+    """The form by jobs is what devices other than CPUs run."""
+    gaussians, receiver, attenuation, signal = random_case(rng)
+    cotangent = jnp.asarray(rng.normal(size=(450, 3, 72)))
+    fitting = geometry_plan(gaussians, receiver)
+    spare = geometry_plan(gaussians, receiver, Capacity(len(fitting.jobs.gaussian) * 64, len(fitting.jobs.gaussian) + 256))
+    geometry = jnp.concatenate([fitting.splats.means2d, fitting.splats.conics], -1)
+
+    def image_and_gradients(form, jobs):
+        def total(geometry, attenuation, signal):
+            tiles = form(geometry, attenuation, signal, jobs)
+            return jnp.sum(tiles * cotangent), tiles
+
+        return jax.value_and_grad(total, argnums=range(3), has_aux=True)(geometry, attenuation, signal)
+
+    image_and_gradients = jax.jit(image_and_gradients, static_argnums=0)
+    expected = image_and_gradients(composite._by_tiles, fitting.jobs)
+    assert all(float(jnp.abs(leaf).max()) > 0 for leaf in jax.tree.leaves(expected))
+    for form, jobs in ((composite._by_jobs, fitting.jobs), (composite._by_tiles, spare.jobs), (composite._by_jobs, spare.jobs)):
+        for got, want in zip(jax.tree.leaves(image_and_gradients(form, jobs)), jax.tree.leaves(expected), strict=True):
+            assert relative(got, want) < EXACT
+
+
+def test_what_runs_the_code_chooses_the_form(rng):
+    """Not what traces it: lowered here for a CPU and for a GPU; neither holds the other's code."""
+    gaussians, receiver, attenuation, signal = random_case(rng, n=20, dtype=np.float32)
+    plan = geometry_plan(gaussians, receiver, Capacity(4096, 1024))
+    traced = jax.jit(jax.grad(lambda a: jnp.sum(render_splats(plan, a, signal)))).trace(attenuation)
+    cpu, cuda = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
+    tiles, jobs = (f"tensor<{n}x3x72xf32>" for n in (composite.TILE_GROUP, 1024 // composite.JOB_GROUPS))
+    assert (tiles in cpu, jobs in cpu) == (True, False)
+    assert (tiles in cuda, jobs in cuda) == (False, True)
+
+
+def test_plans_can_be_mapped_over(rng):
+    cases = [random_case(rng, n=60, dtype=np.float32) for _ in range(2)]
+    arguments = [(geometry_plan(case[0], case[1], Capacity(16384, 2048)), *case[2:]) for case in cases]
+    gradient = jax.grad(lambda *args: jnp.sum(render_splats(*args) ** 2), argnums=(1, 2))
+    mapped = jax.jit(jax.vmap(gradient))(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *arguments))
+    for i, own in enumerate(arguments):
+        for got, want in zip(mapped, jax.jit(gradient)(*own), strict=True):
+            assert relative(got[i], want) < 1e-4
 
 
 def test_dense_reference_agrees_with_equation_6_written_pixel_by_pixel(rng, x64):

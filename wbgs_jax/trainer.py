@@ -106,8 +106,18 @@ class Run:
     def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
         """The batches of an epoch: a function of seed and epoch alone, so that a resumed run sees the same ones."""
         rng = np.random.default_rng([self.seed, 2, epoch])
+        pool = self.pool(epoch * steps / self.settings.optim.steps)
         batch = min(self.settings.optim.batch, len(self.dataset.train))
-        return np.stack([rng.choice(self.dataset.train, batch, replace=False) for _ in range(steps)]).astype(np.int32)
+        return np.stack([rng.choice(pool, batch, replace=len(pool) < batch) for _ in range(steps)]).astype(np.int32)
+
+    def pool(self, progress: float) -> Int[np.ndarray, "n"]:
+        """The training spectra that batches are drawn from after this share of the steps: low frequencies first, if asked."""
+        train, curriculum = self.dataset.train, self.settings.optim.curriculum
+        frequencies = self.dataset.frequencies_hz[train]
+        if progress >= curriculum:
+            return train
+        low, high = frequencies.min(), frequencies.max()
+        return train[frequencies <= low * (high / low) ** (progress / curriculum) * (1 + 1e-6)]
 
     def epoch(self) -> tuple[float, float]:
         """Run one block of steps; returns mean loss and SSIM. Overflowed steps are repeated with a larger capacity."""

@@ -21,6 +21,8 @@ from experiments.bench.timing import Effort, Report, Seconds, interleaved, say
 from wbgs_jax import project
 
 HAS_TORCH = importlib.util.find_spec("torch") is not None
+OTHERS_LARGEST = 8
+"""Queries that the others are given at most: they keep every (Gaussian, pixel, query), or take minutes."""
 SHARED = 8
 """Queries that share a plan in the `sharing` figure."""
 
@@ -97,8 +99,8 @@ def jax_calls(report: Report, effort: Effort, size: Size, scene: Scene, b: int) 
         "render_fwd": scene.compile_forward(scene.tiled, b),
         "render_fwd_bwd": scene.compile_gradient(scene.tiled, b),
     }
-    if size.dense:
-        dense = scene.compile_gradient(scene.dense, b)
+    if size.dense and b <= OTHERS_LARGEST:
+        dense = scene.compile_gradient_one_by_one(scene.dense, b)  # as fast as all at once
         if (needed := temporary_gb(dense)) > effort.memory_limit_gb:
             report.skip(f"dense_fwd_bwd_{size.tag(b)}", f"it needs {needed:.0f} GB")
         else:
@@ -118,7 +120,7 @@ def measure_size(report: Report, effort: Effort, size: Size) -> None:
     calls: dict[Competitor, Callable[[], Any]] = {}
     for b in size.batches:
         calls |= jax_calls(report, effort, size, scene, b)
-        if size.torch and not without_torch():
+        if size.torch and b <= OTHERS_LARGEST and not without_torch():
             calls |= torch_calls(effort, scene, b)
     seconds = interleaved(calls, effort)
     for figure, b in dict.fromkeys((key.figure, key.b) for key in calls):

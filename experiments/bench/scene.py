@@ -52,11 +52,29 @@ class Scene:
 
     def compile_gradient(self, render: Render, b: int) -> jax.stages.Compiled:
         """A renderer's forward and backward."""
+        return jax.jit(_gradient(render)).lower(*self.inputs(b)).compile()
 
-        def objective(gaussians, attenuation, signal, cotangent):
-            return jnp.sum(render(gaussians, attenuation, signal) * cotangent)
+    def compile_gradient_one_by_one(self, render: Render, b: int) -> jax.stages.Compiled:
+        """The same, query after query: for a renderer that keeps every (Gaussian, pixel, query) for its backward pass."""
+        gradient = _gradient(render)
 
-        return jax.jit(jax.grad(objective, argnums=(0, 1, 2))).lower(*self.inputs(b)).compile()
+        def gradients(gaussians, *queries):
+            def add(total, query):
+                own, *others = gradient(gaussians, *(a[..., None] for a in query[:2]), query[2][None])
+                return jax.tree.map(jnp.add, total, own), tuple(a[:, 0] for a in others)
+
+            attenuation, signal, cotangent = queries
+            total, others = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, gaussians), (attenuation.T, signal.T, cotangent))
+            return total, *(a.T for a in others)
+
+        return jax.jit(gradients).lower(*self.inputs(b)).compile()
+
+
+def _gradient(render: Render) -> Callable[..., tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"]]]:
+    def objective(gaussians, attenuation, signal, cotangent):
+        return jnp.sum(render(gaussians, attenuation, signal) * cotangent)
+
+    return jax.grad(objective, argnums=(0, 1, 2))
 
 
 def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:

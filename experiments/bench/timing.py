@@ -15,6 +15,8 @@ Seconds = Float[np.ndarray, "rounds"]
 Name = TypeVar("Name", bound=Hashable)
 
 MIN_ROUNDS = 3
+SHORT_S, SHORT_REPEATS = 0.05, 5
+"""A call that takes less counts with the median of this many in a row: a moment's pause would be most of it."""
 TOLERANCE = {"x": 0.25}
 """Share by which a figure of this unit may be worse than the baseline's: a ratio of two times measured side by side ..."""
 ABSOLUTE_TOLERANCE = 0.5
@@ -90,6 +92,12 @@ def timed(call: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
+def timed_often(call: Callable[[], Any]) -> float:
+    """Seconds of a call; of a short one, the median of several."""
+    first = timed(call)
+    return first if first > SHORT_S else float(np.median([first] + [timed(call) for _ in range(SHORT_REPEATS - 1)]))
+
+
 def interleaved(competitors: Mapping[Name, Callable[[], Any]], effort: Effort) -> dict[Name, Seconds]:
     """Seconds of every call, round by round; a competitor whose call exceeds the limit is missing."""
     for call in competitors.values():
@@ -101,5 +109,5 @@ def interleaved(competitors: Mapping[Name, Callable[[], Any]], effort: Effort) -
         rounds.append([])
         for call in bearable.values():
             timed(call)  # pays for the memory that the competitor before it gave back
-            rounds[-1].append(timed(call))
+            rounds[-1].append(timed_often(call))
     return dict(zip(bearable, np.array(rounds).T, strict=True))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import choices
 from experiments.bench import __main__ as command_line
 from experiments.bench import gate, quality, renderer, timing
 from wbgs_jax.errors import UserError, run_command
@@ -36,7 +37,8 @@ def test_competitors_take_turns_and_the_timed_call_follows_an_untimed_one():
     calls = []
     competitors = {name: lambda name=name: calls.append(name) for name in "ab"}
     seconds = timing.interleaved(competitors, timing.Effort(repeats=3))
-    assert calls == list("ab" + "ab" + "aabb" * 3)  # compile, try, rounds
+    turn = "a" * (1 + timing.SHORT_REPEATS) + "b" * (1 + timing.SHORT_REPEATS)
+    assert calls == list("ab" + "ab" + turn * 3)  # compile, try, rounds
     assert {name: len(times) for name, times in seconds.items()} == {"a": 3, "b": 3}
 
 
@@ -65,6 +67,16 @@ def test_the_times_are_those_of_the_calls(clock):
     np.testing.assert_allclose(seconds["a"], [1] * 5)
     np.testing.assert_allclose(seconds["b"], [3] * 5)
     assert "slow" not in seconds
+
+
+def test_a_short_call_counts_with_a_median_and_a_long_one_once(clock):
+    pauses = iter([0.01, 0.04, 0.01, 0.01, 0.02, 0.3])
+
+    def call():
+        clock.now += next(pauses)
+
+    assert timing.timed_often(call) == pytest.approx(0.01)
+    assert timing.timed_often(call) == pytest.approx(0.3)
 
 
 def test_rounds_end_with_the_budget_but_not_before_the_third(clock):
@@ -280,3 +292,22 @@ def test_pytorch_draws_the_reference_in_value_and_every_gradient(rng, x64):
         for got, expected in zip(torch_tiles.gradients(form, *given, torch.from_numpy(cotangent)), gradients, strict=True):
             largest = max(1.0, float(jnp.abs(expected).max()))
             np.testing.assert_allclose(got.numpy(), expected, atol=1e-12 * largest, err_msg=form)
+
+
+# Choices
+
+
+def test_equal_time_gives_cheaper_steps_more_of_them(monkeypatch, clock):
+    class FakeRun:
+        def __init__(self, dataset, field, settings, seed, folder):
+            self.cost, self.epochs = settings.optim.batch, 0
+
+        def epoch(self):
+            clock.now += self.cost + 100 * (self.epochs == 0)  # the first one compiles
+            self.epochs += 1
+
+    monkeypatch.setattr(choices, "time", clock)
+    monkeypatch.setattr(choices, "Run", FakeRun)
+    block = choices.PRESETS["cpu"].loop.epoch_steps
+    steps = {name: choices.steps_within(None, name, 80.0, 0) for name in ("default", "batch_4", "batch_16")}
+    assert steps == {"default": 10 * block, "batch_4": 20 * block, "batch_16": 5 * block}
