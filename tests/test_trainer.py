@@ -198,3 +198,12 @@ def test_training_in_a_thread(dataset, tmp_path):
     """Signals can be handled in the main thread only; sweeps train in others."""
     with concurrent.futures.ThreadPoolExecutor() as pool:
         assert pool.submit(train, dataset, "wideband", SETTINGS, 0, tmp_path).result().steps == STEPS
+
+
+def test_a_curriculum_starts_with_low_frequencies_and_ends_with_all(dataset, tmp_path):
+    settings = dataclasses.replace(SETTINGS, optim=dataclasses.replace(SETTINGS.optim, curriculum=0.5))
+    run = Run(dataset, "wideband", settings, 0, tmp_path)
+    highest = [dataset.frequencies_hz[run.pool(progress)].max() for progress in (0.0, 0.26, 0.49, 0.5, 1.0)]
+    assert highest == [1e9, 10e9, 10e9, 94e9, 94e9]
+    np.testing.assert_array_equal(run.pool(0.5), dataset.train)
+    assert set(run.batches(0, 20).ravel()) <= set(run.pool(0.0))

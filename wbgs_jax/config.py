@@ -79,6 +79,8 @@ class WaveConfig:
     """... and metres, where the scene does not say."""
     survival: float = 0.7
     """Amplitude that diffracted waves keep at every further meeting, at the start."""
+    coherent: bool = True
+    """False: the powers of the paths are added instead of their amplitudes, as phase-blind models do (an ablation)."""
     residual_weight: float = 0.1
     """Weight of the facets' mean squared residuals."""
 

@@ -18,7 +18,7 @@ from wbgs_jax.runs import TrainedField
 from wbgs_jax.types import Query, Receiver
 
 BLOCK = 16
-"""Queries rendered at a time; more cost memory and, on a CPU, gain nothing."""
+"""Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
 
 Predictor = Callable[[Any, Any], Array]
 """(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360); leading axes broadcast like NumPy's."""

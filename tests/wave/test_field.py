@@ -127,3 +127,18 @@ def test_the_skeleton_has_the_shapes_of_parameters():
     assert jax.tree.structure(skeleton) == jax.tree.structure(params)
     for a, b in zip(jax.tree.leaves(skeleton), jax.tree.leaves(params), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
+
+
+def test_without_phases_the_spectrum_is_that_of_added_powers(scene, rng):
+    """Against the mean over many draws of random path phases, squared."""
+    params, plan = field_of([*room(), box((3, 1, 0.5), (4, 2, 1.2))], RX, mirror_areas=(0.0,))
+    query = make_query([[2.0, 2.5, 1.5]], 5e9)
+    traced = wave.trace(params, plan, query.tx_position)
+    found = wave.phase_blind_pas(params, plan, traced, query.frequency_hz)[0]
+    arrived = jax.tree.map(lambda leaf: leaf[0], wave.channels(params, plan, query))
+    phases = jnp.asarray(np.exp(2j * np.pi * rng.uniform(size=(2000, arrived.amplitude.size))), jnp.complex64)
+    drawn = jax.vmap(lambda p: wave.snapshot(arrived._replace(amplitude=arrived.amplitude * p), plan.receiver))(phases)
+    drawn = drawn / jnp.abs(drawn).max()
+    grid = wave.steering_vector(plan.receiver.element_positions, jnp.asarray(wave.pas_directions(), jnp.float32))
+    power = jnp.mean(wave.cbf(drawn, grid) ** 2, 0)
+    np.testing.assert_allclose(found, jnp.sqrt(power / power.max()), atol=0.05)

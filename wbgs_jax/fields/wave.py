@@ -20,6 +20,7 @@ from wbgs_jax.array import cbf, normalise, pas_directions, steering_vector
 from wbgs_jax.checks import check_query, check_receiver
 from wbgs_jax.config import WaveConfig
 from wbgs_jax.fields.observation import Observation
+from wbgs_jax.losses import squared_magnitude
 from wbgs_jax.pytree import pytree, static
 from wbgs_jax.types import Mesh, Query, Receiver
 from wbgs_jax.wave.edges import Edges, edges_of_facets
@@ -168,8 +169,11 @@ def observe(
 ) -> Observation:
     """Snapshots and spectra of a training batch."""
     planned, traced = memory
-    y = carry(params, planned, jax.tree.map(lambda leaf: leaf[tx_index], traced), query.frequency_hz)
+    chosen = jax.tree.map(lambda leaf: leaf[tx_index], traced)
     penalty = params.config.residual_weight * jnp.sum(jnp.mean(params.residual**2, 0))
+    if not params.config.coherent:
+        return Observation(phase_blind_pas(params, planned, chosen, query.frequency_hz), penalty=penalty)
+    y = carry(params, planned, chosen, query.frequency_hz)
     return Observation(to_pas(y, receiver), y, penalty)
 
 
@@ -200,6 +204,8 @@ def skeleton(config: WaveConfig, sizes: dict[str, int]) -> WaveParams:
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
     """Power angular spectra of B queries."""
+    if not params.config.coherent:
+        return phase_blind_pas(params, plan, trace(params, plan, query.tx_position), query.frequency_hz)
     return to_pas(snapshots(params, plan, query), plan.receiver)
 
 
@@ -227,6 +233,22 @@ def to_pas(y: Complex[Array, "b elements"], receiver: Receiver) -> Float[Array, 
     y = y / jnp.sqrt(jnp.sum(y.real**2 + y.imag**2, -1, keepdims=True) + 1e-30)
     steering = steering_vector(receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
     return normalise(cbf(y, steering))
+
+
+def phase_blind_pas(
+    params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Float[Array, "b"]
+) -> Float[Array, "b 90 360"]:
+    """Spectra with the powers of all paths added: what is left of this model without its phases."""
+
+    def covariance(traced, f):
+        found = arrivals_at(params, plan, traced, f)
+        steering = steering_vector(plan.receiver.element_positions, found.direction)
+        weighted = steering * (squared_magnitude(found.amplitude) / jnp.sum(squared_magnitude(found.amplitude)))[:, None]
+        return steering.T @ weighted.conj()  # sum of power times a a^H
+
+    grid = steering_vector(plan.receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
+    beams = jnp.einsum("hwe,bef,hwf->bhw", grid.conj(), jax.vmap(covariance)(traced, frequency_hz), grid)
+    return normalise(jnp.sqrt(jnp.maximum(beams.real, 1e-12)))
 
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
