@@ -33,7 +33,7 @@ from wbgs_jax.wave.transfer import Arrivals, Slabs, arrivals, snapshot
 STARTS_FROM = "mesh"
 TRACED_AT_ONCE = 16
 """Transmitters."""
-LARGEST_LOG_CONDUCTIVITY = float(np.log(1e5))
+LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Beyond it (S/m) every material is a mirror, and single precision ends."""
 
 
@@ -103,10 +103,15 @@ def init(key: Key[Array, ""], mesh: Mesh, config: WaveConfig, capacity: int | No
         log_survival=jnp.log(jnp.array([[1.0, 1.0, 1.0], [config.survival, config.survival, 1.0]])),
         directivity=jnp.asarray(mesh.directivity, jnp.float32),
         log_gain=jnp.zeros(()),
-        facets=jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), facets),
-        edges=jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), edges_of_facets(facets)),
+        facets=_floats(facets),
+        edges=_floats(edges_of_facets(facets)),
         config=config,
     )
+
+
+def _floats(tree: Any) -> Any:
+    """All arrays as float32, indices too, so that `jax.grad` takes them."""
+    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), tree)
 
 
 def plan(params: WaveParams, receiver: Receiver, *_: Any) -> WavePlan:
@@ -127,7 +132,7 @@ def plan(params: WaveParams, receiver: Receiver, *_: Any) -> WavePlan:
 
 
 def _on_host(tree: Any) -> Any:
-    """float64 positions; indices, which the parameters hold as floats so that `jax.grad` takes them, as integers."""
+    """float64 positions, int32 indices."""
     arrays = {f.name: np.asarray(getattr(tree, f.name), np.float64) for f in dataclasses.fields(tree)}
     return type(tree)(**arrays | {name: arrays[name].astype(np.int32) for name in ("part", "facet") if name in arrays})
 
@@ -164,8 +169,8 @@ def observe(
     receiver: Receiver,
     query: Query,
     tx_index: Int[Array, "b"],
-    capacity: None = None,
-    means2d_offset: None = None,
+    capacity: Any = None,
+    means2d_offset: Any = None,
 ) -> Observation:
     """Snapshots and spectra of a training batch."""
     planned, traced = memory
@@ -187,19 +192,23 @@ def skeleton(config: WaveConfig, sizes: dict[str, int]) -> WaveParams:
     """The shapes of parameters."""
     m, f, e = (sizes[name] for name in ("materials", "facets", "edges"))
 
-    def shaped(*shape: int) -> Any:
-        return jax.ShapeDtypeStruct(shape, jnp.float32)
+    def build() -> WaveParams:
+        def zeros(*shape: int) -> Array:
+            return jnp.zeros(shape, jnp.float32)
 
-    return WaveParams(
-        materials=Materials(*[shaped(m)] * 4),
-        residual=shaped(f, 2),
-        log_survival=shaped(2, 3),
-        directivity=shaped(),
-        log_gain=shaped(),
-        facets=Facets(shaped(f, 4, 3), shaped(f, 3), shaped(f), shaped(f)),
-        edges=Edges(shaped(e, 3), shaped(e, 3), shaped(e), shaped(e, 3), shaped(e, 3), shaped(e)),
-        config=config,
-    )
+        return WaveParams(
+            materials=Materials(*[zeros(m)] * 4),
+            residual=zeros(f, 2),
+            log_survival=zeros(2, 3),
+            directivity=zeros(),
+            log_gain=zeros(),
+            facets=_floats(Facets(zeros(f, 4, 3), zeros(f, 3), zeros(f), jnp.zeros(f, int))),
+            edges=_floats(Edges(zeros(e, 3), zeros(e, 3), zeros(e), zeros(e, 3), zeros(e, 3), jnp.zeros(e, int))),
+            config=config,
+        )
+
+    shaped: Any = jax.eval_shape(build)
+    return shaped
 
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
