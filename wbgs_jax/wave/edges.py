@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax.pytree import pytree
-from wbgs_jax.wave.facets import CORNERS, ODD, WELD, AnyArray, Facets
+from wbgs_jax.wave.facets import CORNERS, ODD, WELD, AnyArray, Facets, outline_of
 
 SHARPEST = 0.05
 """Edges that turn by less than this angle (radians) are part of a smooth surface."""
@@ -71,7 +71,7 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, "e"]:
     out = edges.normal_0 + edges.normal_n
     out = out / np.linalg.norm(out, axis=-1, keepdims=True)
     middle = edges.start + edges.direction * edges.length[:, None] / 2
-    corners, normal = np.asarray(facets.corners), np.asarray(facets.normal)
+    normal, (inward, edge_offset) = np.asarray(facets.normal), outline_of(facets)
     covered = np.zeros(len(middle), bool)
     for i, (point, way) in enumerate(zip(middle, out, strict=True)):
         height = normal @ point - np.asarray(facets.offset)
@@ -79,10 +79,7 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, "e"]:
         distance = -height / np.where(along == 0, 1, along)
         near = np.flatnonzero((along != 0) & (distance > WELD) & (distance < GAP))
         meets = point + distance[near, None] * way
-        inside = np.ones(len(near), bool)
-        for k in range(CORNERS):
-            a, b = corners[near, k], corners[near, (k + 1) % CORNERS]
-            inside &= np.sum(np.cross(b - a, meets - a) * normal[near], -1) >= 0
+        inside = (np.einsum("fed,fd->fe", inward[near], meets) >= edge_offset[near]).all(-1)
         covered[i] = inside.any()
     return covered
 
