@@ -23,7 +23,7 @@ from wbgs_jax import metrics
 from wbgs_jax.config import PRESETS, DensityConfig, OptimConfig, Settings, WidebandConfig
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import select_frequencies
+from wbgs_jax.data.splits import unseen_frequencies
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
@@ -122,11 +122,11 @@ def steps_within(dataset: Dataset, name: str, seconds: float, seed: int) -> int:
     return max(1, round(seconds / (time.perf_counter() - begin) * 2)) * block
 
 
-def measure(dataset: Dataset, settings: Settings, seed: int) -> dict[str, Any]:
+def measure(dataset: Dataset, settings: Settings, seed: int, field: str = "wideband") -> dict[str, Any]:
     """Train once and score all held-out spectra."""
     with tempfile.TemporaryDirectory() as folder:
-        result = train(dataset, "wideband", settings, seed, Path(folder))
-    predicted = predict_spectra(get_field("wideband"), result.params, dataset, dataset.test)
+        result = train(dataset, field, settings, seed, Path(folder))
+    predicted = predict_spectra(get_field(field), result.params, dataset, dataset.test)
     ssim = metrics.ssim(predicted, np.asarray(dataset.pas(dataset.test)))
     scores = {"median_ssim": round(float(np.median(ssim)), 4), "mean_ssim": round(float(np.mean(ssim)), 4)}
     return {
@@ -145,11 +145,9 @@ def main() -> None:
     if unknown := [name for name in names if name not in CHANGES]:
         raise UserError(f"unknown change {unknown[0]!r}; choose among: {', '.join(CHANGES)}")
     dataset = load_dataset(command.data)
-    name = dataset.name
     if command.train_ghz:
-        unseen = [f for f in np.unique(dataset.frequencies_hz) / 1e9 if not np.isclose(f, command.train_ghz).any()]
-        dataset = select_frequencies(dataset, command.train_ghz, unseen)
-        name += "_f" + "-".join(f"{f:g}" for f in command.train_ghz)
+        dataset = unseen_frequencies(dataset, command.train_ghz)
+    name = dataset.name
     timed = command.seconds is not None
     path = command.out / f"{'equal_time' if timed else 'choices'}_{name}{'_' * bool(command.label)}{command.label}.json"
     effort, amount = ("seconds", command.seconds) if timed else ("steps", command.steps)

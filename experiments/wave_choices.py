@@ -9,24 +9,18 @@ what is there already is skipped. docs/wave.md quotes it.
 import dataclasses
 import statistics
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 
-from wbgs_jax import metrics
+from experiments.choices import measure
 from wbgs_jax.config import Settings, preset_settings
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.eval import environment
-from wbgs_jax.fields import get_field
 from wbgs_jax.files import read_json, write_json
-from wbgs_jax.inference import predict_spectra
-from wbgs_jax.trainer import train
 
 RESULTS = Path(__file__).parent / "results"
 Change = dict[str, Any]
@@ -73,16 +67,6 @@ def changed_settings(name: str, steps: int) -> Settings:
     )
 
 
-def measure(dataset: Dataset, settings: Settings, seed: int) -> dict[str, Any]:
-    """Train once and score all held-out spectra."""
-    with tempfile.TemporaryDirectory() as folder:
-        result = train(dataset, "wave", settings, seed, Path(folder))
-    predicted = predict_spectra(get_field("wave"), result.params, dataset, dataset.test)
-    ssim = metrics.ssim(predicted, np.asarray(dataset.pas(dataset.test)))
-    scores = {"median_ssim": round(float(np.median(ssim)), 4), "mean_ssim": round(float(np.mean(ssim)), 4)}
-    return {"seed": seed, **scores, "seconds": round(result.seconds, 1)}
-
-
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.wave_choices")
@@ -101,7 +85,7 @@ def main() -> None:
             runs = report["changes"].setdefault(name, {"runs": []})["runs"]
             if any(run["seed"] == seed for run in runs):
                 continue
-            runs.append(measure(dataset, changed_settings(name, command.steps), seed) | environment())
+            runs.append(measure(dataset, changed_settings(name, command.steps), seed, "wave") | environment())
             report["changes"][name]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
             write_json(path, report)
             print(f"{name:18} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}", file=sys.stderr, flush=True)

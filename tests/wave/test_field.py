@@ -136,3 +136,8 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(scene, rng):
     grid = wave.steering_vector(plan.receiver.element_positions, jnp.asarray(wave.pas_directions(), jnp.float32))
     power = jnp.mean(wave.cbf(drawn, grid) ** 2, 0)
     np.testing.assert_allclose(found, jnp.sqrt(power / power.max()), atol=0.05)
+
+
+def test_more_facets_than_can_be_numbered_are_refused():
+    with pytest.raises(UserError, match="max-facets is 4094; the most is 4093"):
+        field_of(room(), RX, max_facets=4094)

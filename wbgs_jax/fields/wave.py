@@ -19,6 +19,7 @@ from jaxtyping import Array, Complex, Float, Int, Key
 from wbgs_jax.array import cbf, normalise, pas_directions, steering_vector
 from wbgs_jax.checks import check_query, check_receiver
 from wbgs_jax.config import WaveConfig
+from wbgs_jax.errors import UserError
 from wbgs_jax.fields.observation import Observation
 from wbgs_jax.losses import squared_magnitude
 from wbgs_jax.pytree import pytree, static
@@ -26,7 +27,17 @@ from wbgs_jax.types import Mesh, Query, Receiver
 from wbgs_jax.wave.edges import Edges, edges_of_facets
 from wbgs_jax.wave.facets import Facets, facets_from_mesh, outline_of
 from wbgs_jax.wave.images import diffracted_chains, receiver_chains
-from wbgs_jax.wave.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Outline, Paths, Search, diffracted_paths, reflected_paths
+from wbgs_jax.wave.paths import (
+    DIFFRACTED,
+    MAX_FACETS,
+    REFLECTED,
+    TRANSMITTED,
+    Outline,
+    Paths,
+    Search,
+    diffracted_paths,
+    reflected_paths,
+)
 from wbgs_jax.wave.slab import complex_permittivity
 from wbgs_jax.wave.transfer import Arrivals, Slabs, arrivals, snapshot
 
@@ -87,7 +98,13 @@ class Traced:
 
 
 def init(key: Key[Array, ""], mesh: Mesh, config: WaveConfig, capacity: int | None = None) -> WaveParams:
-    """Facets and edges of a mesh (on the host), all materials alike but for thicknesses that are known."""
+    """Facets and edges of a mesh (on the host), all materials alike but for thicknesses that are known.
+
+    Raises:
+        UserError: more facets are asked for than the search for paths can number.
+    """
+    if config.max_facets > MAX_FACETS:
+        raise UserError(f"--wave.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
     facets = facets_from_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.cluster), config.max_facets)
     m = mesh.thickness.shape[0]
     thickness = jnp.where(mesh.thickness > 0, mesh.thickness, config.thickness)
@@ -239,7 +256,7 @@ def carry(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Floa
 
 def to_pas(y: Complex[Array, "b elements"], receiver: Receiver) -> Float[Array, "b 90 360"]:
     """Spectra of snapshots of any scale."""
-    y = y / jnp.sqrt(jnp.sum(y.real**2 + y.imag**2, -1, keepdims=True) + 1e-30)
+    y = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + 1e-30)
     steering = steering_vector(receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
     return normalise(cbf(y, steering))
 
@@ -252,7 +269,8 @@ def phase_blind_pas(
     def covariance(traced, f):
         found = arrivals_at(params, plan, traced, f)
         steering = steering_vector(plan.receiver.element_positions, found.direction)
-        weighted = steering * (squared_magnitude(found.amplitude) / jnp.sum(squared_magnitude(found.amplitude)))[:, None]
+        power = squared_magnitude(found.amplitude)
+        weighted = steering * (power / jnp.sum(power))[:, None]
         return steering.T @ weighted.conj()  # sum of power times a a^H
 
     grid = steering_vector(plan.receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))

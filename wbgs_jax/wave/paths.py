@@ -28,6 +28,7 @@ NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
 INDICES, PLACES = 2**12, 2**17
 """A meeting's key holds the index of a facet or vertex (less than `INDICES`) and its place, in parts of a leg."""
 MAX_FACETS = INDICES - MAX_ORDER
+"""More cannot be told apart by their keys."""
 NO_KEY = jnp.uint32(0xFFFFFFFF)
 CUT_AT_ONCE = 64
 """Paths: few enough for a CPU's cache."""
