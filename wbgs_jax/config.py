@@ -157,11 +157,18 @@ class LoopConfig:
     keep_checkpoints: int = 2
 
 
+def without_frequency(config: WidebandConfig) -> WidebandConfig:
+    """The same field with both frequency embeddings switched off."""
+    return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False)
+
+
 @dataclass(frozen=True)
 class Settings:
     """Everything that makes a run, but the data and the seed."""
 
     wideband: WidebandConfig = field(default_factory=WidebandConfig)
+    wrfgs: WidebandConfig = field(default_factory=lambda: without_frequency(WidebandConfig()))
+    """The wideband field without any frequency input, one model a frequency (fields/wrfgs.py)."""
     wave: WaveConfig = field(default_factory=WaveConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
@@ -195,6 +202,8 @@ WAVE_STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 def preset_settings(preset: str, field: str) -> Settings:
     """A preset as it suits a field."""
     settings = PRESETS[preset]
+    if field == "wrfgs":
+        return dataclasses.replace(settings, wrfgs=without_frequency(settings.wideband))
     if field != "wave":
         return settings
     steps = WAVE_STEPS[preset]
@@ -216,7 +225,7 @@ def from_dict(values: Any) -> Settings:
             raise KeyError(f"{cls.__name__}.{min(missing)}")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
 
-    sections = {f.name: f.default_factory for f in dataclasses.fields(Settings)}
+    sections = {f.name: type(getattr(Settings(), f.name)) for f in dataclasses.fields(Settings)}
     try:
         built = {name: build(sections[name], value) for name, value in values.items()}
         return Settings(**built | {name: built[name] for name in sections})
@@ -241,26 +250,32 @@ def check(settings: Settings) -> None:
         "loop.evaluate-every": settings.loop.evaluate_every,
         "loop.checkpoint-every": settings.loop.checkpoint_every,
         "loop.keep-checkpoints": settings.loop.keep_checkpoints,
-        "wideband.width": settings.wideband.width,
-        "wideband.depth": settings.wideband.depth,
-        "wideband.radiance-widths": min(settings.wideband.radiance_widths, default=0),
     }
-    for name, value in positive.items():
-        if value < 1:
-            raise UserError(f"--{name} is {value}; it must be at least 1")
-    if 0 < settings.wideband.gaussians < 4 or settings.wideband.gaussians < 0:
-        raise UserError(
-            f"--wideband.gaussians is {settings.wideband.gaussians}; give at least 4, or 0 for the size of the mesh"
-        )
+    _check_positive(positive)
     steps, block = settings.optim.steps, settings.loop.epoch_steps
     if steps % block:
         raise UserError(f"--optim.steps {steps} is not a multiple of --loop.epoch-steps {block}; change one of them")
-    if not 0 <= settings.wideband.fusion < settings.wideband.depth:
-        raise UserError(
-            f"--wideband.fusion is {settings.wideband.fusion}; it is the number of a layer, 0 to {settings.wideband.depth - 1}"
-        )
-    for name in ("gaussian", "tx", "frequency"):
-        if getattr(settings.wideband, f"{name}_octaves") < 0:
-            raise UserError(f"--wideband.{name}-octaves is negative; give 0 or more")
     if not 0 <= settings.optim.ssim_weight <= 1:
         raise UserError(f"--optim.ssim-weight is {settings.optim.ssim_weight}; it must lie between 0 and 1")
+    _check_splatting("wideband", settings.wideband)
+    _check_splatting("wrfgs", settings.wrfgs)
+    if settings.wrfgs != without_frequency(settings.wrfgs):
+        raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
+
+
+def _check_positive(values: dict[str, int]) -> None:
+    for name, value in values.items():
+        if value < 1:
+            raise UserError(f"--{name} is {value}; it must be at least 1")
+
+
+def _check_splatting(name: str, config: WidebandConfig) -> None:
+    widths = min(config.radiance_widths, default=0)
+    _check_positive({f"{name}.width": config.width, f"{name}.depth": config.depth, f"{name}.radiance-widths": widths})
+    if 0 < config.gaussians < 4 or config.gaussians < 0:
+        raise UserError(f"--{name}.gaussians is {config.gaussians}; give at least 4, or 0 for the size of the mesh")
+    if not 0 <= config.fusion < config.depth:
+        raise UserError(f"--{name}.fusion is {config.fusion}; it is the number of a layer, 0 to {config.depth - 1}")
+    for part in ("gaussian", "tx", "frequency"):
+        if getattr(config, f"{part}_octaves") < 0:
+            raise UserError(f"--{name}.{part}-octaves is negative; give 0 or more")

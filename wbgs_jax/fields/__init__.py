@@ -22,7 +22,7 @@ from typing import Any, Literal, Protocol, cast, runtime_checkable
 from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax.errors import UserError
-from wbgs_jax.fields import wave, wideband
+from wbgs_jax.fields import wave, wideband, wrfgs
 from wbgs_jax.fields.observation import Observation
 from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver
@@ -66,7 +66,7 @@ class Field(Protocol):
     def skeleton(self, config: Any, sizes: dict[str, int]) -> Any: ...
 
 
-FIELDS: dict[str, ModuleType] = {"wideband": wideband, "wave": wave}
+FIELDS: dict[str, ModuleType] = {"wideband": wideband, "wave": wave, "wrfgs": wrfgs}
 
 
 def get_field(name: str) -> Field:
