@@ -1,0 +1,95 @@
+"""What tables are made of: scores of a row over its seeds, cells with the paper's value, and marks for what was not run."""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.jobs import Job
+from experiments.results import Results
+from experiments.statistics import estimate, typical
+from wbgs_jax.data import released_scenes
+from wbgs_jax.data.schema import load_scene
+
+NOT_RUN = "not run yet"
+Scores = Float[np.ndarray, "seeds tx ghz"]
+NAMES = {
+    ("wideband", ""): "wideband (ours)",
+    ("wave", ""): "coherent (ours)",
+    ("wrfgs", ""): "WRF-GS, equal samples",
+    ("wrfgs", "long"): "WRF-GS, long",
+    ("nerf2", ""): "NeRF2-style",
+}
+"""Of fields and variants, for people."""
+
+
+def seeds_of(job: Job, jobs: Sequence[Job]) -> list[Job]:
+    """The jobs that differ from one in their seed alone."""
+    return [other for other in jobs if _unseeded(other) == _unseeded(job)]
+
+
+def _unseeded(job: Job) -> tuple:
+    return job.scene, job.field, job.combination, job.all_tx, job.variant
+
+
+def scores(results: Results, jobs: Sequence[Job], ghz: Sequence[float] = ()) -> Scores | None:
+    """SSIM of the seeds that were run, at some frequencies (default: all that were asked); None if there are none."""
+    found = results.all(list(jobs))
+    if not found:
+        return None
+    return np.stack([result.at(list(ghz) or result.ghz) for result in found])
+
+
+def at_transmitters(results: Results, jobs: Sequence[Job], like: Job, ghz: Sequence[float] = ()) -> Scores | None:
+    """`scores` at the transmitters of another job: they must be among those that were scored."""
+    all_scores, other = scores(results, jobs, ghz), results.get(like)
+    if all_scores is None or other is None:
+        return None
+    known = results.all(list(jobs))[0].tx.tolist()
+    return all_scores[:, [known.index(tx) for tx in other.tx.tolist()]]
+
+
+def cell(value: float | None, paper: float | None = None, digits: int = 3) -> str:
+    """A figure, the paper's behind it in parentheses."""
+    own = NOT_RUN if value is None else f"{value:.{digits}f}"
+    return own if paper is None else f"{own} ({paper:.2f})"
+
+
+def median_cell(values: Scores | None, paper: float | None = None) -> str:
+    """Median over seeds of the average of medians."""
+    return cell(None if values is None else float(np.median(typical(values))), paper)
+
+
+def summary_cells(values: Scores | None, paper: float | None = None) -> list[str]:
+    """Median over seeds of the average of medians, its interval over transmitters, the seeds and their range."""
+    if values is None:
+        return [cell(None, paper), NOT_RUN, NOT_RUN]
+    found = estimate(values)
+    seeds = f"{len(found.seeds)}"
+    if len(found.seeds) > 1:
+        seeds += f": {min(found.seeds):.3f}-{max(found.seeds):.3f}"
+    return [cell(found.value, paper), f"{found.low:.3f}-{found.high:.3f}", seeds]
+
+
+SUMMARY = ("average (paper)", "95 %", "seeds")
+"""Headings of `summary_cells`."""
+
+
+@functools.cache
+def ceilings(scene: str) -> dict[float, float]:
+    """Frequency (GHz): the score of the best possible phase-blind predictor, from the scene file."""
+    rows = load_scene(released_scenes()[scene]).meta.get("ceilings", [])
+    return {float(row["frequency_ghz"]): float(row["phase_blind"]) for row in rows}
+
+
+def ceiling(scene: str, ghz: Sequence[float]) -> float | None:
+    """Their average over frequencies."""
+    known = ceilings(scene)
+    return float(np.mean([known[f] for f in ghz])) if known else None
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; the first column is left-aligned."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,165 @@
+"""Run one job: train its models, score them, and put the result together. What is done of a job is kept in its folder."""
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, settings
+from wbgs_jax import metrics
+from wbgs_jax.config import Settings, preset_settings
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.eval import environment
+from wbgs_jax.fields import get_field
+from wbgs_jax.files import atomic_write
+from wbgs_jax.inference import predict_spectra
+from wbgs_jax.references import references
+from wbgs_jax.runs import RunConfig
+from wbgs_jax.train import prepare_folder
+from wbgs_jax.trainer import train
+
+CURVE_POINTS = 200
+BLOCK = 256
+"""Spectra scored at a time."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one trained model of a job leaves."""
+
+    tx: Int[np.ndarray, "tx"]
+    ghz: Float[np.ndarray, "ghz"]
+    ssim: Float[np.ndarray, "tx ghz"]
+    psnr_db: Float[np.ndarray, "tx ghz"]
+    curve: Float[np.ndarray, "2 points"]
+    """Steps and training losses."""
+    sizes: Int[np.ndarray, "2"]
+    """Steps, and Gaussians at the end."""
+    seconds: Float[np.ndarray, "2"]
+    """Of training and of evaluation."""
+    pictures: UInt8[np.ndarray, "k 90 360"]
+
+
+def execute(job: Job, profile: str, folder: Path) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Train and score a job, or go on with it: its result, and its pictures (k, 90, 360) if they are kept."""
+    origin = {"profile": profile, "environment": environment()}
+    if job.field == REFERENCES:
+        return reference_scores(job) | origin, None
+    chosen = settings(job, PROFILES[profile])
+    parts = [part(job, profile, dataset, chosen, folder / name) for name, dataset in job.models()]
+    preset = PROFILES[profile].preset
+    changes = {"preset": preset, "settings": difference(chosen, preset_settings(preset, job.field), job.field)}
+    pictures = np.concatenate([p.pictures for p in parts]) if job.pictured else None
+    return merged(parts, chosen.optim.batch) | changes | origin, pictures
+
+
+def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path) -> Part:
+    """Train one model and score it, unless that is done."""
+    done = folder / "part.npz"
+    if done.exists():
+        with np.load(done) as archive:
+            return Part(**dict(archive))
+    config = RunConfig(job.scene, job.field, PROFILES[profile].preset, job.seed, None, chosen, job.train_ghz)
+    prepare_folder(folder, config, resume=True)
+    trained = train(dataset, job.field, chosen, job.seed, folder, resume=True)
+    begin = time.perf_counter()
+    predicted = predict_spectra(get_field(job.field), trained.params, dataset, dataset.test)
+    scores = score(dataset, predicted)
+    seconds = np.array([trained.seconds, time.perf_counter() - begin])
+    sizes = np.array([trained.steps, trained.gaussians])
+    shown = pictured(dataset) if job.pictured else np.zeros(0, int)
+    pictures = (np.clip(predicted[shown], 0, 1) * 255).round().astype(np.uint8)
+    result = Part(**scores, curve=curve(folder), sizes=sizes, seconds=seconds, pictures=pictures)
+    with atomic_write(done) as stream:
+        np.savez_compressed(stream, **{f.name: getattr(result, f.name) for f in dataclasses.fields(result)})
+    return result
+
+
+def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[str, np.ndarray]:
+    """SSIM and PSNR of the test spectra, by transmitter and frequency."""
+    test = dataset.test
+    ghz = np.unique(dataset.frequencies_hz[test]) / 1e9
+    tx = dataset.tx_index[test].reshape(-1, len(ghz))[:, 0]
+    ssim, psnr = np.zeros(len(test)), np.zeros(len(test))
+    for start in range(0, len(test), BLOCK):  # the truth of a whole scene is hundreds of megabytes
+        block = slice(start, start + BLOCK)
+        truth = np.asarray(dataset.pas(test[block]))
+        ssim[block], psnr[block] = metrics.ssim(predicted[block], truth), metrics.psnr_db(predicted[block], truth)
+    shape = (len(tx), len(ghz))
+    return {"tx": tx, "ghz": ghz, "ssim": ssim.reshape(shape), "psnr_db": psnr.reshape(shape)}
+
+
+def pictured(dataset: Dataset) -> Int[np.ndarray, "k"]:
+    """Places in `dataset.test` of the spectra that figure 4 shows: another held-out transmitter at every frequency."""
+    ghz, transmitters = dataset.frequencies_hz[dataset.test] / 1e9, dataset.tx_index[dataset.test]
+    shown = np.random.default_rng([0, 6]).permutation(np.unique(transmitters))[
+        np.arange(len(PICTURED_GHZ)) % len(set(transmitters))
+    ]
+    return np.concatenate(
+        [np.flatnonzero(np.isclose(ghz, f) & (transmitters == tx)) for f, tx in zip(PICTURED_GHZ, shown, strict=True)]
+    )
+
+
+def curve(folder: Path) -> Float[np.ndarray, "2 points"]:
+    """Steps and losses of a run, thinned to at most `CURVE_POINTS` by averaging neighbours."""
+    entries = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    points = np.array([(e["step"], e["loss"]) for e in entries if "loss" in e])
+    thin = -(-len(points) // CURVE_POINTS)
+    return np.array([block.mean(0) for block in np.split(points, range(thin, len(points), thin))]).T
+
+
+def merged(parts: list[Part], batch: int) -> dict[str, Any]:
+    """The result of a job from those of its models."""
+    ssim = {f"{f:g}": p.ssim[:, i] for p in parts for i, f in enumerate(p.ghz)}
+    psnr = {f"{f:g}": float(np.median(p.psnr_db[:, i])) for p in parts for i, f in enumerate(p.ghz)}
+    everything = np.concatenate(list(ssim.values()))
+    steps, loss = np.mean([p.curve for p in parts], 0)
+    n_steps = sum(int(p.sizes[0]) for p in parts)
+    return {
+        "models": len(parts),
+        "median_ssim": rounded(np.median(everything)),
+        "mean_ssim": rounded(everything.mean()),
+        "average_of_medians": rounded(np.mean([np.median(values) for values in ssim.values()])),
+        "psnr_db": {name: round(value, 2) for name, value in psnr.items()},
+        "tx": parts[0].tx.tolist(),
+        "ssim": {name: rounded(values) for name, values in ssim.items()},
+        "curve": {"step": np.round(steps).astype(int).tolist(), "loss": rounded(loss)},
+        "steps": n_steps,
+        "samples": n_steps * batch,
+        "gaussians": round(float(np.mean([p.sizes[1] for p in parts]))),
+        "training_seconds": round(sum(float(p.seconds[0]) for p in parts), 1),
+        "evaluation_seconds": round(sum(float(p.seconds[1]) for p in parts), 1),
+    }
+
+
+def reference_scores(job: Job) -> dict[str, Any]:
+    """Median SSIM by frequency of the predictors that learn nothing."""
+    dataset = job.dataset()
+    begin = time.perf_counter()
+    scores = {}
+    for name, predictor in references(dataset).items():
+        values = score(dataset, predictor(dataset.test))
+        medians = np.median(values["ssim"], 0)
+        scores[name] = {f"{f:g}": rounded(m) for f, m in zip(values["ghz"], medians, strict=True)}
+    return {"references": scores, "evaluation_seconds": round(time.perf_counter() - begin, 1)}
+
+
+def difference(chosen: Settings, base: Settings, field: str) -> dict[str, Any]:
+    """A field's settings that are not the preset's."""
+    pairs = [
+        (f"{section}.{name}", value, getattr(getattr(base, section), name))
+        for section, values in dataclasses.asdict(chosen).items()
+        if section in (field, "optim", "density", "loop")
+        for name, value in values.items()
+    ]
+    return {name: value for name, value, other in pairs if value != other}
+
+
+def rounded(values: Any) -> Any:
+    """Four digits, as plain numbers."""
+    return np.round(values, 4).tolist()

@@ -1,0 +1,91 @@
+"""Result files: written by the runner, read by the tables. One small JSON a job, with where it comes from."""
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+
+from experiments.jobs import PICTURED_GHZ, Job
+from wbgs_jax.files import atomic_write, read_json
+
+FOLDER = Path(__file__).parent / "results"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is known of a job that was run."""
+
+    values: dict[str, Any]
+
+    @cached_property
+    def ghz(self) -> list[float]:
+        """Frequencies that were asked for, ascending."""
+        return [float(f) for f in self.values["ssim"]]
+
+    @cached_property
+    def tx(self) -> Int[np.ndarray, "tx"]:
+        """Transmitters that were scored."""
+        return np.array(self.values["tx"])
+
+    @cached_property
+    def ssim(self) -> Float[np.ndarray, "tx ghz"]:
+        """Of every scored spectrum."""
+        return np.array(list(self.values["ssim"].values())).T
+
+    def at(self, ghz: tuple[float, ...] | list[float]) -> Float[np.ndarray, "tx ghz"]:
+        """SSIM at some of the frequencies."""
+        return self.ssim[:, [self.ghz.index(float(f)) for f in ghz]]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of a profile."""
+
+    profile: str
+    folder: Path = FOLDER
+
+    def path(self, job: Job) -> Path:
+        """Where a job's result is or will be."""
+        return self.folder / self.profile / f"{job.name}.json"
+
+    def pictures_path(self, job: Job) -> Path:
+        """Where its pictures are."""
+        return self.path(job).with_suffix(".png")
+
+    def get(self, job: Job) -> Result | None:
+        """A job's result; None if it has not been run yet."""
+        path = self.path(job)
+        return Result(read_json(path)) if path.exists() else None
+
+    def all(self, jobs: list[Job]) -> list[Result]:
+        """Those that there are."""
+        return [result for result in map(self.get, jobs) if result is not None]
+
+    def pictures(self, job: Job) -> UInt8[np.ndarray, "k 90 360"] | None:
+        """The kept pictures, one for each of `PICTURED_GHZ`."""
+        path = self.pictures_path(job)
+        if not path.exists():
+            return None
+        with Image.open(path) as image:
+            return np.asarray(image).reshape(len(PICTURED_GHZ), -1, image.width)
+
+    def write(self, job: Job, values: dict[str, Any], pictures: UInt8[np.ndarray, "k 90 360"] | None = None) -> None:
+        """Keep a result; the JSON is written last, so that it stands for everything."""
+        if pictures is not None:
+            with atomic_write(self.pictures_path(job)) as stream:
+                Image.fromarray(pictures.reshape(-1, pictures.shape[-1])).save(stream, format="png", optimize=True)
+        text = json.dumps({"job": dataclasses.asdict(job)} | values, indent=2, allow_nan=False)
+        with atomic_write(self.path(job)) as stream:
+            stream.write((one_line_lists(text) + "\n").encode())
+
+
+def one_line_lists(text: str) -> str:
+    """Indented JSON with lists of plain values on one line each: a tenth of the size, and a line a frequency in a diff."""
+    return re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]).replace("[ ", "[").replace(" ]", "]"), text)

@@ -1,0 +1,229 @@
+"""Run what the tables and figures need: `python -m experiments.runner --profile quick [--only table1] [--minutes 9]`.
+
+Jobs come in the order of importance: every experiment's first seed, then further ones. What is done is skipped, what was cut
+goes on where it stopped, however it was cut; runners side by side never do the same job. `make tables` shows the results.
+"""
+
+import contextlib
+import fcntl
+import shutil
+import signal
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import jax
+import tyro
+
+from experiments.execute import execute
+from experiments.jobs import DENSE_SCENE, PROFILES, Job
+from experiments.results import FOLDER, Results
+from experiments.tables import EXPERIMENTS
+from wbgs_jax.compilation import use_compilation_cache
+from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.trainer import Interrupted
+
+RUNS = Path("runs/experiments")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Run the experiments that have no result yet."""
+
+    profile: Literal["quick", "paper", "smoke"] = "quick"
+    """quick: two CPU cores, hours. paper: full size, a GPU. smoke: minutes, proves that everything works."""
+    only: tuple[str, ...] = ()
+    """Experiments (table1, figure7, ...); all by default."""
+    scenes: tuple[str, ...] = ()
+    """Scenes (1, 2, ..., 1_21f); all by default."""
+    seeds: tuple[int, ...] = ()
+    """Seeds; all by default."""
+    fields: tuple[str, ...] = ()
+    """Fields (wideband, wrfgs, wave, references, ...); all by default."""
+    minutes: float | None = None
+    """Stop after this time; what is cut goes on the next time."""
+    dry_run: bool = False
+    """List the jobs and what is known of them."""
+    results: Path = FOLDER
+    runs: Path = RUNS
+    """Where unfinished runs are kept."""
+
+
+class TimeIsUp(UserError):
+    """The time limit, outside a training (inside one it is `Interrupted`)."""
+
+
+class Clock:
+    """A time limit, and what a signal that ends the runner does: within a training it is saved first."""
+
+    def __init__(self, minutes: float | None):
+        self.minutes, self.expired = minutes, False
+
+    def _alarm(self, number: int, frame: object) -> None:
+        self.expired = True
+        signal.raise_signal(signal.SIGTERM)  # a training defers it to the end of its epoch and saves
+
+    def _terminate(self, number: int, frame: object) -> None:
+        raise TimeIsUp("stopped by a signal")
+
+    def __enter__(self) -> "Clock":
+        self.previous = {
+            signal.SIGALRM: signal.signal(signal.SIGALRM, self._alarm),
+            signal.SIGTERM: signal.signal(signal.SIGTERM, self._terminate),
+        }
+        if self.minutes is not None:
+            signal.setitimer(signal.ITIMER_REAL, max(60 * self.minutes, 1e-3))
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
+
+
+def all_jobs(names: tuple[str, ...] = ()) -> list[Job]:
+    """The jobs of some experiments (all by default), each once, first seeds first."""
+    if unknown := [name for name in names if name not in EXPERIMENTS]:
+        raise UserError(f"there is no experiment {unknown[0]!r}; choose among: {', '.join(EXPERIMENTS)}")
+    jobs = dict.fromkeys(job for name in names or EXPERIMENTS for job in EXPERIMENTS[name].jobs())
+    return sorted(jobs, key=lambda job: job.seed)
+
+
+def chosen_jobs(command: Command) -> list[Job]:
+    """What a command line asks for."""
+    jobs = all_jobs(command.only)
+    for name, wanted in (("scene", command.scenes), ("seed", command.seeds), ("field", command.fields)):
+        jobs = [job for job in jobs if not wanted or getattr(job, name) in wanted]
+    if not jobs:
+        raise UserError("no job fits this choice; see `python -m experiments.runner --dry-run`")
+    return jobs
+
+
+@contextlib.contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Whether this process, and no other, has the job. The kernel frees a lock when its process is gone, however it went."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+            return
+        yield True
+
+
+class Durations:
+    """How long jobs take, learned from those that are done."""
+
+    def __init__(self, results: Results, jobs: list[Job]):
+        self.known: dict[tuple, list[float]] = {}
+        for job in jobs:
+            if result := results.get(job):
+                seconds = result.values.get("training_seconds", 0) + result.values["evaluation_seconds"]
+                self.known.setdefault(self.kind(job), []).append(seconds)
+
+    @staticmethod
+    def kind(job: Job) -> tuple:
+        """Jobs of a kind take about as long."""
+        return job.field, job.variant == "long", job.scene == DENSE_SCENE and not job.combination, job.all_tx
+
+    def expect(self, job: Job) -> float | None:
+        """Seconds; None if no such job is done."""
+        known = self.known.get(self.kind(job)) or [
+            s for kind, all_s in self.known.items() if kind[0] == job.field for s in all_s
+        ]
+        return statistics.median(known) if known else None
+
+    def left(self, jobs: list[Job]) -> str:
+        """Time left, for people."""
+        times = [self.expect(job) for job in jobs]
+        hours = sum(t for t in times if t is not None) / 3600
+        unknown = sum(t is None for t in times)
+        return f"{len(jobs)} left, about {hours:.1f} h" + (f" and {unknown} of unknown length" if unknown else "")
+
+
+def run_job(job: Job, command: Command, results: Results) -> str:
+    """Run one job unless it is done or another process has it; says what became of it."""
+    folder = command.runs / command.profile / job.name
+    with claimed(command.runs / command.profile / "locks" / job.name) as mine:
+        if not mine:
+            return "another process has it"
+        if results.get(job):
+            return "done meanwhile"
+        begin = time.perf_counter()
+        values, pictures = execute(job, command.profile, folder)
+        results.write(job, values, pictures)
+        shutil.rmtree(folder, ignore_errors=True)
+        jax.clear_caches()  # otherwise every job's compiled programs stay in memory
+        score = f"SSIM {values['average_of_medians']:.3f}, " if "average_of_medians" in values else ""
+        return f"{score}{time.perf_counter() - begin:.0f} s"
+
+
+def run(jobs: list[Job], command: Command) -> list[str]:
+    """Run jobs in order until they are done or the time is up; returns one line for every job that failed."""
+    results = Results(command.profile, command.results)
+    open_jobs = [job for job in jobs if results.get(job) is None]
+    say(f"{len(jobs)} jobs: {Durations(results, jobs).left(open_jobs)}")
+    failures = []
+    with Clock(command.minutes) as clock:
+        for i, job in enumerate(open_jobs):
+            try:
+                say(f"{job.name} ...")
+                say(f"{job.name}: {run_job(job, command, results)}; {Durations(results, jobs).left(open_jobs[i + 1 :])}")
+                if clock.expired:
+                    raise TimeIsUp("the time is up")
+            except (Interrupted, TimeIsUp):
+                if not clock.expired:
+                    raise
+                say("the time is up: run the same command again to go on")
+                break
+            except Exception as error:  # whatever it is, the other jobs are worth running
+                failures.append(f"{job.name}: {one_line(error)}")
+                say(f"{failures[-1]}")
+    return failures
+
+
+def one_line(error: Exception) -> str:
+    """An error for people; of a mistake in the code, its kind too."""
+    text = (str(error).splitlines() or [""])[0]
+    return text if isinstance(error, UserError) else f"{type(error).__name__}: {text}"
+
+
+def listing(jobs: list[Job], command: Command) -> str:
+    """One line a job: done, begun or open, and the time it takes."""
+    results = Results(command.profile, command.results)
+    durations = Durations(results, jobs)
+    lines = []
+    for job in jobs:
+        begun = (command.runs / command.profile / job.name).exists()
+        state = "done" if results.get(job) else "begun" if begun else "open"
+        seconds = durations.expect(job)
+        lines.append(f"{state:6} {'?' if seconds is None else f'{seconds:.0f}':>6} s  {job.name}")
+    open_jobs = [job for job in jobs if results.get(job) is None]
+    return "\n".join([*lines, f"{len(jobs)} jobs: {durations.left(open_jobs)}"])
+
+
+def say(line: str) -> None:
+    """A line for people, on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m experiments.runner")
+    assert command.profile in PROFILES
+    jobs = chosen_jobs(command)
+    if command.dry_run:
+        print(listing(jobs, command))
+        return
+    use_compilation_cache()
+    if failures := run(jobs, command):
+        raise UserError(f"{len(failures)} of {len(jobs)} jobs failed: " + "; ".join(failures))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,43 @@
+"""Table 1: six scenes at ten frequencies, one field for all of them against a WRF-GS model for each."""
+
+from experiments.cells import NAMES, SUMMARY, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.jobs import REFERENCES, SEEDS, Job
+from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
+from experiments.results import Results
+
+TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"
+MODELS = (("wideband", ""), ("wrfgs", ""), ("wrfgs", "long"), ("wave", ""))
+
+
+def jobs() -> list[Job]:
+    """Ours, the two budgets of WRF-GS, the coherent field and what learns nothing."""
+    headline = [job for seed in SEEDS for scene in SCENES for job in (jobs_of(scene, *m)[seed] for m in MODELS[:3])]
+    return headline + [Job(scene, field) for scene in SCENES for field in ("wave", REFERENCES)]
+
+
+def jobs_of(scene: str, field: str, variant: str = "") -> list[Job]:
+    """One row of the table: a job a seed."""
+    seeds = SEEDS if field != "wave" else SEEDS[:1]
+    return [Job(scene, field, variant=variant, seed=seed) for seed in seeds]
+
+
+def render(results: Results) -> str:
+    """A table a scene."""
+    note = (
+        "Median SSIM by frequency (GHz); in parentheses the paper's. 95 %: bootstrap interval of the average over the scene's"
+        " held-out transmitters; seeds: how many, and the range of their averages."
+    )
+    return "\n\n".join([note, *(scene_table(results, scene) for scene in SCENES)])
+
+
+def scene_table(results: Results, scene: str) -> str:
+    """One scene: a row a model, the ceiling below."""
+    rows = []
+    for field, variant in MODELS:
+        jobs, paper = jobs_of(scene, field, variant), TABLE_1[scene].get(field)
+        each = [median_cell(scores(results, jobs, [f]), paper[i] if paper else None) for i, f in enumerate(GHZ_10)]
+        average = summary_cells(scores(results, jobs, GHZ_10), TABLE_1_AVERAGE[scene].get(field))
+        rows.append([NAMES[field, variant], *each, *average])
+    best = [cell(ceiling(scene, [f])) for f in (*GHZ_10,)] + [cell(ceiling(scene, GHZ_10)), "", ""]
+    rows.append(["phase-blind ceiling", *best])
+    return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)
