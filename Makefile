@@ -1,4 +1,5 @@
-# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PYTHON for set-up.
+# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
+# `make experiments`; PYTHON for set-up.
 SCENE  ?= 1
 FIELD  ?= wideband
 PRESET ?= $(if $(CUDA),gpu,cpu)
@@ -6,6 +7,8 @@ DATA   ?=
 OUT    ?=
 SEED   ?= 0
 ARGS   ?=
+PROFILE ?= quick
+MINUTES ?=
 PYTHON ?= python3
 
 VENV   := .venv
@@ -16,7 +19,7 @@ SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
 NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCENE)),$(notdir $(basename $(SCENE))),scene$(SCENE)))
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval test simulator data lint typecheck bench clean
+.PHONY: help setup train eval test simulator data lint typecheck bench experiments tables clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -62,6 +65,12 @@ typecheck: setup  ## mypy
 
 bench: setup  ## measure this machine, compare: make bench [GATE=1 to fail on a regression] [ARGS="--only renderer --update"]
 	$(PY) -m experiments.bench $(if $(filter-out 0,$(GATE)),--gate) $(ARGS)
+
+experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE=quick|paper MINUTES=60 ARGS="--only table1"]
+	$(PY) -m experiments.runner --profile $(PROFILE) $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)
+
+tables: setup  ## write docs/results.md from the results that there are: make tables [PROFILE=]
+	$(PY) -m experiments.tables --profile $(PROFILE)
 
 clean:  ## remove caches; runs, data and .venv stay
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist

@@ -1,7 +1,16 @@
 """Figure 7: scene 1 at 21 frequencies, one field for all of them against a WRF-GS model for each."""
 
+from pathlib import Path
+
+import numpy as np
+from matplotlib import pyplot as plt
+
+from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
 from experiments.jobs import REFERENCES, SEEDS, Job
-from experiments.paper import DENSE_SCENE
+from experiments.paper import DENSE_SCENE, FIGURE_7_AVERAGE, FIGURE_7_GAIN, FIGURE_7_POINTS, GHZ_21
+from experiments.plots import STYLES, save
+from experiments.results import Results
+from experiments.statistics import compare, typical
 
 TITLE = "Figure 7: scene 1 at 21 frequencies"
 MODELS = (("wideband", ""), ("wrfgs", ""), ("wrfgs", "long"), ("wave", ""))
@@ -16,3 +25,59 @@ def jobs_of(field: str, variant: str = "") -> list[Job]:
     """One curve: a job a seed; the costly ones have one."""
     seeds = SEEDS if (field, variant) in MODELS[:2] else SEEDS[:1]
     return [Job(DENSE_SCENE, field, variant=variant, seed=seed) for seed in seeds]
+
+
+def render(results: Results, images: Path) -> str:
+    """Curves, and the numbers below."""
+    values = {model: scores(results, jobs_of(*model), GHZ_21) for model in MODELS}
+    summary = [
+        [NAMES[m], *summary_cells(v, FIGURE_7_AVERAGE.get(m[0])), *gain_cells(values["wideband", ""], v, m)]
+        for m, v in values.items()
+    ]
+    summary.append(["phase-blind ceiling", cell(ceiling(DENSE_SCENE, GHZ_21)), "", "", "", "", ""])
+    head = ["model", "average (paper)", "95 %", "seeds", "ours above it (paper)", "better at", "p"]
+    parts = [markdown(head, summary), by_frequency(values)]
+    if any(v is not None for v in values.values()):
+        parts.insert(0, save(draw(values), images, "figure7", "median SSIM of scene 1 at 21 frequencies"))
+    return "\n\n".join(parts)
+
+
+def gain_cells(ours: Scores | None, theirs: Scores | None, model: tuple[str, str]) -> list[str]:
+    """The wideband field's relative gain over a WRF-GS row, with a paired test over transmitters."""
+    if model[0] != "wrfgs":
+        return ["", "", ""]
+    paper = f"({100 * FIGURE_7_GAIN:+.1f} %)"
+    if ours is None or theirs is None:
+        return [f"{NOT_RUN} {paper}", NOT_RUN, NOT_RUN]
+    gain, test = np.median(typical(ours)) / np.median(typical(theirs)) - 1, compare(ours, theirs)
+    return [f"{100 * gain:+.1f} % {paper}", f"{100 * test.share:.0f} % of {test.transmitters}", f"{test.p:.1e}"]
+
+
+def by_frequency(values: dict[tuple[str, str], Scores | None]) -> str:
+    """A row a frequency."""
+    rows = []
+    for i, ghz in enumerate(GHZ_21):
+        paper = FIGURE_7_POINTS.get(ghz, {})
+        cells = [median_cell(None if v is None else v[..., i : i + 1], paper.get(m[0])) for m, v in values.items()]
+        rows.append([f"{ghz:g}", *cells, cell(ceiling(DENSE_SCENE, [ghz]))])
+    return markdown(["GHz", *(NAMES[m] for m in values), "ceiling"], rows)
+
+
+def draw(values: dict[tuple[str, str], Scores | None]) -> plt.Figure:
+    """Median SSIM over frequency, the band between the seeds, the paper's averages and the ceiling."""
+    figure, axis = plt.subplots(figsize=(8.5, 4.2), layout="constrained")
+    for model, v in values.items():
+        if v is not None:
+            seeds = np.median(v, 1)
+            axis.plot(GHZ_21, np.median(seeds, 0), label=NAMES[model], **STYLES[model])
+            axis.fill_between(GHZ_21, seeds.min(0), seeds.max(0), color=STYLES[model]["color"], alpha=0.2, lw=0)
+    best = [value for f in GHZ_21 if (value := ceiling(DENSE_SCENE, [f])) is not None]
+    if best:
+        axis.plot(GHZ_21, best, color="0.4", lw=1, ls=":", label="phase-blind ceiling")
+    for name, value in FIGURE_7_AVERAGE.items():
+        axis.axhline(value, color=STYLES[name, ""]["color"], lw=0.8, alpha=0.6)
+        axis.text(101, value, "paper", fontsize=7, va="center", color=STYLES[name, ""]["color"])
+    axis.set(xlabel="frequency [GHz]", ylabel="median SSIM", ylim=(0.4, 1))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, ncols=3, loc="lower center")
+    return figure

@@ -1,7 +1,16 @@
 """Figure 8: trained at some of 21 frequencies, asked at the others."""
 
+from pathlib import Path
+
+import numpy as np
+from matplotlib import pyplot as plt
+
+from experiments.cells import SUMMARY, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.figure7 import jobs_of as all_frequencies
 from experiments.jobs import SEEDS, Job
-from experiments.paper import DENSE_SCENE
+from experiments.paper import COMBINATIONS, DENSE_SCENE, FIGURE_8, GHZ_21
+from experiments.plots import save
+from experiments.results import Results
 
 TITLE = "Figure 8: unseen frequencies, combinations A-K of table 6 (scene 1)"
 LETTERS = "ABCDEFGHIJK"
@@ -27,3 +36,63 @@ def held_out() -> list[Job]:
 def wave(letter: str, all_tx: bool) -> Job:
     """The coherent field in the same place."""
     return Job(DENSE_SCENE, "wave", letter, all_tx=all_tx)
+
+
+def render(results: Results, images: Path) -> str:
+    """Bars, and the numbers below."""
+    values = {letter: scores(results, jobs_of(letter)) for letter in LETTERS}
+    full = scores(results, all_frequencies("wideband"))
+    rows = [row(letter, values[letter], full) for letter in LETTERS]
+    head = ["", "trained at (GHz)", *SUMMARY, "over frequencies", "held-out TX, trained on all", "ceiling"]
+    others = [
+        ["coherent, trained transmitters", *(median_cell(scores(results, [wave(letter, True)])) for letter in "DG")],
+        ["wideband, held-out transmitters", median_cell(scores(results, held_out())), ""],
+        ["coherent, held-out transmitters", *(median_cell(scores(results, [wave(letter, False)])) for letter in "DG")],
+    ]
+    note = (
+        "All transmitters train, as in the paper, and the scores are at frequencies that have not trained. Over frequencies:"
+        " lowest and highest median. Beside it the field that trained on all 21 frequencies, asked for held-out transmitters at"
+        " the same ones: what a new frequency costs against what a new place costs."
+    )
+    parts = [note, markdown(head, rows), "The same unseen frequencies otherwise:", markdown(["field", "D", "G"], others)]
+    if any(v is not None for v in values.values()):
+        parts.insert(0, save(draw(values), images, "figure8", "median SSIM at unseen frequencies, combinations A to K"))
+    return "\n\n".join(parts)
+
+
+def row(letter: str, values: Scores | None, full: Scores | None) -> list[str]:
+    """One combination, and the field that has seen everything at the same frequencies."""
+    trained, unseen = COMBINATIONS[letter], unseen_ghz(letter)
+    among = [GHZ_21.index(round(f)) for f in unseen]
+    text = ", ".join(f"{f:g}" for f in trained) if len(trained) < 12 else f"all but {', '.join(f'{f:g}' for f in unseen)}"
+    spread = ""
+    if values is not None:
+        by_frequency = np.median(np.median(values, 1), 0)
+        spread = f"{by_frequency.min():.3f}-{by_frequency.max():.3f}"
+    summary = summary_cells(values, FIGURE_8.get(letter))
+    seen = median_cell(None if full is None else full[..., among])
+    return [letter, text, *summary, spread, seen, cell(ceiling(DENSE_SCENE, unseen))]
+
+
+def unseen_ghz(letter: str) -> list[float]:
+    """The test frequencies of a combination."""
+    return [float(f) for f in GHZ_21 if f not in COMBINATIONS[letter]]
+
+
+def draw(values: dict[str, Scores | None]) -> plt.Figure:
+    """A bar a combination, a dot a frequency, the paper's value where its text gives one."""
+    figure, axis = plt.subplots(figsize=(8.5, 3.8), layout="constrained")
+    for i, (letter, v) in enumerate(values.items()):
+        if v is None:
+            axis.text(i, 0.42, "not run yet", rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
+        else:
+            by_frequency = np.median(np.median(v, 1), 0)
+            axis.bar(i, by_frequency.mean(), color="C0", alpha=0.45, width=0.65, label="average" if letter == "D" else None)
+            axis.plot([i] * len(by_frequency), by_frequency, ".", color="C0", ms=4)
+        if letter in FIGURE_8:
+            label = "paper" if letter == "D" else None
+            axis.plot([i - 0.33, i + 0.33], [FIGURE_8[letter]] * 2, color="C3", lw=1.5, label=label)
+    axis.set(xticks=range(len(values)), xticklabels=list(values), ylabel="median SSIM", ylim=(0.4, 1))
+    axis.grid(axis="y", alpha=0.3)
+    axis.legend(fontsize=8)
+    return figure

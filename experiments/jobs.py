@@ -18,7 +18,7 @@ from wbgs_jax.data.splits import select_frequencies, unseen_frequencies
 
 SEEDS = (0, 1, 2)
 """Of the headline rows."""
-ONE_FREQUENCY = ("wrfgs", "nerf2")
+ONE_FREQUENCY = ("wrfgs",)
 """Fields that know one frequency: a model for each, all of them one job."""
 REFERENCES = "references"
 """In the place of a field: the predictors that learn nothing."""

@@ -22,7 +22,7 @@ import tyro
 from experiments.execute import execute
 from experiments.jobs import DENSE_SCENE, PROFILES, Job
 from experiments.results import FOLDER, Results
-from experiments.tables import EXPERIMENTS
+from experiments.tables import EXPERIMENTS, unique_jobs
 from wbgs_jax.compilation import use_compilation_cache
 from wbgs_jax.errors import UserError, run_command
 from wbgs_jax.trainer import Interrupted
@@ -89,8 +89,8 @@ def all_jobs(names: tuple[str, ...] = ()) -> list[Job]:
     """The jobs of some experiments (all by default), each once, first seeds first."""
     if unknown := [name for name in names if name not in EXPERIMENTS]:
         raise UserError(f"there is no experiment {unknown[0]!r}; choose among: {', '.join(EXPERIMENTS)}")
-    jobs = dict.fromkeys(job for name in names or EXPERIMENTS for job in EXPERIMENTS[name].jobs())
-    return sorted(jobs, key=lambda job: job.seed)
+    jobs = unique_jobs(names)
+    return sorted(jobs, key=lambda job: (job.seed > 0 and job.variant == "long", job.seed))  # the longest repetitions last
 
 
 def chosen_jobs(command: Command) -> list[Job]:

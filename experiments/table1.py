@@ -1,5 +1,7 @@
 """Table 1: six scenes at ten frequencies, one field for all of them against a WRF-GS model for each."""
 
+from pathlib import Path
+
 from experiments.cells import NAMES, SUMMARY, ceiling, cell, markdown, median_cell, scores, summary_cells
 from experiments.jobs import REFERENCES, SEEDS, Job
 from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
@@ -21,7 +23,7 @@ def jobs_of(scene: str, field: str, variant: str = "") -> list[Job]:
     return [Job(scene, field, variant=variant, seed=seed) for seed in seeds]
 
 
-def render(results: Results) -> str:
+def render(results: Results, images: Path) -> str:
     """A table a scene."""
     note = (
         "Median SSIM by frequency (GHz); in parentheses the paper's. 95 %: bootstrap interval of the average over the scene's"
@@ -38,6 +40,6 @@ def scene_table(results: Results, scene: str) -> str:
         each = [median_cell(scores(results, jobs, [f]), paper[i] if paper else None) for i, f in enumerate(GHZ_10)]
         average = summary_cells(scores(results, jobs, GHZ_10), TABLE_1_AVERAGE[scene].get(field))
         rows.append([NAMES[field, variant], *each, *average])
-    best = [cell(ceiling(scene, [f])) for f in (*GHZ_10,)] + [cell(ceiling(scene, GHZ_10)), "", ""]
+    best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])
     return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)

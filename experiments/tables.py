@@ -1,8 +1,24 @@
-"""All tables and figures: `python -m experiments.tables`."""
+"""Every table and figure of the paper from the results that there are: `python -m experiments.tables [--profile quick]`.
 
+Writes docs/results.md (docs/results_<profile>.md for other profiles than quick) and its pictures. Nothing in it is typed
+in: what has not been run says so.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
+from typing import Literal
 
-from experiments import figure4, figure6, figure7, figure8, table1, table2, table3
+import tyro
+
+from experiments import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
+from experiments.jobs import PROFILES, Job, Profile
+from experiments.paper import GHZ_10
+from experiments.results import FOLDER, Results
+from wbgs_jax.errors import run_command
+from wbgs_jax.files import atomic_write
 
 EXPERIMENTS: dict[str, ModuleType] = {
     # In the order of importance, for the runner.
@@ -13,4 +29,104 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "table3": table3,
     "figure8": figure8,
     "table2": table2,
+    "baselines": baselines,
 }
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = (headline, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
+"""In the order of the paper, for readers."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Write the page of results."""
+
+    profile: Literal["quick", "paper", "smoke"] = "quick"
+    results: Path = FOLDER
+    docs: Path = DOCS
+
+
+def unique_jobs(names: Sequence[str] = ()) -> list[Job]:
+    """The jobs of some experiments (all by default), each once."""
+    return list(dict.fromkeys(job for name in names or EXPERIMENTS for job in EXPERIMENTS[name].jobs()))
+
+
+def page(results: Results, images: Path) -> str:
+    """The whole document."""
+    parts = ["# Results", introduction(results.profile), provenance(results)]
+    for module in PAGES:
+        parts += [f"## {module.TITLE}", module.render(results, images)]
+    return "\n\n".join(parts) + "\n"
+
+
+def introduction(name: str) -> str:
+    """What is compared, with which effort, and how to run it again."""
+    profile = PROFILES[name]
+    return f"""The tables and figures of [*Wideband RF Radiance Field Modeling Using Frequency-embedded 3D Gaussian
+Splatting*](https://arxiv.org/abs/2505.20714), run again on [this repository's data](dataset.md). A model is trained on spectra
+of one scene and asked for spectra at transmitter positions, or frequencies, that it has not seen. Scores are median SSIM
+(scikit-image, 7 x 7 window). **In parentheses stands the paper's value**, where it gives one. The paper's scenes are not
+published and the data here are others, traced with exact physics: compare orders and ratios, not single values.
+
+* **wideband (ours)**: the paper's field; one model for all frequencies of a scene.
+* **coherent (ours)**: the [coherent field](wave.md), which knows the mesh's facets and learns materials; one model for all
+  frequencies.
+* **WRF-GS**: the state of the art that the paper compares with, a splatting field without frequency; *one model for every
+  frequency*. "Equal samples": all models of a scene together see as many spectra as ours does.
+  "Long": {long_budget(profile)}.
+* **NeRF2-style**: a volume marched along rays, with the frequency as an input.
+* **Predictors that learn nothing**, and the **phase-blind ceiling**: the score of the best possible predictor that knows every
+  path but not its phase ([dataset card](dataset.md)).
+
+Effort (profile `{name}`): {profile_text(profile)}.
+Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples. Where
+several seeds were run a value is their median. All models of a scene train and are tested on the same transmitters.
+
+```
+make experiments PROFILE={name}    # runs what is missing, goes on where it was cut; MINUTES=60 sets a limit
+make tables PROFILE={name}         # writes this page
+python -m experiments.runner --profile {name} --only table1 --scenes 1 4 --dry-run
+```"""
+
+
+def profile_text(profile: Profile) -> str:
+    """The size of a profile in words."""
+    gaussians = profile.changes.get("wideband", {}).get("gaussians")
+    size = f"the `{profile.preset}` preset" + (f" with {gaussians:,} Gaussians at the start" if gaussians else "")
+    return f"{size}, {profile.steps:,} steps (the coherent field {profile.wave_steps:,})"
+
+
+def long_budget(profile: Profile) -> str:
+    """How long the long variant trains."""
+    times = len(GHZ_10) * profile.long_steps / profile.steps
+    return f"{profile.long_steps:,} steps for every frequency, at ten frequencies {times:.1f} times our samples in total"
+
+
+def provenance(results: Results) -> str:
+    """How much has been run, where, with which code."""
+    jobs = unique_jobs()
+    found = results.all(jobs)
+    if not found:
+        return f"**None of the {len(jobs)} jobs has been run yet.**"
+    seconds = sum(r.values.get("training_seconds", 0) + r.values["evaluation_seconds"] for r in found)
+    where = Counter((r.values["environment"]["device"], r.values["environment"]["jax"]) for r in found)
+    devices = "; ".join(f"{count} on {device} (JAX {jax})" for (device, jax), count in where.most_common())
+    commits = sorted({str(r.values["environment"]["commit"]) for r in found})
+    return (
+        f"{len(found)} of {len(jobs)} jobs have been run ({devices}; {seconds / 3600:.1f} hours of training and evaluation;"
+        f" code {', '.join(f'`{c}`' for c in commits)}). Each is a file in `experiments/results/{results.profile}/`, with its"
+        " settings."
+    )
+
+
+def main() -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m experiments.tables")
+    name = "results.md" if command.profile == "quick" else f"results_{command.profile}.md"
+    text = page(Results(command.profile, command.results), command.docs / "images")
+    with atomic_write(command.docs / name) as stream:
+        stream.write(text.encode())
+    print(command.docs / name)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,69 @@
+"""Table 1's scenes beside what learns nothing, and beside a NeRF2-style volume."""
+
+from pathlib import Path
+
+import numpy as np
+
+from experiments import table1
+from experiments.cells import NAMES, NOT_RUN, at_transmitters, ceiling, cell, markdown, median_cell, scores
+from experiments.jobs import REFERENCES, SCORED, Job
+from experiments.paper import GHZ_10, SCENES
+from experiments.results import Results
+from experiments.statistics import compare
+
+TITLE = "Baselines"
+NAMES_OF_REFERENCES = ("mean_image", "nearest_tx", "inverse_distance", "line_of_sight")
+
+
+def jobs() -> list[Job]:
+    """The volume in every scene, and the references."""
+    return [Job(scene, "nerf2") for scene in SCENES] + [Job(scene, REFERENCES) for scene in SCENES]
+
+
+def reference_average(results: Results, job: Job, name: str) -> float | None:
+    """A reference's average over frequencies of the median SSIM."""
+    result = results.get(job)
+    return None if result is None else float(np.mean(list(result.values["references"][name].values())))
+
+
+def render(results: Results, images: Path) -> str:
+    """Two tables: without learning, and the volume on the transmitters it was asked for."""
+    return "\n\n".join([without_learning(results), volume(results)])
+
+
+def without_learning(results: Results) -> str:
+    """Averages over ten frequencies."""
+    rows = []
+    for scene in SCENES:
+        fields = [median_cell(scores(results, table1.jobs_of(scene, field), GHZ_10)) for field in ("wideband", "wave")]
+        others = [cell(reference_average(results, Job(scene, REFERENCES), name)) for name in NAMES_OF_REFERENCES]
+        rows.append([scene, *fields, *others, cell(ceiling(scene, GHZ_10))])
+    note = (
+        "Predictors that learn nothing, on all held-out transmitters: the mean of all training spectra, that of the nearest"
+        " training transmitter, their average weighted by 1/d², and the array's answer to the straight line. The phase-blind"
+        " ceiling knows every path but not its phase. Averages over ten frequencies of the median SSIM."
+    )
+    names = [name.replace("_", " ").replace("tx", "TX") for name in NAMES_OF_REFERENCES]
+    return note + "\n\n" + markdown(["scene", "wideband", "coherent", *names, "ceiling"], rows)
+
+
+def volume(results: Results) -> str:
+    """All models on the few transmitters that the slowest one was scored at, with a paired test of ours against it."""
+    models = (*table1.MODELS, ("nerf2", ""))
+    rows = []
+    for scene in SCENES:
+        slow = Job(scene, "nerf2")
+        jobs = {m: [slow] if m[0] == "nerf2" else table1.jobs_of(scene, *m) for m in models}
+        values = {m: at_transmitters(results, jobs[m], slow, GHZ_10) for m in models}
+        ours, theirs = values["wideband", ""], values["nerf2", ""]
+        test = [NOT_RUN, NOT_RUN]
+        if ours is not None and theirs is not None:
+            found = compare(ours, theirs)
+            test = [f"{100 * found.share:.0f} % of {found.transmitters}", f"{found.p:.1e}"]
+        rows.append([scene, *(median_cell(v) for v in values.values()), *test])
+    note = (
+        f"A NeRF2-style volume marches rays and is slow to ask: it is scored on {SCORED['nerf2']} of the held-out transmitters,"
+        " and here so are the others. It has the frequency as an input and sees as many spectra as ours."
+    )
+    head = ["scene", *(NAMES[m] for m in models), "ours better at", "p"]
+    return note + "\n\n" + markdown(head, rows)
