@@ -9,6 +9,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.encoding import FrequencyScale
 from wbgs_jax.errors import UserError
 from wbgs_jax.geometry import Projection
@@ -50,6 +51,33 @@ class WidebandConfig:
     """Frequency embedding of the radiance network (paper, Table 3)."""
     projection: Projection = "hemisphere"
     """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
+
+
+@dataclass(frozen=True)
+class Nerf2Config:
+    """The NeRF2-style volume (fields/nerf2.py)."""
+
+    samples: int = 24
+    """Samples of a ray between the receiver and the end of the scene's box."""
+    directions: int = 192
+    """Directions (pixels) of every spectrum that a training step looks at."""
+    width: int = 64
+    """Units of the attenuation network's layers (authors: 256)."""
+    depth: int = 4
+    """Layers of the attenuation network (authors: 8); the frequency enters the last one."""
+    skip: int = 2
+    """The layer at which the place enters again (authors: 4)."""
+    radiance_widths: tuple[int, ...] = (64, 32)
+    """Units of the radiance network's layers."""
+    point_octaves: int = 6
+    """Octaves of P(x) (authors: 10)."""
+    direction_octaves: int = 2
+    tx_octaves: int = 4
+    """Octaves of P(TX) (authors: 10)."""
+    frequency_octaves: int = 0
+    """Octaves of the frequency encoding, beyond its logarithm itself."""
+    relative: bool = True
+    """Also encode the TX relative to the place, the direction and the receiver array, as the wideband field does."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +127,8 @@ class OptimConfig:
     """Queries a step."""
     ssim_weight: float = 0.2
     """lambda of the paper's equation 5."""
+    pixel_loss: Literal["l1", "l2"] = "l1"
+    """Of a field that trains on some directions only, where there is no SSIM."""
     network_lr: float = 1e-3
     """Authors: 8e-4."""
     network_weight_decay: float = 0.0
@@ -169,6 +199,7 @@ class Settings:
     wideband: WidebandConfig = field(default_factory=WidebandConfig)
     wrfgs: WidebandConfig = field(default_factory=lambda: without_frequency(WidebandConfig()))
     """The wideband field without any frequency input, one model a frequency (fields/wrfgs.py)."""
+    nerf2: Nerf2Config = field(default_factory=Nerf2Config)
     wave: WaveConfig = field(default_factory=WaveConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
@@ -259,6 +290,7 @@ def check(settings: Settings) -> None:
         raise UserError(f"--optim.ssim-weight is {settings.optim.ssim_weight}; it must lie between 0 and 1")
     _check_splatting("wideband", settings.wideband)
     _check_splatting("wrfgs", settings.wrfgs)
+    _check_volume(settings.nerf2)
     if settings.wrfgs != without_frequency(settings.wrfgs):
         raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
 
@@ -277,5 +309,19 @@ def _check_splatting(name: str, config: WidebandConfig) -> None:
     if not 0 <= config.fusion < config.depth:
         raise UserError(f"--{name}.fusion is {config.fusion}; it is the number of a layer, 0 to {config.depth - 1}")
     for part in ("gaussian", "tx", "frequency"):
-        if getattr(config, f"{part}_octaves") < 0:
-            raise UserError(f"--{name}.{part}-octaves is negative; give 0 or more")
+        _check_octaves(name, config, part)
+
+
+def _check_volume(config: Nerf2Config) -> None:
+    counts = {name: getattr(config, name) for name in ("samples", "directions", "width", "depth")}
+    _check_positive({f"nerf2.{name}": n for name, n in counts.items()})
+    _check_positive({"nerf2.radiance-widths": min(config.radiance_widths, default=0)})
+    if config.directions > (pixels := PAS_HEIGHT * PAS_WIDTH):
+        raise UserError(f"--nerf2.directions is {config.directions}; a spectrum has {pixels} pixels")
+    for part in ("point", "direction", "tx", "frequency"):
+        _check_octaves("nerf2", config, part)
+
+
+def _check_octaves(name: str, config: Any, part: str) -> None:
+    if getattr(config, f"{part}_octaves") < 0:
+        raise UserError(f"--{name}.{part}-octaves is negative; give 0 or more")

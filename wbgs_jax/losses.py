@@ -1,6 +1,7 @@
 """Training losses on PAS images: L = (1 - lambda) L1 + lambda (1 - SSIM)  (paper, equation 5)."""
 
 import functools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -71,3 +72,9 @@ def image_loss(
     l1 = jnp.mean(jnp.abs(predicted - truth))
     similarity = jnp.mean(ssim(predicted, truth))
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity), similarity
+
+
+def pixel_loss(predicted: Float[Array, "*n"], truth: Float[Array, "*n"], kind: Literal["l1", "l2"]) -> Float[Array, ""]:
+    """Mean absolute or squared error, for pixels that make no image."""
+    error = predicted - truth
+    return jnp.mean(jnp.abs(error) if kind == "l1" else error**2)

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 
 
 class PartwiseDense(nn.Module):
-    """A dense layer on the concatenation of broadcastable parts, each of shape (N or 1, B or 1, features)."""
+    """A dense layer on the concatenation of broadcastable parts, each of shape (N or 1, B or 1, features), or of more axes."""
 
     features: int
 
     @nn.compact
-    def __call__(self, parts: Sequence[Float[Array, "_ _ _"]]) -> Float[Array, "n b features"]:
+    def __call__(self, parts: Sequence[Float[Array, "... _"]]) -> Float[Array, "... features"]:
         fan_in = sum(part.shape[-1] for part in parts)
         init = nn.initializers.normal(stddev=(2.0 / fan_in) ** 0.5)
         total = self.param("bias", nn.initializers.zeros_init(), (self.features,))
@@ -46,9 +46,9 @@ class AttenuationNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, gaussian: Sequence[Float[Array, "_ _ _"]], query: Sequence[Float[Array, "_ _ _"]]
-    ) -> tuple[Float[Array, "n b width"], Float[Array, "n b"]]:
-        hidden: list[Float[Array, "_ _ _"]] = []
+        self, gaussian: Sequence[Float[Array, "... _"]], query: Sequence[Float[Array, "... _"]]
+    ) -> tuple[Float[Array, "... width"], Float[Array, "..."]]:
+        hidden: list[Float[Array, "... _"]] = []
         for layer in range(self.depth):
             inputs = list(hidden)
             if layer in (0, self.skip):
@@ -67,14 +67,14 @@ class RadianceNetwork(nn.Module):
     widths: tuple[int, ...]
 
     @nn.compact
-    def __call__(self, parts: Sequence[Float[Array, "_ _ _"]]) -> Float[Array, "n b"]:
+    def __call__(self, parts: Sequence[Float[Array, "... _"]]) -> Float[Array, "..."]:
         hidden = nn.relu(PartwiseDense(self.widths[0])(parts))
         for width in self.widths[1:]:
             hidden = nn.relu(PartwiseDense(width)([hidden]))
         return nn.Dense(1, kernel_init=nn.initializers.normal(0.01))(hidden)[..., 0]
 
 
-def signal_activation(logits: Float[Array, "n b"]) -> Float[Array, "n b"]:
+def signal_activation(logits: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Sig > 0; the bias makes a zero logit a mid-grey image of the normalised spectra."""
     return jax.nn.softplus(logits - 1.0)
 

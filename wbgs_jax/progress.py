@@ -47,14 +47,21 @@ class TrainingProgress:
         self.bar.stop()
 
     def update(
-        self, step: int, loss: float, batch_ssim: float, gaussians: int, seconds: float, held_out_ssim: float | None = None
+        self,
+        step: int,
+        loss: float,
+        batch_ssim: float | None,
+        gaussians: int,
+        seconds: float,
+        held_out_ssim: float | None = None,
     ) -> None:
         """Show the state after a block of steps."""
         if held_out_ssim is not None:
             self.held_out = f"  held-out SSIM {held_out_ssim:.3f}"
         elapsed = max(time.monotonic() - self.started, 1e-9)
         rate = (step - self.start_step) / elapsed
-        status = f"loss {loss:.4f}  SSIM {batch_ssim:.3f}{self.held_out}  {gaussians} Gaussians  {rate:.1f} steps/s"
+        ssim = "" if batch_ssim is None else f"  SSIM {batch_ssim:.3f}"
+        status = f"loss {loss:.4f}{ssim}{self.held_out}  {gaussians} Gaussians  {rate:.1f} steps/s"
         self.bar.update(self.task, completed=step, status=status)
         if not self.console.is_terminal and (time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total):
             self.last_line = time.monotonic()

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Complex, Float, Int, UInt8
 from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH, cbf, normalise, pas_directions, steering_vector
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.fields import Field
-from wbgs_jax.losses import image_loss, snapshot_loss
+from wbgs_jax.fields import Field, SampledField
+from wbgs_jax.losses import image_loss, pixel_loss, snapshot_loss
 from wbgs_jax.pytree import pytree
 from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver
@@ -76,7 +76,7 @@ class EpochReport:
     loss: Float[Array, "k"]
     """NaN for steps that did not run or failed."""
     ssim: Float[Array, "k"]
-    """Mean SSIM of the batch (11x11 Gaussian window), as in the loss."""
+    """Mean SSIM of the batch (11x11 Gaussian window), as in the loss; NaN where only some pixels were looked at."""
     good_steps: Int[Array, ""]
     """Steps committed, counted from the epoch's start."""
     overflow: Bool[Array, ""]
@@ -121,13 +121,27 @@ def init_state(params: Any, optimizer: optax.GradientTransformation) -> TrainSta
 
 
 def loss_and_gradients(
-    field: Field, params: Any, data: TrainingData, index: Int[Array, "b"], capacity: Capacity | None, optim: OptimConfig
+    field: Field,
+    params: Any,
+    data: TrainingData,
+    index: Int[Array, "b"],
+    capacity: Capacity | None,
+    optim: OptimConfig,
+    step: Int[Array, ""] | int = 0,
 ):
-    """((loss, (ssim, jobs)), (d params, d means2d)) of one batch; jobs are None for a field that does not splat."""
+    """((loss, (ssim, jobs)), (d params, d means2d)) of one batch; jobs are None for a field that does not splat.
+
+    A field that looks at some directions only gets those that the number of the step draws; its SSIM is NaN.
+    """
     probe = jnp.zeros((gaussian_count(params), 2))
 
     def objective(params, probe):
         query = jax.tree.map(lambda a: a[index], data.query)
+        if isinstance(field, SampledField):
+            pixels = field.choose_pixels(params, jax.random.fold_in(jax.random.key(0), step))
+            truth = data.pas(index).reshape(len(index), -1)[:, pixels]
+            loss = pixel_loss(field.observe_pixels(params, data.receiver, query, pixels), truth, optim.pixel_loss)
+            return loss, (jnp.full((), jnp.nan), None)
         seen = field.observe(params, data.memory, data.receiver, query, data.tx_index[index], capacity, probe)
         loss, ssim = image_loss(seen.pas, data.pas(index), optim.ssim_weight)
         if seen.snapshots is not None and data.snapshots is not None:
@@ -164,7 +178,9 @@ def make_epoch(
         index, position = batch
 
         def run(state: TrainState):
-            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(field, state.params, data, index, capacity, optim)
+            (loss, (ssim, jobs)), (gradients, probe) = loss_and_gradients(
+                field, state.params, data, index, capacity, optim, state.step
+            )
             overflow, needed = jnp.zeros((), bool), jnp.zeros(2, jnp.int32)
             if jobs is not None:
                 overflow, needed = jobs.overflow, jnp.stack([jobs.required_entries, jobs.required_jobs])

@@ -25,7 +25,7 @@ from wbgs_jax.data.surface import make_mesh, make_surface
 from wbgs_jax.errors import UserError
 from wbgs_jax.fields import Field, get_field
 from wbgs_jax.files import atomic_write
-from wbgs_jax.inference import predict_spectra
+from wbgs_jax.inference import predict_spectra, scene_box
 from wbgs_jax.optim import make_optimizer
 from wbgs_jax.progress import TrainingProgress
 from wbgs_jax.splat import Capacity, fit_capacity
@@ -74,6 +74,10 @@ class Run:
         config, key = getattr(self.settings, self.field_name), jax.random.key(self.seed)
         if self.field.STARTS_FROM == "mesh":
             return init_state(self.field.init(key, make_mesh(self.dataset), config), self.optimizer), None
+        if self.field.STARTS_FROM == "box":
+            return init_state(
+                self.field.init(key, jnp.asarray(scene_box(self.dataset), jnp.float32), config), self.optimizer
+            ), None
         surface = make_surface(self.dataset, config.gaussians, self.seed, config.sampling)
         params = self.field.init(key, surface, config, density.capacity_bucket(len(surface.points)))
         jobs = self.field.plan(params, self.dataset.receiver).geometry.jobs
@@ -270,7 +274,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
             entry: dict[str, Any] = {
                 "step": run.step,
                 "loss": loss,
-                "batch_ssim": ssim,
+                "batch_ssim": None if np.isnan(ssim) else ssim,
                 "gaussians": run.alive,
                 "seconds": run.seconds,
             }

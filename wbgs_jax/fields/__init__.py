@@ -7,11 +7,16 @@ A field is a module of pure functions. What users of a trained field need:
 
 What training needs besides:
 
-    STARTS_FROM                        "points" (types.Surface) or "mesh" (types.Mesh)
+    STARTS_FROM                        "points" (types.Surface), "mesh" (types.Mesh) or "box" (2, 3)
     init(key, start, config, capacity) -> params  a pytree of floats; with `gaussians` if density control applies
     remember(params, receiver, tx)     -> memory  what can be computed once for all training steps, on the host
     observe(params, memory, ...)       -> Observation of the spectra of a batch
     sizes(params), skeleton(config, sizes)        the shapes of a checkpoint
+
+and of a field that is trained on some directions of every spectrum (`SampledField`), instead of `observe`,
+
+    choose_pixels(params, key)         -> pixels (r,)  which ones
+    observe_pixels(params, ...)        -> (b, r)
 
 Trainer, evaluation and experiments know nothing else about a model.
 """
@@ -22,19 +27,19 @@ from typing import Any, Literal, Protocol, cast, runtime_checkable
 from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax.errors import UserError
-from wbgs_jax.fields import wave, wideband, wrfgs
+from wbgs_jax.fields import nerf2, wave, wideband, wrfgs
 from wbgs_jax.fields.observation import Observation
 from wbgs_jax.splat import Capacity
 from wbgs_jax.types import Query, Receiver
 
-__all__ = ["FIELDS", "Field", "Observation", "get_field"]
+__all__ = ["FIELDS", "Field", "Observation", "SampledField", "get_field"]
 
 
 @runtime_checkable
 class Field(Protocol):
     """The seam between models and everything else."""
 
-    STARTS_FROM: Literal["points", "mesh"]
+    STARTS_FROM: Literal["points", "mesh", "box"]
 
     def init(self, key: Key[Array, ""], start: Any, config: Any, capacity: int | None = None) -> Any: ...
 
@@ -66,7 +71,16 @@ class Field(Protocol):
     def skeleton(self, config: Any, sizes: dict[str, int]) -> Any: ...
 
 
-FIELDS: dict[str, ModuleType] = {"wideband": wideband, "wave": wave, "wrfgs": wrfgs}
+@runtime_checkable
+class SampledField(Field, Protocol):
+    """A field too slow to train on whole images: a step looks at some pixels (flat indices), the same ones in all spectra."""
+
+    def choose_pixels(self, params: Any, key: Key[Array, ""]) -> Int[Array, "r"]: ...
+
+    def observe_pixels(self, params: Any, receiver: Receiver, query: Query, pixels: Int[Array, "r"]) -> Float[Array, "b r"]: ...
+
+
+FIELDS: dict[str, ModuleType] = {"wideband": wideband, "wave": wave, "wrfgs": wrfgs, "nerf2": nerf2}
 
 
 def get_field(name: str) -> Field:
