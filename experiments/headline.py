@@ -22,9 +22,9 @@ def render(results: Results, images: Path) -> str:
 def gain_over_wrfgs(results: Results) -> str:
     """Scene by scene against both budgets of WRF-GS, with a paired test; the averages below."""
     parts = [
-        "**Gain over WRF-GS**: averages over ten frequencies of the median SSIM (in parentheses the paper's), the relative gain,"
-        " and a paired test over held-out transmitters: at how many of them ours is better (mean over frequencies and seeds), and"
-        " the p-value of Wilcoxon's signed-rank test."
+        "**Gain over WRF-GS**: averages over ten frequencies of the median SSIM (in parentheses the paper's), the relative"
+        " gain, and a paired test over held-out transmitters: at how many of them ours is better (mean over frequencies and"
+        " seeds), and the p-value of Wilcoxon's signed-rank test."
     ]
     for variant in ("", "long"):
         rows, pairs = [], []

@@ -61,7 +61,7 @@ class Job:
     @property
     def train_ghz(self) -> tuple[float, ...]:
         """Training frequencies."""
-        return COMBINATIONS[self.combination] if self.combination else self.known_ghz
+        return tuple(float(f) for f in COMBINATIONS[self.combination]) if self.combination else self.known_ghz
 
     @property
     def test_ghz(self) -> tuple[float, ...]:

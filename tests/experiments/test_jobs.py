@@ -1,0 +1,136 @@
+"""Jobs: what the tables need is among them, each trains and tests on what it says, budgets are what they are said to be."""
+
+import numpy as np
+import pytest
+
+from experiments import figure8, paper, table1, table2
+from experiments.jobs import ONE_FREQUENCY, PROFILES, REFERENCES, SCORED, Job, settings
+from experiments.tables import EXPERIMENTS, unique_jobs
+from wbgs_jax.config import check
+
+JOBS = unique_jobs()
+TRAINED = [job for job in JOBS if job.field != REFERENCES]
+
+
+def test_names_are_unique_and_stay_as_they_are():
+    assert len({job.name for job in JOBS}) == len(JOBS)
+    names = {
+        "scene1_wideband_seed0": Job("1", "wideband"),
+        "scene3_wrfgs_long_seed2": Job("3", "wrfgs", variant="long", seed=2),
+        "scene4_wave_C4_alltx_seed0": Job("4", "wave", "C4", all_tx=True),
+        "scene1_21f_wideband_no_frequency_D_alltx_seed1": Job(
+            "1_21f", "wideband", "D", all_tx=True, variant="no_frequency", seed=1
+        ),
+    }
+    assert {name: job.name for name, job in names.items()} == {name: name for name in names}
+    assert set(names.values()) <= set(JOBS)
+
+
+@pytest.mark.parametrize("model", table1.MODELS[:3])
+def test_table_1_has_sixty_cells_and_three_seeds_of_every_compared_model(model):
+    jobs = [job for job in table1.jobs() if (job.field, job.variant) == model]
+    cells = {(job.scene, ghz) for job in jobs for ghz in job.test_ghz}
+    assert len(cells) == 60
+    assert {job.seed for job in jobs} == {0, 1, 2}
+
+
+def test_table_2_has_all_combinations_with_and_without_held_out_transmitters():
+    found = {(job.scene, job.combination, job.all_tx) for job in table2.jobs() if job.field == "wideband"}
+    assert len(found) == 6 * 4 * 2
+
+
+def test_figure_8_has_all_combinations():
+    assert {job.combination for job in figure8.jobs() if job.all_tx} == set("ABCDEFGHIJK")
+
+
+def test_every_experiment_has_jobs():
+    assert all(experiment.jobs() for experiment in EXPERIMENTS.values())
+
+
+@pytest.mark.parametrize(
+    ("combination", "unseen"),
+    {
+        "C1": (5, 37, 77),
+        "C2": (2.4, 10, 37, 60, 94),
+        "C3": (2.4, 5, 10, 37, 47, 60, 94),
+        "C4": (2.4, 5, 10, 24.25, 37, 47, 60, 77),
+        "A": (1,),
+        "B": (50,),
+        "C": (100,),
+        "D": (5, 15, 25, 35, 45, 55, 65, 75, 85, 95),
+        "E": (5, 10, 15, 20, 30, 35, 40, 45, 55, 60, 65, 70, 80, 85, 90, 95),
+        "F": (5, 10, 15, 20, 25, 30, 35, 40, 45, 55, 60, 65, 70, 75, 80, 85, 90, 95),
+        "H": (1, 5, 10, 15, 20, 30, 35, 40, 45, 50, 55, 60, 65, 70, 80, 85, 90, 95, 100),
+        "K": tuple(range(5, 101, 5)),
+    }.items(),
+)
+def test_the_test_frequencies_are_those_of_tables_5_and_6(combination, unseen):
+    scene = "1" if combination in table2.COMBINATIONS else paper.DENSE_SCENE
+    assert Job(scene, "wideband", combination).test_ghz == unseen
+
+
+def transmitters(dataset, index):
+    return set(dataset.tx_index[index].tolist())
+
+
+def frequencies(dataset, index):
+    return set(np.unique(dataset.frequencies_hz[index] / 1e9).tolist())
+
+
+@pytest.mark.parametrize("all_tx", [True, False])
+def test_unseen_frequencies_are_unseen(all_tx):
+    job = Job("1", "wideband", "C3", all_tx=all_tx)
+    dataset = job.dataset()
+    assert frequencies(dataset, dataset.train) == {1, 24.25, 77}
+    assert frequencies(dataset, dataset.test) == set(job.test_ghz)
+    trained, tested = transmitters(dataset, dataset.train), transmitters(dataset, dataset.test)
+    if all_tx:
+        assert len(trained) == 877 and len(tested) == SCORED["all_tx"] and tested <= trained
+    else:
+        assert len(trained) == 702 and len(tested) == 175 and not tested & trained
+
+
+def test_a_model_for_every_frequency_sees_that_frequency_alone():
+    models = list(Job("1", "wrfgs").models())
+    assert [name for name, _ in models[:3]] == ["1GHz", "2.4GHz", "5GHz"] and len(models) == 10
+    for (_, dataset), ghz in zip(models, paper.GHZ_10, strict=True):
+        assert frequencies(dataset, dataset.train) == frequencies(dataset, dataset.test) == {ghz}
+
+
+def test_the_slow_field_is_scored_on_some_of_the_others_transmitters():
+    slow, others = Job("1", "nerf2").dataset(), Job("1", "wideband").dataset()
+    assert len(transmitters(slow, slow.test)) == SCORED["nerf2"]
+    assert transmitters(slow, slow.test) <= transmitters(others, others.test)
+    np.testing.assert_array_equal(slow.train, others.train)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_all_settings_can_work_and_have_the_steps_of_the_profile(profile):
+    size = PROFILES[profile]
+    for job in {(job.field, job.variant, job.scene): job for job in TRAINED}.values():
+        chosen = settings(job, size)
+        check(chosen)
+        assert chosen.optim.min_steps == chosen.optim.steps  # no data set cuts them
+        if job.field in ONE_FREQUENCY and job.variant != "long":
+            block, share = chosen.loop.epoch_steps, size.steps / len(job.test_ghz)
+            assert chosen.optim.steps == block or abs(chosen.optim.steps - share) <= block / 2
+
+
+def test_wrfgs_sees_as_many_spectra_as_the_wideband_field():
+    ours, theirs = (settings(Job("1", field), PROFILES["quick"]).optim for field in ("wideband", "wrfgs"))
+    assert 10 * theirs.steps * theirs.batch == ours.steps * ours.batch
+
+
+def test_variants_change_what_they_name():
+    blind = settings(Job("1_21f", "wideband", variant="no_frequency"), PROFILES["quick"]).wideband
+    assert not blind.attenuation_frequency and not blind.radiance_frequency and blind.gaussians == 1000
+
+
+def test_the_papers_averages_are_those_of_its_rows():
+    rows = [(paper.TABLE_1[s][m], paper.TABLE_1_AVERAGE[s][m]) for s in paper.SCENES for m in ("wrfgs", "wideband")]
+    for row, average in rows:
+        assert len(row) == 10 and np.mean(row) == pytest.approx(average, abs=0.0061)
+    for model, value in paper.TABLE_1_OVERALL.items():
+        assert np.mean([paper.TABLE_1_AVERAGE[s][model] for s in paper.SCENES]) == pytest.approx(value, abs=0.006)
+    assert paper.TABLE_1_OVERALL["wideband"] / paper.TABLE_1_OVERALL["wrfgs"] - 1 == pytest.approx(paper.GAIN, abs=1e-3)
+    assert 1 - paper.FIGURE_8["D"] / paper.FIGURE_7_AVERAGE["wideband"] == pytest.approx(paper.ZERO_SHOT_DROP, abs=1e-3)

@@ -1,0 +1,263 @@
+"""The runner: what is done is skipped, what was cut goes on, no job is done twice, no failure stops the others."""
+
+import contextlib
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from types import SimpleNamespace
+from unittest import mock
+
+import numpy as np
+import pytest
+import synthetic
+
+from experiments import execute, jobs, runner
+from experiments.jobs import Job
+from experiments.results import Results
+from wbgs_jax.data.schema import save_scene
+from wbgs_jax.errors import run_command
+from wbgs_jax.trainer import Run
+
+JOB = Job("1", "wideband")
+VALUES = {"average_of_medians": 0.5, "training_seconds": 1.0, "evaluation_seconds": 0.1, "ssim": {"1": [0.5]}, "tx": [0]}
+
+
+@pytest.fixture
+def command(tmp_path):
+    return runner.Command(profile="smoke", results=tmp_path / "results", runs=tmp_path / "runs")
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Jobs that were executed, by a stand-in that takes no time."""
+    executed = []
+
+    def stand_in(job, profile, folder):
+        executed.append(job.name)
+        return VALUES, None
+
+    monkeypatch.setattr(runner, "execute", stand_in)
+    return executed
+
+
+@pytest.fixture
+def scenes(monkeypatch, tmp_path):
+    """A tiny scene 1 with the ten frequencies."""
+    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(jobs.GHZ_10) * 1e9)
+    monkeypatch.setenv("WBGS_DATA", str(tmp_path / "data"))
+    save_scene(tmp_path / "data" / "scene1.npz", dataclasses.replace(synthetic.tiny_scene(), name="scene1"))
+
+
+def result_of(command, job=JOB):
+    return Results(command.profile, command.results).get(job)
+
+
+def test_every_job_is_done_once(command, calls):
+    wanted = [Job("1", "wideband", seed=seed) for seed in range(3)]
+    assert runner.run(wanted[:2], command) == []
+    assert runner.run(wanted, command) == []
+    assert calls == [job.name for job in wanted]
+
+
+def test_a_failing_job_does_not_stop_the_others(command, calls, monkeypatch, capsys):
+    succeed = runner.execute
+    broken = Job("1", "wave")
+
+    def execute_most(job, profile, folder):
+        if job == broken:
+            raise ZeroDivisionError("no paths\nand more")
+        return succeed(job, profile, folder)
+
+    monkeypatch.setattr(runner, "execute", execute_most)
+    monkeypatch.setattr(sys, "argv", ["runner", "--profile", "smoke", "--scenes", "1", "--seeds", "0", "--only", "table1"])
+    monkeypatch.setattr(runner.tyro, "cli", lambda *_, **__: dataclasses.replace(command, scenes=("1",), only=("table1",)))
+    with pytest.raises(SystemExit) as stop:
+        run_command(runner.main)
+    assert stop.value.code == 2
+    assert len(calls) == len([job for job in runner.all_jobs(("table1",)) if job.scene == "1"]) - 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == f"error: 1 of {len(calls) + 1} jobs failed: scene1_wave_seed0: ZeroDivisionError: no paths"
+
+
+def test_two_at_once_do_not_do_the_same_job(command, monkeypatch):
+    executed, together = [], threading.Barrier(2)
+
+    def slow(job, profile, folder):
+        executed.append(job.name)
+        time.sleep(0.3)
+        return VALUES, None
+
+    def run_one():
+        together.wait()
+        said.append(runner.run_job(JOB, command, Results(command.profile, command.results)))
+
+    monkeypatch.setattr(runner, "execute", slow)
+    said: list[str] = []
+    threads = [threading.Thread(target=run_one) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert executed == [JOB.name]
+    assert "another process has it" in said or "done meanwhile" in said
+
+
+def test_the_lock_of_a_killed_process_is_free(command, calls):
+    lock = command.runs / command.profile / "locks" / JOB.name
+    lock.parent.mkdir(parents=True)
+    hold = "import fcntl, sys, time; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print('held'); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-u", "-c", hold, str(lock)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        runner.run([JOB], command)
+        assert calls == []
+        holder.kill()
+    runner.run([JOB], command)
+    assert calls == [JOB.name]
+
+
+def test_the_time_limit_holds_outside_a_training(command, monkeypatch, capsys):
+    monkeypatch.setattr(runner, "execute", lambda *_: time.sleep(60))
+    begin = time.monotonic()
+    assert runner.run([JOB, Job("2", "wideband")], dataclasses.replace(command, minutes=0.005)) == []
+    assert time.monotonic() - begin < 10
+    assert "the time is up" in capsys.readouterr().err
+    assert result_of(command) is None
+
+
+def test_a_signal_from_outside_stops_everything(command, monkeypatch):
+    monkeypatch.setattr(runner, "execute", lambda *_: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(runner.TimeIsUp):
+        runner.run([JOB], command)
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.usefixtures("compile_once", "scenes")
+def test_a_cut_training_goes_on_to_the_same_result(command, monkeypatch, tmp_path):
+    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
+    steady = jobs.PROFILES["smoke"].changes | {"density": {"every": 0}}  # compiles once
+    monkeypatch.setitem(jobs.PROFILES, "smoke", dataclasses.replace(jobs.PROFILES["smoke"], changes=steady))
+    original, epochs = Run.epoch, []
+
+    def epoch(run):
+        epochs.append(run.step)
+        result = original(run)
+        if len(epochs) == 2:
+            signal.raise_signal(signal.SIGALRM)  # as if the time were up
+        return result
+
+    monkeypatch.setattr(Run, "epoch", epoch)
+    assert runner.run([JOB], command) == []
+    assert epochs == [0, 2] and result_of(command) is None
+    assert runner.run([JOB], command) == []
+    assert epochs == [0, 2, 4, 6]
+    cut = result_of(command)
+    whole = dataclasses.replace(command, results=tmp_path / "other", runs=tmp_path / "more")
+    runner.run([JOB], whole)
+    np.testing.assert_array_equal(cut.ssim, result_of(whole).ssim)
+    assert cut.values["curve"]["step"] == [2, 4, 6, 8]
+    assert not (command.runs / "smoke" / JOB.name).exists()
+
+
+@pytest.fixture
+def models(monkeypatch):
+    """Stand-ins for training and prediction; the folders of the models that were trained."""
+    trained = []
+
+    def train(dataset, field, settings, seed, folder, resume):
+        trained.append(folder.name)
+        (folder / "metrics.jsonl").write_text("".join(json.dumps({"step": s, "loss": 1 / s}) + "\n" for s in range(1, 500)))
+        return SimpleNamespace(params=None, steps=499, seconds=1.5, gaussians=7)
+
+    monkeypatch.setattr(execute, "train", train)
+    monkeypatch.setattr(execute, "predict_spectra", lambda field, params, dataset, index: np.asarray(dataset.pas(index)) * 0.9)
+    return trained
+
+
+@pytest.mark.usefixtures("scenes")
+def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
+    job, stop = Job("1", "wrfgs"), mock.patch.object(execute, "score", side_effect=[KeyboardInterrupt])
+    with stop, contextlib.suppress(KeyboardInterrupt):
+        runner.run([job], command)
+    assert models == ["1GHz"]
+    original = execute.score
+    answers = [original, original, KeyboardInterrupt]
+
+    def score(dataset, predicted):
+        answer = answers.pop(0)
+        if answer is KeyboardInterrupt:
+            raise KeyboardInterrupt
+        return answer(dataset, predicted)
+
+    with mock.patch.object(execute, "score", score), pytest.raises(KeyboardInterrupt):
+        runner.run([job], command)
+    assert models == ["1GHz", "1GHz", "2.4GHz", "5GHz"]
+    runner.run([job], command)
+    assert models[4:] == ["5GHz", "10GHz", "24.25GHz", "37GHz", "47GHz", "60GHz", "77GHz", "94GHz"]
+    found = result_of(command, job)
+    assert found.ghz == list(jobs.GHZ_10) and found.ssim.shape == (2, 10)
+    assert found.values["models"] == 10 and found.values["steps"] == 4990 and found.values["training_seconds"] == 15
+
+
+@pytest.mark.usefixtures("scenes")
+def test_a_result_says_where_it_comes_from(command, models):
+    runner.run([JOB], command)
+    found = result_of(command).values
+    assert {"commit", "device", "jax", "version"} <= set(found["environment"])
+    assert found["job"] == dataclasses.asdict(JOB) and found["profile"] == found["preset"] == "smoke"
+    assert found["settings"]["wideband.gaussians"] == 60 and found["settings"]["optim.steps"] == 8
+    assert len(found["curve"]["step"]) <= execute.CURVE_POINTS
+    assert found["samples"] == 499 * 2
+    pictures = Results(command.profile, command.results).pictures(JOB)
+    assert pictures.shape == (8, 90, 360) and pictures.max() > 200
+
+
+@pytest.mark.usefixtures("scenes")
+def test_references_are_a_job_of_their_own(command):
+    job = Job("1", "references", "C4", all_tx=True)
+    runner.run([job], command)
+    found = result_of(command, job).values["references"]
+    assert set(found) == {"mean_image", "nearest_tx", "inverse_distance", "line_of_sight"}
+    assert list(found["nearest_tx"]) == ["2.4", "5", "10", "24.25", "37", "47", "60", "77"]
+
+
+def test_a_list_of_numbers_is_one_line(command):
+    results = Results(command.profile, command.results)
+    results.write(JOB, VALUES | {"ssim": {"1": [0.5] * 200}})
+    text = results.path(JOB).read_text()
+    assert len(text.splitlines()) < 20 and json.loads(text)["ssim"]["1"] == [0.5] * 200
+
+
+def test_jobs_come_in_the_order_of_importance():
+    listed = runner.all_jobs()
+    assert listed[0] == Job("1", "wideband")
+    assert [job.seed for job in listed if job.variant != "long"] == sorted(j.seed for j in listed if j.variant != "long")
+
+
+def test_a_listing_says_what_is_done(command, calls):
+    wanted = [JOB, Job("2", "wideband"), Job("1", "wave")]
+    runner.run(wanted[:1], command)
+    (command.runs / "smoke" / "scene1_wave_seed0").mkdir()
+    done, same_kind, begun, total = runner.listing(wanted, command).splitlines()
+    assert done.split() == ["done", "1", "s", "scene1_wideband_seed0"]
+    assert same_kind.split() == ["open", "1", "s", "scene2_wideband_seed0"]
+    assert begun.split() == ["begun", "?", "s", "scene1_wave_seed0"]
+    assert total == "3 jobs: 2 left, about 0.0 h and 1 of unknown length"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--only", "table9"], "there is no experiment 'table9'; choose among: table1"),
+        (["--scenes", "7"], "no job fits this choice"),
+    ],
+)
+def test_a_wrong_choice_is_one_line(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["runner", "--dry-run", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        run_command(runner.main)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and words in line

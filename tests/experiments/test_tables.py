@@ -1,0 +1,132 @@
+"""The page of results: marks for what was not run, right numbers where the results are made up, the paper's beside them."""
+
+import re
+
+import numpy as np
+import pytest
+
+from experiments import baselines, cells, figure8, headline, table1, table2, table3, tables
+from experiments.jobs import PICTURED_GHZ, REFERENCES, Job
+from experiments.results import Results
+
+LEVELS = {("wideband", ""): 0.8, ("wrfgs", ""): 0.64, ("wrfgs", "long"): 0.75, ("wave", ""): 0.9, ("nerf2", ""): 0.6}
+ENVIRONMENT = {"version": "0", "commit": "abc123", "device": "cpu x86_64", "jax": "0.10"}
+
+
+def made_up(job, tx=(3, 5, 8, 9, 11, 20, 21)):
+    """Scores around a level of the model: 0.01 higher with every seed, lower at unseen frequencies, their median exact."""
+    values = {"environment": ENVIRONMENT, "training_seconds": 60.0, "evaluation_seconds": 6.0}
+    if job.field == REFERENCES:
+        return values | {"references": {name: {f"{f:g}": 0.5 for f in job.test_ghz} for name in baselines.NAMES_OF_REFERENCES}}
+    level = LEVELS.get((job.field, job.variant), 0.7) + 0.01 * job.seed - 0.02 * bool(job.combination)
+    spread = np.linspace(-0.03, 0.03, len(tx))
+    scores = {f"{f:g}": np.round(level + spread, 4).tolist() for f in job.test_ghz}
+    return values | {"tx": list(tx), "ssim": scores, "curve": {"step": [1, 2, 3], "loss": [0.3, 0.2, 0.1]}}
+
+
+@pytest.fixture(scope="module")
+def nothing(tmp_path_factory):
+    return Results("quick", tmp_path_factory.mktemp("nothing"))
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory):
+    results = Results("quick", tmp_path_factory.mktemp("everything"))
+    picture = np.tile(np.linspace(0, 255, 360).astype(np.uint8), (len(PICTURED_GHZ), 90, 1))
+    for job in tables.unique_jobs():
+        results.write(job, made_up(job), picture if job.pictured else None)
+    return results
+
+
+def rows(text):
+    """Cells of all table rows but headings and rulers."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    bodies = [line for line, ruler in zip(lines, [*lines[1:], ""], strict=True) if "---" not in line and "---" not in ruler]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in bodies]
+
+
+def row(text, first):
+    return next(cells[1:] for cells in rows(text) if cells[0] == first)
+
+
+def test_what_has_not_been_run_says_so_everywhere(nothing, tmp_path):
+    text = tables.page(nothing, tmp_path)
+    assert "None of the" in text and not list(tmp_path.iterdir())
+    for module in tables.PAGES:
+        assert cells.NOT_RUN in module.render(nothing, tmp_path), module.__name__
+    known = re.compile(r"not run yet|\(.*\)|ceiling")
+    for name, *values in rows(table1.render(nothing, tmp_path)):
+        assert "ceiling" in name or all(known.search(value) for value in values), name
+
+
+def test_the_papers_values_stand_beside_the_cells(nothing, tmp_path):
+    text = table1.scene_table(nothing, "3")
+    assert row(text, "wideband (ours)")[:2] == ["not run yet (0.58)", "not run yet (0.63)"]
+    assert row(text, "WRF-GS, long")[10] == "not run yet (0.50)"
+    assert "not run yet (+17.8 %)" in headline.render(nothing, tmp_path)
+
+
+def test_table_1_has_medians_intervals_seeds_and_ceilings(everything):
+    text = table1.scene_table(everything, "1")
+    ours = row(text, "wideband (ours)")
+    assert ours[0] == "0.810 (0.76)" and ours[10] == "0.810 (0.74)"
+    low, high = (float(v) for v in ours[11].split("-"))
+    assert 0.78 <= low < 0.81 < high <= 0.84
+    assert ours[12] == "3: 0.800-0.820"
+    assert row(text, "coherent (ours)")[12] == "1"
+    assert row(text, "phase-blind ceiling")[:2] == ["0.914", "0.839"]
+
+
+def test_the_headline_is_computed(everything, tmp_path):
+    text = headline.gain_over_wrfgs(everything)
+    equal, long = text.split("WRF-GS, long")
+    assert row(equal, "**average**")[:3] == ["0.810 (0.66)", "0.650 (0.56)", "**+24.6 % (+17.8 %)**"]
+    assert row(long, "**average**")[2] == "**+6.6 % (+17.8 %)**"
+    assert row(equal, "2")[2:] == ["+24.6 % (+13.5 %)", "100 % of 7", "+0.160", "1.6e-02"]
+    mixed, alike = rows(headline.zero_shot_drop(everything))
+    assert mixed[1:] == ["0.790", "0.810", "2.5 % (2.8 %)"]
+    assert alike[1:] == ["0.790", "0.810", "2.5 %"]
+
+
+def test_scenes_that_are_missing_are_left_out_of_the_average_and_counted(tmp_path):
+    results = Results("quick", tmp_path)
+    for scene in ("1", "4"):
+        for field in ("wideband", "wrfgs"):
+            results.write(Job(scene, field), made_up(Job(scene, field)))
+    text = headline.gain_over_wrfgs(results).split("WRF-GS, long")[0]
+    assert row(text, "**average of 2 scenes**")[2] == "**+25.0 % (+17.8 %)**"
+    assert row(text, "3")[2] == cells.NOT_RUN
+
+
+def test_tables_2_and_3_and_figure_8(everything, tmp_path):
+    paper, harder = table2.table(everything, True), table2.table(everything, False)
+    assert row(paper, "**1** wideband (ours)") == ["0.780 (0.75)", "0.780 (0.74)", "0.780 (0.73)", "0.780 (0.70)"]
+    assert row(paper, "**2** wideband (ours)") == ["0.780", "0.780", "0.780", "0.780 (0.54)"]
+    assert row(harder, "**1** wideband (ours)") == ["0.780"] * 4
+    assert row(harder, "nearest TX") == ["0.500"] * 4
+    ablation = table3.render(everything, tmp_path)
+    assert rows(ablation)[0][:3] == ["yes", "yes", "0.810 (0.72)"]
+    assert rows(ablation)[3][5] == "0.690 (0.53)"
+    bars = figure8.render(everything, tmp_path)
+    assert row(bars, "A")[0:2] == ["all but 1", "0.780"]
+    assert row(bars, "D")[1] == "0.790 (0.70)"
+
+
+def test_the_slow_field_is_compared_at_its_own_transmitters(tmp_path):
+    results = Results("quick", tmp_path)
+    results.write(Job("1", "wideband"), made_up(Job("1", "wideband")))
+    results.write(Job("1", "nerf2"), made_up(Job("1", "nerf2"), tx=(5, 9, 20)))
+    cells_of_scene = row(baselines.volume(results), "1")
+    assert cells_of_scene[0] == f"{np.median([0.78, 0.8, 0.82]):.3f}"
+    assert cells_of_scene[5] == "100 % of 3"
+    assert cells_of_scene[1] == cells.NOT_RUN
+
+
+def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
+    text = tables.page(everything, tmp_path)
+    for module in tables.PAGES:
+        assert f"## {module.TITLE}" in text
+    shown = set(re.findall(r"\(images/(\S+?)\)", text))
+    assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 5
+    assert cells.NOT_RUN not in text
+    assert "`abc123`" in text and "nan" not in text
