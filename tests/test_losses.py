@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from wbgs_jax.losses import image_loss, ssim
+from wbgs_jax.losses import image_loss, pixel_loss, ssim
 
 
 @pytest.fixture
@@ -66,3 +66,9 @@ def test_the_gradient_of_a_dark_or_perfect_image_is_finite():
     for predicted in (dark, truth):
         gradient = jax.grad(lambda a: image_loss(a, truth)[0])(predicted)
         assert bool(jnp.isfinite(gradient).all())
+
+
+def test_the_loss_of_pixels_is_a_mean_error(rng, x64):
+    a, b = jnp.asarray(rng.random((3, 20))), jnp.asarray(rng.random((3, 20)))
+    assert float(pixel_loss(a, b, "l1")) == pytest.approx(np.abs(a - b).mean())
+    assert float(pixel_loss(a, b, "l2")) == pytest.approx(((a - b) ** 2).mean())

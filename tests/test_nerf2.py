@@ -140,52 +140,26 @@ def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
 
 def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path, monkeypatch):
     save_scene(tmp_path / "box.npz", tiny_scene())
-    tiny = [
-        "--nerf2.samples",
-        "4",
-        "--nerf2.width",
-        "8",
-        "--nerf2.directions",
-        "30",
-        "--optim.steps",
-        "20",
-        "--loop.evaluate-spectra",
-        "2",
-    ]
-    out = tmp_path / "run"
-    arguments = [
-        "train",
-        "--scene",
-        str(tmp_path / "box.npz"),
-        "--field",
-        "nerf2",
-        "--preset",
-        "smoke",
-        "--out",
-        str(out),
-        *tiny,
-    ]
-    monkeypatch.setattr("sys.argv", arguments)
+    tiny = "--nerf2.samples 4 --nerf2.width 8 --nerf2.directions 30 --optim.steps 20 --loop.evaluate-spectra 2"
+    command = f"train --scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run {tiny}"
+    monkeypatch.setattr("sys.argv", command.split())
     train_command.main()
-    trained = load_trained(out)
+    trained = load_trained(tmp_path / "run")
     assert trained.step == 20 and trained.config.settings.nerf2.samples == 4
     dataset = trained.config.dataset()
     predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test[:2])
     assert predicted.shape == (2, *PAS_SHAPE) and np.isfinite(predicted).all()
 
 
-def test_it_is_a_field_and_settings_that_cannot_work_are_refused():
+def test_it_is_trained_on_some_directions_and_no_other_field_is():
     assert isinstance(get_field("nerf2"), SampledField)
     assert not isinstance(wideband, SampledField)
-    for change in (
-        {"samples": 0},
-        {"directions": 0},
-        {"directions": 40_000},
-        {"width": 0},
-        {"depth": 0},
-        {"radiance_widths": ()},
-        {"tx_octaves": -1},
-    ):
-        (name,) = change
-        with pytest.raises(UserError, match=name.replace("_", "-")):
-            check(dataclasses.replace(Settings(), nerf2=Nerf2Config(**change)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("samples", 0), ("directions", 0), ("directions", 40_000), ("width", 0), ("radiance_widths", ()), ("tx_octaves", -1)],
+)
+def test_settings_that_cannot_work_are_refused(name, value):
+    with pytest.raises(UserError, match=name.replace("_", "-")):
+        check(dataclasses.replace(Settings(), nerf2=Nerf2Config(**{name: value})))

@@ -210,6 +210,7 @@ PRESETS: dict[str, Settings] = {
     # Under a minute on two cores: proves that everything works, not that it is good.
     "smoke": Settings(
         wideband=WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
+        nerf2=Nerf2Config(samples=8, directions=64, width=32, depth=3, radiance_widths=(32,)),
         optim=OptimConfig(steps=200, batch=4),
         density=DensityConfig(every=100, start=50, max_gaussians=640),
         loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),
@@ -219,6 +220,7 @@ PRESETS: dict[str, Settings] = {
     # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
     "gpu": Settings(
         wideband=WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64)),
+        nerf2=Nerf2Config(samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128)),
         optim=OptimConfig(steps=20_000, batch=8, network_lr=8e-4),
         density=DensityConfig(max_gaussians=100_000, reset_every=3000),
         loop=LoopConfig(epoch_steps=100, checkpoint_every=2000),
@@ -229,12 +231,17 @@ PRESETS: dict[str, Settings] = {
 WAVE_STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """The wave field has a few numbers a material to learn, not networks."""
 
+NERF2_LR = {"smoke": 4e-3, "cpu": 4e-3, "gpu": 8e-4}
+"""The volume learns with its networks alone: docs/baselines.md has the figures of the small ones."""
+
 
 def preset_settings(preset: str, field: str) -> Settings:
     """A preset as it suits a field."""
     settings = PRESETS[preset]
     if field == "wrfgs":
         return dataclasses.replace(settings, wrfgs=without_frequency(settings.wideband))
+    if field == "nerf2":
+        return dataclasses.replace(settings, optim=dataclasses.replace(settings.optim, network_lr=NERF2_LR[preset]))
     if field != "wave":
         return settings
     steps = WAVE_STEPS[preset]
