@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,20 +46,25 @@ class Part:
     pictures: UInt8[np.ndarray, "k 90 360"]
 
 
-def execute(job: Job, profile: str, folder: Path) -> tuple[dict[str, Any], np.ndarray | None]:
-    """Train and score a job, or go on with it: its result, and its pictures (k, 90, 360) if they are kept."""
+def execute(
+    job: Job, profile: str, folder: Path, may_go_on: Callable[[], None] = lambda: None
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Train and score a job, or go on with it: its result, and its pictures (k, 90, 360) if they are kept.
+
+    `may_go_on` is called where stopping loses nothing, and raises if the job is to stop.
+    """
     origin = {"profile": profile, "environment": environment()}
     if job.field == REFERENCES:
         return reference_scores(job) | origin, None
     chosen = settings(job, PROFILES[profile])
-    parts = [part(job, profile, dataset, chosen, folder / name) for name, dataset in job.models()]
+    parts = [part(job, profile, dataset, chosen, folder / name, may_go_on) for name, dataset in job.models()]
     preset = PROFILES[profile].preset
     changes = {"preset": preset, "settings": difference(chosen, preset_settings(preset, job.field), job.field)}
     pictures = np.concatenate([p.pictures for p in parts]) if job.pictured else None
     return merged(parts, chosen.optim.batch) | changes | origin, pictures
 
 
-def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path) -> Part:
+def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
     """Train one model and score it, unless that is done."""
     done = folder / "part.npz"
     if done.exists():
@@ -67,6 +73,7 @@ def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Pat
     config = RunConfig(job.scene, job.field, PROFILES[profile].preset, job.seed, None, chosen, job.train_ghz)
     prepare_folder(folder, config, resume=True)
     trained = train(dataset, job.field, chosen, job.seed, folder, resume=True)
+    may_go_on()
     begin = time.perf_counter()
     predicted = predict_spectra(get_field(job.field), trained.params, dataset, dataset.test)
     scores = score(dataset, predicted)

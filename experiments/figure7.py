@@ -74,10 +74,9 @@ def draw(values: dict[tuple[str, str], Scores | None]) -> plt.Figure:
     best = [value for f in GHZ_21 if (value := ceiling(DENSE_SCENE, [f])) is not None]
     if best:
         axis.plot(GHZ_21, best, color="0.4", lw=1, ls=":", label="phase-blind ceiling")
-    for name, value in FIGURE_7_AVERAGE.items():
-        axis.axhline(value, color=STYLES[name, ""]["color"], lw=0.8, alpha=0.6)
-        axis.text(101, value, "paper", fontsize=7, va="center", color=STYLES[name, ""]["color"])
-    axis.set(xlabel="frequency [GHz]", ylabel="median SSIM", ylim=(0.4, 1))
+    for name, label in (("wideband", "wideband, paper"), ("wrfgs", "WRF-GS, paper")):
+        axis.axhline(FIGURE_7_AVERAGE[name], color=STYLES[name, ""]["color"], lw=0.8, alpha=0.6, label=label)
+    axis.set(xlabel="frequency [GHz]", ylabel="median SSIM", xlim=(0, 101), ylim=(0.4, 1))
     axis.grid(alpha=0.3)
-    axis.legend(fontsize=8, ncols=3, loc="lower center")
+    axis.legend(fontsize=8, ncols=4, loc="lower center")
     return figure

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import pyplot as plt
 
-from experiments.cells import SUMMARY, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.cells import NOT_RUN, SUMMARY, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
 from experiments.figure7 import jobs_of as all_frequencies
 from experiments.jobs import SEEDS, Job
 from experiments.paper import COMBINATIONS, DENSE_SCENE, FIGURE_8, GHZ_21
@@ -84,7 +84,7 @@ def draw(values: dict[str, Scores | None]) -> plt.Figure:
     figure, axis = plt.subplots(figsize=(8.5, 3.8), layout="constrained")
     for i, (letter, v) in enumerate(values.items()):
         if v is None:
-            axis.text(i, 0.42, "not run yet", rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
+            axis.text(i, 0.02, NOT_RUN, rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
         else:
             by_frequency = np.median(np.median(v, 1), 0)
             axis.bar(i, by_frequency.mean(), color="C0", alpha=0.45, width=0.65, label="average" if letter == "D" else None)
@@ -92,7 +92,7 @@ def draw(values: dict[str, Scores | None]) -> plt.Figure:
         if letter in FIGURE_8:
             label = "paper" if letter == "D" else None
             axis.plot([i - 0.33, i + 0.33], [FIGURE_8[letter]] * 2, color="C3", lw=1.5, label=label)
-    axis.set(xticks=range(len(values)), xticklabels=list(values), ylabel="median SSIM", ylim=(0.4, 1))
+    axis.set(xticks=range(len(values)), xticklabels=list(values), ylabel="median SSIM", ylim=(0, 1))
     axis.grid(axis="y", alpha=0.3)
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="upper right")
     return figure

@@ -76,7 +76,8 @@ class Job:
     @property
     def pictured(self) -> bool:
         """Whether predicted pictures are kept."""
-        return self.scene in PICTURED_SCENES and not self.combination and self.seed == 0 and self.field != REFERENCES
+        everywhere = self.field not in (REFERENCES, *SCORED) and not self.combination
+        return everywhere and self.scene in PICTURED_SCENES and self.seed == 0
 
     def dataset(self) -> Dataset:
         """The scene with this job's training and test spectra."""

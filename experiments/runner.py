@@ -70,6 +70,11 @@ class Clock:
     def _terminate(self, number: int, frame: object) -> None:
         raise TimeIsUp("stopped by a signal")
 
+    def may_go_on(self) -> None:
+        """Raises when the time is up, which a training does not say that ended at that moment."""
+        if self.expired:
+            raise TimeIsUp("the time is up")
+
     def __enter__(self) -> "Clock":
         self.previous = {
             signal.SIGALRM: signal.signal(signal.SIGALRM, self._alarm),
@@ -146,7 +151,7 @@ class Durations:
         return f"{len(jobs)} left, about {hours:.1f} h" + (f" and {unknown} of unknown length" if unknown else "")
 
 
-def run_job(job: Job, command: Command, results: Results) -> str:
+def run_job(job: Job, command: Command, results: Results, clock: Clock) -> str:
     """Run one job unless it is done or another process has it; says what became of it."""
     folder = command.runs / command.profile / job.name
     with claimed(command.runs / command.profile / "locks" / job.name) as mine:
@@ -155,7 +160,7 @@ def run_job(job: Job, command: Command, results: Results) -> str:
         if results.get(job):
             return "done meanwhile"
         begin = time.perf_counter()
-        values, pictures = execute(job, command.profile, folder)
+        values, pictures = execute(job, command.profile, folder, clock.may_go_on)
         results.write(job, values, pictures)
         shutil.rmtree(folder, ignore_errors=True)
         jax.clear_caches()  # otherwise every job's compiled programs stay in memory
@@ -173,9 +178,9 @@ def run(jobs: list[Job], command: Command) -> list[str]:
         for i, job in enumerate(open_jobs):
             try:
                 say(f"{job.name} ...")
-                say(f"{job.name}: {run_job(job, command, results)}; {Durations(results, jobs).left(open_jobs[i + 1 :])}")
-                if clock.expired:
-                    raise TimeIsUp("the time is up")
+                outcome = run_job(job, command, results, clock)
+                say(f"{job.name}: {outcome}; {Durations(results, jobs).left(open_jobs[i + 1 :])}")
+                clock.may_go_on()
             except (Interrupted, TimeIsUp):
                 if not clock.expired:
                     raise

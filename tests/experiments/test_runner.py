@@ -36,7 +36,7 @@ def calls(monkeypatch):
     """Jobs that were executed, by a stand-in that takes no time."""
     executed = []
 
-    def stand_in(job, profile, folder):
+    def stand_in(job, profile, folder, may_go_on):
         executed.append(job.name)
         return VALUES, None
 
@@ -67,10 +67,10 @@ def test_a_failing_job_does_not_stop_the_others(command, calls, monkeypatch, cap
     succeed = runner.execute
     broken = Job("1", "wave")
 
-    def execute_most(job, profile, folder):
+    def execute_most(job, *others):
         if job == broken:
             raise ZeroDivisionError("no paths\nand more")
-        return succeed(job, profile, folder)
+        return succeed(job, *others)
 
     monkeypatch.setattr(runner, "execute", execute_most)
     monkeypatch.setattr(sys, "argv", ["runner", "--profile", "smoke", "--scenes", "1", "--seeds", "0", "--only", "table1"])
@@ -86,14 +86,14 @@ def test_a_failing_job_does_not_stop_the_others(command, calls, monkeypatch, cap
 def test_two_at_once_do_not_do_the_same_job(command, monkeypatch):
     executed, together = [], threading.Barrier(2)
 
-    def slow(job, profile, folder):
+    def slow(job, *others):
         executed.append(job.name)
         time.sleep(0.3)
         return VALUES, None
 
     def run_one():
         together.wait()
-        said.append(runner.run_job(JOB, command, Results(command.profile, command.results)))
+        said.append(runner.run_job(JOB, command, Results(command.profile, command.results), runner.Clock(None)))
 
     monkeypatch.setattr(runner, "execute", slow)
     said: list[str] = []
@@ -126,6 +126,24 @@ def test_the_time_limit_holds_outside_a_training(command, monkeypatch, capsys):
     assert time.monotonic() - begin < 10
     assert "the time is up" in capsys.readouterr().err
     assert result_of(command) is None
+
+
+@pytest.mark.usefixtures("scenes")
+def test_a_training_that_ends_as_the_time_does_is_scored_the_next_time(command, models, monkeypatch):
+    train = execute.train
+
+    def slow(*arguments, **options):
+        result = train(*arguments, **options)
+        with contextlib.suppress(runner.TimeIsUp):
+            signal.raise_signal(signal.SIGALRM)  # a training notes it and returns
+        return result
+
+    monkeypatch.setattr(execute, "train", slow)
+    with mock.patch.object(execute, "predict_spectra", side_effect=AssertionError("scored")):
+        assert runner.run([JOB], command) == []
+    monkeypatch.setattr(execute, "train", train)
+    runner.run([JOB], command)
+    assert models == ["all", "all"] and result_of(command) is not None
 
 
 def test_a_signal_from_outside_stops_everything(command, monkeypatch):
