@@ -128,7 +128,8 @@ class Durations:
         self.known: dict[tuple, list[float]] = {}
         for job in jobs:
             if result := results.get(job):
-                seconds = result.values.get("training_seconds", 0) + result.values["evaluation_seconds"]
+                parts = result.values.get("training_seconds", 0) + result.values["evaluation_seconds"]
+                seconds = max(parts, result.values["wall_seconds"])  # of a job that was cut, the wall clock saw its end alone
                 self.known.setdefault(self.kind(job), []).append(seconds)
 
     @staticmethod
@@ -161,11 +162,12 @@ def run_job(job: Job, command: Command, results: Results, clock: Clock) -> str:
             return "done meanwhile"
         begin = time.perf_counter()
         values, pictures = execute(job, command.profile, folder, clock.may_go_on)
-        results.write(job, values, pictures)
+        seconds = time.perf_counter() - begin
+        results.write(job, values | {"wall_seconds": round(seconds, 1)}, pictures)
         shutil.rmtree(folder, ignore_errors=True)
         jax.clear_caches()  # otherwise every job's compiled programs stay in memory
         score = f"SSIM {values['average_of_medians']:.3f}, " if "average_of_medians" in values else ""
-        return f"{score}{time.perf_counter() - begin:.0f} s"
+        return f"{score}{seconds:.0f} s"
 
 
 def run(jobs: list[Job], command: Command) -> list[str]:

@@ -23,7 +23,14 @@ from wbgs_jax.errors import run_command
 from wbgs_jax.trainer import Run
 
 JOB = Job("1", "wideband")
-VALUES = {"average_of_medians": 0.5, "training_seconds": 1.0, "evaluation_seconds": 0.1, "ssim": {"1": [0.5]}, "tx": [0]}
+VALUES = {
+    "average_of_medians": 0.5,
+    "training_seconds": 1.0,
+    "evaluation_seconds": 0.1,
+    "wall_seconds": 1.2,
+    "ssim": {"1": [0.5]},
+    "tx": [0],
+}
 
 
 @pytest.fixture
