@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments import table1
-from experiments.cells import NAMES, NOT_RUN, at_transmitters, ceiling, cell, markdown, median_cell, scores
+from experiments.cells import NAMES, NOT_RUN, at_transmitters, ceiling, cell, median_cell, scores
 from experiments.jobs import REFERENCES, SCORED, Job
 from experiments.paper import GHZ_10, SCENES
+from experiments.report import markdown
 from experiments.results import Results
 from experiments.statistics import compare
 

@@ -87,9 +87,3 @@ def ceiling(scene: str, ghz: Sequence[float]) -> float | None:
     """Their average over frequencies."""
     known = ceilings(scene)
     return float(np.mean([known[f] for f in ghz])) if known else None
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; the first column is left-aligned."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib import pyplot as plt
 
-from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, median_cell, scores, summary_cells
 from experiments.jobs import REFERENCES, SEEDS, Job
 from experiments.paper import DENSE_SCENE, FIGURE_7_AVERAGE, FIGURE_7_GAIN, FIGURE_7_POINTS, GHZ_21
 from experiments.plots import STYLES, save
+from experiments.report import markdown
 from experiments.results import Results
 from experiments.statistics import compare, typical
 

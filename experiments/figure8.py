@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib import pyplot as plt
 
-from experiments.cells import NOT_RUN, SUMMARY, Scores, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.cells import NOT_RUN, SUMMARY, Scores, ceiling, cell, median_cell, scores, summary_cells
 from experiments.figure7 import jobs_of as all_frequencies
 from experiments.jobs import SEEDS, Job
 from experiments.paper import COMBINATIONS, DENSE_SCENE, FIGURE_8, GHZ_21
 from experiments.plots import save
+from experiments.report import markdown
 from experiments.results import Results
 
 TITLE = "Figure 8: unseen frequencies, combinations A-K of table 6 (scene 1)"

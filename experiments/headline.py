@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments import figure7, figure8, table1, table3
-from experiments.cells import NAMES, NOT_RUN, Scores, cell, markdown, scores
+from experiments.cells import NAMES, NOT_RUN, Scores, cell, scores
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_AVERAGE, TABLE_1_OVERALL, ZERO_SHOT_DROP
+from experiments.report import markdown
 from experiments.results import Results
 from experiments.statistics import compare, typical
 

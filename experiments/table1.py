@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from experiments.cells import NAMES, SUMMARY, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells
 from experiments.jobs import REFERENCES, SEEDS, Job
 from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
+from experiments.report import markdown
 from experiments.results import Results
 
 TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"

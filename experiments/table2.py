@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from experiments.baselines import reference_average
-from experiments.cells import NAMES, ceiling, cell, markdown, median_cell, scores, summary_cells
+from experiments.cells import NAMES, ceiling, cell, median_cell, scores, summary_cells
 from experiments.jobs import REFERENCES, SCORED, Job
 from experiments.paper import SCENES, TABLE_2
+from experiments.report import markdown
 from experiments.results import Results
 
 TITLE = "Table 2: unseen frequencies, combinations C1-C4 of table 5"

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from experiments.cells import ceiling, cell, markdown, scores, summary_cells
+from experiments.cells import ceiling, cell, scores, summary_cells
 from experiments.jobs import SEEDS, Job
 from experiments.paper import DENSE_SCENE, TABLE_3
+from experiments.report import markdown
 from experiments.results import Results
 
 TITLE = "Table 3: the two frequency embeddings, scene 1 at 21 frequencies"
