@@ -102,7 +102,8 @@ def changed_settings(name: str, steps: int) -> Settings:
         return max(block, round(count * scale / block) * block) if count else 0
 
     wideband: WidebandConfig = dataclasses.replace(base.wideband, **field)
-    optimiser: OptimConfig = dataclasses.replace(base.optim, **{"steps": steps, "min_steps": steps} | optim)
+    changed: Change = {"steps": steps, "min_steps": steps} | optim
+    optimiser: OptimConfig = dataclasses.replace(base.optim, **changed)
     shrunk = {key: shrink(getattr(base.density, key)) for key in ("every", "start", "reset_every")}
     control: DensityConfig = dataclasses.replace(base.density, **shrunk | density)
     loop = dataclasses.replace(base.loop, evaluate_every=10 * steps, checkpoint_every=10 * steps)

@@ -124,7 +124,7 @@ class Profile:
 GAUSSIANS = {"gaussians": 1000}
 TINY = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance_widths": (8,)}
 PROFILES = {
-    "quick": Profile("cpu", 1500, 1000, 1000, {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS, "loop": {"epoch_steps": 25}}),
+    "quick": Profile("cpu", 1000, 500, 600, {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS, "loop": {"epoch_steps": 25}}),
     "paper": Profile("gpu", 14_000, 14_000, 4000),
     # Proves within minutes that everything works.
     "smoke": Profile("smoke", 8, 4, 4, {"wideband": TINY, "wrfgs": TINY, "optim": {"batch": 2}, "loop": {"epoch_steps": 2}}),

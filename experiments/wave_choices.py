@@ -59,10 +59,11 @@ class Command:
 def changed_settings(name: str, steps: int) -> Settings:
     """The `cpu` preset of the wave field with one change."""
     base, (field, optim) = preset_settings("cpu", "wave"), CHANGES[name]
+    changed: Change = {"steps": steps, "min_steps": steps} | optim
     return dataclasses.replace(
         base,
         wave=dataclasses.replace(base.wave, **field),
-        optim=dataclasses.replace(base.optim, **{"steps": steps, "min_steps": steps} | optim),
+        optim=dataclasses.replace(base.optim, **changed),
         loop=dataclasses.replace(base.loop, evaluate_every=10 * steps, checkpoint_every=10 * steps),
     )
 

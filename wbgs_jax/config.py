@@ -129,7 +129,7 @@ class OptimConfig:
     """lambda of the paper's equation 5."""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Of a field that trains on some directions only, where there is no SSIM."""
-    network_lr: float = 1e-3
+    network_lr: float = 4e-3
     """Authors: 8e-4."""
     network_weight_decay: float = 0.0
     means_lr: float = 1e-3
@@ -175,6 +175,18 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
+class SearchConfig:
+    """Search for known materials before the first step of the wave field (material_search.py)."""
+
+    rounds: int = 3
+    """Times all materials are gone through; 0: no search."""
+    spectra: int = 384
+    """Training spectra that are looked at."""
+    sure: float = 2.0
+    """Standard errors by which what has been learned must fit better than every known material to be kept."""
+
+
+@dataclass(frozen=True)
 class LoopConfig:
     """How the host drives training."""
 
@@ -203,6 +215,7 @@ class Settings:
     wave: WaveConfig = field(default_factory=WaveConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
 
 
@@ -231,21 +244,16 @@ PRESETS: dict[str, Settings] = {
 WAVE_STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """The wave field has a few numbers a material to learn, not networks."""
 
-NERF2_LR = {"smoke": 4e-3, "cpu": 4e-3, "gpu": 8e-4}
-"""The volume learns with its networks alone: docs/baselines.md has the figures of the small ones."""
-
 
 def preset_settings(preset: str, field: str) -> Settings:
     """A preset as it suits a field."""
     settings = PRESETS[preset]
     if field == "wrfgs":
         return dataclasses.replace(settings, wrfgs=without_frequency(settings.wideband))
-    if field == "nerf2":
-        return dataclasses.replace(settings, optim=dataclasses.replace(settings.optim, network_lr=NERF2_LR[preset]))
     if field != "wave":
         return settings
     steps = WAVE_STEPS[preset]
-    optim = dataclasses.replace(settings.optim, steps=steps, min_steps=steps // 2, batch=8, curriculum=0.5)
+    optim = dataclasses.replace(settings.optim, steps=steps, min_steps=steps // 2, batch=8)
     loop = dataclasses.replace(settings.loop, evaluate_every=min(settings.loop.evaluate_every, steps // 2))
     return dataclasses.replace(settings, optim=optim, loop=loop)
 

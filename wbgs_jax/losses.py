@@ -12,6 +12,8 @@ _WINDOW, _SIGMA = 11, 1.5
 FAINTEST = 1e-12
 """Power relative to the truth's, below which predictions are all the same to the loss: a prediction of nearly nothing has no
 gradient that leads anywhere."""
+GOOD_MATCH = 2e-3
+"""Unlikeness below which two snapshots are the same to a search."""
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -53,11 +55,24 @@ def snapshot_loss(
     The correlation |y^H y_hat|^2 / (|y|^2 |y_hat|^2) is blind to a common phase and scale; the amplitude is that of the whole
     array, in nepers.
     """
+    correlation, power = _correlation_and_power(predicted, truth)
+    return jnp.mean(1 - correlation), jnp.mean((0.5 * jnp.log(power)) ** 2)
+
+
+def unlikeness(predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]) -> Float[Array, "*n"]:
+    """log(1 - correlation): the likelihood where every snapshot has a noise of its own, unknown level. No match is perfect."""
+    correlation, _ = _correlation_and_power(predicted, truth)
+    return jnp.log(1 - correlation + GOOD_MATCH)
+
+
+def _correlation_and_power(
+    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """|y^H y_hat|^2 / (|y|^2 |y_hat|^2), and |y_hat|^2 / |y|^2."""
     scale = jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
     unit_truth, relative = truth / scale, predicted / scale
     power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
-    product = jnp.sum(unit_truth.conj() * relative, -1)
-    return jnp.mean(1 - squared_magnitude(product) / power), jnp.mean((0.5 * jnp.log(power)) ** 2)
+    return squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power, power
 
 
 def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:

@@ -14,6 +14,7 @@ _BY_NAME = {
     "quats": "quats",
     "opacity_logits": "opacity_logits",
     "log_thickness": "thickness",
+    "known_thickness": FROZEN,
     "materials": "materials",
     "residual": "residual",
     "log_survival": "residual",

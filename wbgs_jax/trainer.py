@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from wbgs_jax import checkpoint, density, metrics
+from wbgs_jax import checkpoint, density, material_search, metrics
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import make_mesh, make_surface
@@ -176,6 +176,19 @@ class Run:
         if config.reset_every and step % config.reset_every == 0:
             self.state = density.reset_attenuation(self.state, config)
 
+    def search(self) -> None:
+        """Before the first step: known materials that fit, for a field that has materials."""
+        config = self.settings.search
+        if self.step or not config.rounds or not hasattr(self.state.params, "materials"):
+            return
+        begin = time.perf_counter()
+        rng = np.random.default_rng([self.seed, 6])
+        chosen = rng.choice(self.dataset.train, min(config.spectra, len(self.dataset.train)), replace=False)
+        params, report = material_search.search_materials(self.field, self.state.params, self.data, chosen, config)
+        self.state = init_state(params, self.optimizer)
+        self.seconds += time.perf_counter() - begin
+        self.log({"step": 0, "search": dataclasses.asdict(report)})
+
     def evaluate(self) -> float:
         """Median SSIM (skimage) on the watched held-out spectra."""
         predicted = predict_spectra(self.field, self.state.params, self.dataset, self.watched)
@@ -265,6 +278,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
     run = Run(dataset, field_name, settings, seed, folder)
     if resume:
         run.restore()
+    run.search()
     loop, total = settings.loop, settings.optim.steps
     with _deferred_interrupt() as interrupt, TrainingProgress(total, run.step) as progress:
         while run.step < total:

@@ -59,7 +59,13 @@ class Materials:
     slope: Float[Array, "m"]
     """d."""
     log_thickness: Float[Array, "m"]
-    """log of metres."""
+    """log of metres, where the scene does not say."""
+    known_thickness: Float[Array, "m"]
+    """Metres, not trained; 0 where it is not known."""
+
+    def thickness(self) -> Float[Array, "m"]:
+        """Metres."""
+        return jnp.where(self.known_thickness > 0, self.known_thickness, jnp.exp(self.log_thickness))
 
 
 @pytree
@@ -107,12 +113,12 @@ def init(key: Key[Array, ""], mesh: Mesh, config: WaveConfig, capacity: int | No
         raise UserError(f"--wave.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
     facets = facets_from_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.cluster), config.max_facets)
     m = mesh.thickness.shape[0]
-    thickness = jnp.where(mesh.thickness > 0, mesh.thickness, config.thickness)
     materials = Materials(
         log_susceptibility=jnp.full(m, np.log(config.permittivity - 1), jnp.float32),
         log_conductivity=jnp.full(m, np.log(config.conductivity), jnp.float32),
         slope=jnp.full(m, config.slope, jnp.float32),
-        log_thickness=jnp.log(thickness).astype(jnp.float32),
+        log_thickness=jnp.full(m, np.log(config.thickness), jnp.float32),
+        known_thickness=jnp.asarray(mesh.thickness, jnp.float32),
     )
     return WaveParams(
         materials=materials,
@@ -214,7 +220,7 @@ def skeleton(config: WaveConfig, sizes: dict[str, int]) -> WaveParams:
             return jnp.zeros(shape, jnp.float32)
 
         return WaveParams(
-            materials=Materials(*[zeros(m)] * 4),
+            materials=Materials(*[zeros(m)] * 5),
             residual=zeros(f, 2),
             log_survival=zeros(2, 3),
             directivity=zeros(),
@@ -283,7 +289,7 @@ def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""])
     m, cluster = params.materials, plan.search.facets.part
     sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
-    return Slabs(permittivity[cluster], jnp.exp(m.log_thickness)[cluster])
+    return Slabs(permittivity[cluster], m.thickness()[cluster])
 
 
 def arrivals_at(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Float[Array, ""]) -> Arrivals:

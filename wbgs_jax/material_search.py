@@ -1,0 +1,112 @@
+"""Search for materials on the host, before the first epoch: what gradients alone cannot find.
+
+The phase behind a slab turns by many radians at high frequencies. Its permittivity then has a valley of the loss for every
+turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
+data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
+apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
+spectra best is taken, unless what is there fits better by more than chance. Training goes on from there.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields import Field
+from wbgs_jax.losses import unlikeness
+from wbgs_jax.train_step import TrainingData
+
+ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
+    # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
+    "concrete": (5.24, 0.0462, 0.7822),
+    "brick": (3.91, 0.0238, 0.16),
+    "plasterboard": (2.73, 0.0085, 0.9395),
+    "wood": (1.99, 0.0047, 1.0718),
+    "glass": (6.31, 0.0036, 1.3394),
+    "ceiling board": (1.48, 0.0011, 1.0750),
+    "chipboard": (2.58, 0.0217, 0.78),
+    "plywood": (2.71, 0.33, 0.0),
+    "marble": (7.074, 0.0055, 0.9262),
+    "floorboard": (3.66, 0.0044, 1.3515),
+    "metal": (1.01, 1e7, 0.0),
+}
+"""ITU-R P.2040-3, table 3 (metal has 1 there, whose logarithm minus 1 cannot be stored)."""
+Scores = Callable[[Any, Any], Float[Array, "k n"]]
+"""(parameters, K candidates for their materials) -> log unlikeness of N spectra."""
+
+
+@dataclass(frozen=True)
+class SearchReport:
+    """What a search did."""
+
+    before: float
+    """Mean log unlikeness of the spectra that were looked at."""
+    after: float
+    taken: dict[int, str]
+    """Materials, and the entry that each of them got."""
+
+
+def search_materials(
+    field: Field, params: Any, data: TrainingData, spectra: Int[np.ndarray, "n"], config: SearchConfig
+) -> tuple[Any, SearchReport]:
+    """Parameters with the materials that fit some training spectra best."""
+    score = _make_scores(field, data, jnp.asarray(spectra, jnp.int32))
+    before, taken = np.zeros(len(spectra)), {}
+    for turn in range(config.rounds):
+        for material in range(len(params.materials.slope)):
+            candidates = [params.materials, *_entries(params.materials, material)]
+            scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)))
+            best = 1 + int(np.argmin(scores[1:].mean(1)))
+            before = scores[0] if turn == material == 0 else before
+            if not _surely_better(scores[0], scores[best], config.sure):
+                params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
+                taken[material] = list(ITU_MATERIALS)[best - 1]
+    return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
+
+
+def _surely_better(new: Float[np.ndarray, "n"], old: Float[np.ndarray, "n"], errors: float) -> bool:
+    """By more than so many standard errors of the mean difference."""
+    gain = old - new
+    return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
+
+
+def _make_scores(field: Field, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
+    def score(params, candidates):
+        query = jax.tree.map(lambda a: a[spectra], data.query)
+
+        def one(materials):
+            seen = field.observe(
+                dataclasses.replace(params, materials=materials),
+                data.memory,
+                data.receiver,
+                query,
+                data.tx_index[spectra],
+                None,
+                None,
+            )
+            if seen.snapshots is not None and data.snapshots is not None:
+                return unlikeness(seen.snapshots, data.snapshots[spectra])
+            return jnp.log(jnp.mean(jnp.abs(seen.pas - data.pas(spectra)), (-2, -1)))
+
+        return jax.lax.map(one, candidates)
+
+    return jax.jit(score)
+
+
+def _entries(materials: Any, material: int) -> list[Any]:
+    """Copies in which one material is one of ITU-R P.2040."""
+    return [
+        dataclasses.replace(
+            materials,
+            log_susceptibility=materials.log_susceptibility.at[material].set(np.log(permittivity - 1)),
+            log_conductivity=materials.log_conductivity.at[material].set(np.log(c)),
+            slope=materials.slope.at[material].set(d),
+        )
+        for permittivity, c, d in ITU_MATERIALS.values()
+    ]
