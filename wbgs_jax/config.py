@@ -179,7 +179,7 @@ class SearchConfig:
     """Search for known materials before the first step of the wave field (material_search.py)."""
 
     rounds: int = 3
-    """Times all materials are gone through; 0: no search."""
+    """Times all materials are gone through, at most; 0: no search."""
     spectra: int = 384
     """Training spectra that are looked at."""
     sure: float = 2.0

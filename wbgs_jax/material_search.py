@@ -59,6 +59,7 @@ def search_materials(
     score = _make_scores(field, data, jnp.asarray(spectra, jnp.int32))
     before, taken = np.zeros(len(spectra)), {}
     for turn in range(config.rounds):
+        known = dict(taken)
         for material in range(len(params.materials.slope)):
             candidates = [params.materials, *_entries(params.materials, material)]
             scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)))
@@ -67,6 +68,8 @@ def search_materials(
             if not _surely_better(scores[0], scores[best], config.sure):
                 params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
                 taken[material] = list(ITU_MATERIALS)[best - 1]
+        if taken == known:
+            break
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
