@@ -64,7 +64,7 @@ def volume(results: Results) -> str:
         rows.append([scene, *(median_cell(v) for v in values.values()), *test])
     note = (
         f"A NeRF2-style volume marches rays and is slow to ask: it is scored on {SCORED['nerf2']} of the held-out transmitters,"
-        " and here so are the others. It has the frequency as an input and sees as many spectra as ours."
+        " and here so are the others. It has the frequency as an input and sees as many spectra as ours, some pixels of each."
     )
     head = ["scene", *(NAMES[m] for m in models), "ours better at", "p"]
     return note + "\n\n" + markdown(head, rows)

@@ -25,6 +25,8 @@ from wbgs_jax.train import prepare_folder
 from wbgs_jax.trainer import train
 
 CURVE_POINTS = 200
+ENVIRONMENT = environment()
+"""Read when this code is: what is committed while it runs is not what ran."""
 BLOCK = 256
 """Spectra scored at a time."""
 
@@ -53,7 +55,7 @@ def execute(
 
     `may_go_on` is called where stopping loses nothing, and raises if the job is to stop.
     """
-    origin = {"profile": profile, "environment": environment()}
+    origin = {"profile": profile, "environment": ENVIRONMENT}
     if job.field == REFERENCES:
         return reference_scores(job) | origin, None
     chosen = settings(job, PROFILES[profile])
@@ -66,12 +68,13 @@ def execute(
 
 def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
     """Train one model and score it, unless that is done."""
+    trained_ghz = job.train_ghz if job.combination else ()
+    config = RunConfig(job.scene, job.field, PROFILES[profile].preset, job.seed, None, chosen, trained_ghz)
+    prepare_folder(folder, config, resume=True)  # refuses what other settings have begun
     done = folder / "part.npz"
     if done.exists():
         with np.load(done) as archive:
             return Part(**dict(archive))
-    config = RunConfig(job.scene, job.field, PROFILES[profile].preset, job.seed, None, chosen, job.train_ghz)
-    prepare_folder(folder, config, resume=True)
     trained = train(dataset, job.field, chosen, job.seed, folder, resume=True)
     may_go_on()
     begin = time.perf_counter()
@@ -161,7 +164,7 @@ def difference(chosen: Settings, base: Settings, field: str) -> dict[str, Any]:
     pairs = [
         (f"{section}.{name}", value, getattr(getattr(base, section), name))
         for section, values in dataclasses.asdict(chosen).items()
-        if section in (field, "optim", "density", "loop")
+        if section in (field, "optim", "density", "search", "loop")
         for name, value in values.items()
     ]
     return {name: value for name, value, other in pairs if value != other}

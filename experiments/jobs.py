@@ -136,7 +136,7 @@ def settings(job: Job, profile: Profile) -> Settings:
     base = preset_settings(profile.preset, job.field)
     preset_steps = base.optim.steps
     for section, values in profile.changes.items():
-        base = changed(base, section, **values) if hasattr(base, section) else base
+        base = changed(base, section, **values)
     if VARIANTS[job.variant]:
         base = changed(base, job.field, **VARIANTS[job.variant])
     block = base.loop.epoch_steps

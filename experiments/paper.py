@@ -72,8 +72,6 @@ TABLE_3: dict[tuple[bool, bool], tuple[float, float]] = {
 
 FIGURE_7_AVERAGE = {"wideband": 0.72, "wrfgs": 0.63}
 """Averages over 21 frequencies ..."""
-FIGURE_7_DEVIATION = {"wideband": 0.007, "wrfgs": 0.016}
-"""... what the paper writes behind them as plus-minus ..."""
 FIGURE_7_GAIN = 0.143
 FIGURE_7_POINTS = {25: {"wideband": 0.73, "wrfgs": 0.65}, 70: {"wideband": 0.71, "wrfgs": 0.61}}
 """... and the two frequencies it names."""

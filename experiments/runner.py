@@ -161,11 +161,13 @@ def run_job(job: Job, command: Command, results: Results, clock: Clock) -> str:
         if results.get(job):
             return "done meanwhile"
         begin = time.perf_counter()
-        values, pictures = execute(job, command.profile, folder, clock.may_go_on)
+        try:
+            values, pictures = execute(job, command.profile, folder, clock.may_go_on)
+        finally:
+            jax.clear_caches()  # otherwise every job's compiled programs stay in memory
         seconds = time.perf_counter() - begin
         results.write(job, values | {"wall_seconds": round(seconds, 1)}, pictures)
         shutil.rmtree(folder, ignore_errors=True)
-        jax.clear_caches()  # otherwise every job's compiled programs stay in memory
         score = f"SSIM {values['average_of_medians']:.3f}, " if "average_of_medians" in values else ""
         return f"{score}{seconds:.0f} s"
 

@@ -296,6 +296,7 @@ def check(settings: Settings) -> None:
         "loop.evaluate-every": settings.loop.evaluate_every,
         "loop.checkpoint-every": settings.loop.checkpoint_every,
         "loop.keep-checkpoints": settings.loop.keep_checkpoints,
+        "search.spectra": settings.search.spectra,
     }
     _check_positive(positive)
     steps, block = settings.optim.steps, settings.loop.epoch_steps

@@ -36,9 +36,11 @@ ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     "floorboard": (3.66, 0.0044, 1.3515),
     "metal": (1.01, 1e7, 0.0),
 }
-"""ITU-R P.2040-3, table 3 (metal has 1 there, whose logarithm minus 1 cannot be stored)."""
-Scores = Callable[[Any, Any], Float[Array, "k n"]]
-"""(parameters, K candidates for their materials) -> log unlikeness of N spectra."""
+"""ITU-R P.2040-3, table 3 (metal has permittivity 1 there; log(eps_r - 1) is what is stored)."""
+UNSEEN = 1e-6
+"""A material that changes the scores by less is in no path of the spectra, and stays what it is."""
+Scores = Callable[[Any, Any, TrainingData, Int[Array, "n"]], Float[Array, "k n"]]
+"""(parameters, K candidates for their materials, data, N spectra) -> log unlikeness."""
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,17 @@ def search_materials(
     field: Field, params: Any, data: TrainingData, spectra: Int[np.ndarray, "n"], config: SearchConfig
 ) -> tuple[Any, SearchReport]:
     """Parameters with the materials that fit some training spectra best."""
-    score = _make_scores(field, data, jnp.asarray(spectra, jnp.int32))
-    before, taken = np.zeros(len(spectra)), {}
+    score, chosen = _make_scores(field), jnp.asarray(spectra, jnp.int32)
+    before, taken = np.zeros(len(spectra)), dict[int, str]()
     for turn in range(config.rounds):
         known = dict(taken)
         for material in range(len(params.materials.slope)):
             candidates = [params.materials, *_entries(params.materials, material)]
-            scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)))
+            scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates), data, chosen))
             best = 1 + int(np.argmin(scores[1:].mean(1)))
             before = scores[0] if turn == material == 0 else before
-            if not _surely_better(scores[0], scores[best], config.sure):
+            unseen = np.ptp(scores.mean(1)) < UNSEEN
+            if not unseen and not _surely_better(scores[0], scores[best], config.sure):
                 params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
                 taken[material] = list(ITU_MATERIALS)[best - 1]
         if taken == known:
@@ -79,8 +82,8 @@ def _surely_better(new: Float[np.ndarray, "n"], old: Float[np.ndarray, "n"], err
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def _make_scores(field: Field, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
-    def score(params, candidates):
+def _make_scores(field: Field) -> Scores:
+    def score(params, candidates, data, spectra):
         query = jax.tree.map(lambda a: a[spectra], data.query)
 
         def one(materials):

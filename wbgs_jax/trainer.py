@@ -1,4 +1,4 @@
-"""The host loop: jitted epochs, density control between them, checkpoints, curves, resume.
+"""The host loop: a search for materials, jitted epochs, density control between them, checkpoints, curves, resume.
 
 A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step.
 """

@@ -4,8 +4,8 @@
 
 The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (wave/). What a
 path carries follows from the slabs it is reflected by and passes through, and those are learned: permittivity, conductivity
-and thickness of every material, and a small residual of every facet. Phase-blind models cannot follow interference; this one
-does, and it yields the channel itself.
+and (where it is not known) thickness of every material, and a small residual of every facet. Phase-blind models cannot follow
+interference; this one does, and it yields the channel itself.
 """
 
 import dataclasses

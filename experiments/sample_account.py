@@ -1,0 +1,108 @@
+"""What the coherent field explains of the published sample: `python -m experiments.sample_account FOLDER`.
+
+Nothing is trained: every surface is plasterboard of 0.1 m, paths are taken away one kind at a time. The array sees directions
+above its horizon; of a line of sight from below only side lobes are in the picture. Writes
+experiments/results/sample_account.json; docs/wave.md quotes it.
+"""
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from wbgs_jax import metrics
+from wbgs_jax.config import WaveConfig
+from wbgs_jax.data import load_dataset
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.surface import make_mesh
+from wbgs_jax.errors import run_command
+from wbgs_jax.eval import environment
+from wbgs_jax.fields import wave
+from wbgs_jax.files import write_json
+from wbgs_jax.geometry import to_local
+from wbgs_jax.wave.paths import REFLECTED, TRANSMITTED
+
+RESULTS = Path(__file__).parent / "results"
+CONFIG = WaveConfig(
+    diffracted_tried=1, diffracted_kept=1, mirror_areas=(0.01, 0.2), permittivity=2.73, conductivity=0.0085, slope=0.94
+)
+AT_ONCE = 50
+"""Spectra."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Score what the mesh alone says about a sample."""
+
+    data: tyro.conf.Positional[str]
+    """Folder of the published layout."""
+    out: Path = RESULTS
+
+
+def main() -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m experiments.sample_account")
+    dataset = load_dataset(command.data)
+    params = wave.init(jax.random.key(0), make_mesh(dataset), CONFIG)
+    _, first = np.unique(dataset.tx_index, return_index=True)
+    plan, traced = wave.remember(params, dataset.receiver, jnp.asarray(dataset.tx_positions[first], jnp.float32))
+    reflections = np.asarray((traced.plain.kind == REFLECTED).sum(-1))
+    passes = np.asarray((traced.plain.kind == TRANSMITTED).sum(-1))
+    kept = {"line of sight": reflections == 0, "one reflection": reflections <= 1, "two reflections": reflections <= 2}
+    kept |= {"two reflections, nothing passes": (reflections <= 2) & (passes == 0), "no line of sight": reflections > 0}
+    scores = {name: ssim(dataset, params, plan, keep(traced, mask)) for name, mask in kept.items()}
+    report = {"dataset": dataset.name, "groups": by_group(dataset, sine_of_elevation(dataset), scores)} | environment()
+    write_json(command.out / "sample_account.json", report)
+    for group, row in report["groups"].items():
+        print(f"{group:28}", *(f"{name} {value}" for name, value in row.items()), sep="  ", file=sys.stderr)
+
+
+def keep(traced: wave.Traced, mask: np.ndarray) -> wave.Traced:
+    """The paths of a mask alone."""
+    return dataclasses.replace(traced, plain=dataclasses.replace(traced.plain, alive=traced.plain.alive & jnp.asarray(mask)))
+
+
+def ssim(dataset: Dataset, params: Any, plan: Any, traced: wave.Traced) -> Float[np.ndarray, "n"]:
+    """Of every spectrum."""
+
+    @jax.jit
+    def predict(traced, frequency_hz):
+        return wave.to_pas(wave.carry(params, plan, traced, frequency_hz), dataset.receiver)
+
+    found = []
+    for start in range(0, len(dataset), AT_ONCE):
+        index = np.arange(start, min(start + AT_ONCE, len(dataset)))
+        chosen = jax.tree.map(lambda leaf, i=index: leaf[dataset.tx_index[i]], traced)
+        predicted = np.asarray(predict(chosen, jnp.asarray(dataset.frequencies_hz[index], jnp.float32)))
+        found.append(metrics.ssim(predicted, np.asarray(dataset.pas(index))))
+    return np.concatenate(found)
+
+
+def sine_of_elevation(dataset: Dataset) -> Float[np.ndarray, "n"]:
+    """Of every spectrum's transmitter above the array's horizon."""
+    offset = dataset.tx_positions - np.asarray(dataset.receiver.position, np.float64)
+    local = np.asarray(to_local(jnp.asarray(offset, jnp.float32), dataset.receiver.orientation))
+    return local[:, 2] / np.linalg.norm(local, axis=-1)
+
+
+def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    """Median SSIM of training and test transmitters, above the horizon and not."""
+    test = np.isin(np.arange(len(dataset)), dataset.test)
+    groups = {}
+    for role, members in (("training", ~test), ("test", test)):
+        for place, there in (("above the horizon", sine > 0.05), ("at it or below", sine <= 0.05)):
+            chosen = members & there
+            count = {"transmitters": len(np.unique(dataset.tx_index[chosen]))}
+            groups[f"{role}, {place}"] = count | {name: round(float(np.median(s[chosen])), 3) for name, s in scores.items()}
+    return groups
+
+
+if __name__ == "__main__":
+    run_command(main)
