@@ -51,7 +51,7 @@ def main() -> None:
     """Entry point."""
     if quality := [read_json(path) for path in sorted(RESULTS.glob("quality_*.json"))]:
         print(quality_table(quality))
-    for path in sorted(RESULTS.glob("choices_*.json")):
+    for path in sorted(RESULTS.glob("*choices_*.json")):
         print("\n" + choices_table(path.stem, read_json(path)))
 
 

@@ -45,7 +45,7 @@ UNTRAINED: Change = {"materials_lr": 0.0, "thickness_lr": 0.0, "residual_lr": 0.
 
 VARIANTS: dict[str, Variant] = {
     "default": Variant(),
-    "phase_blind": Variant({"coherent": False}),
+    "phase_blind": Variant({"coherent": False}, search={"rounds": 0}),  # phases would name the materials
     "order_0": Variant({"mirror_areas": ()} | NO_EDGES),
     "order_1": Variant({"mirror_areas": (0.0,)} | NO_EDGES),
     "order_2": Variant({"mirror_areas": (0.0, 0.05)} | NO_EDGES),
