@@ -226,6 +226,7 @@ PRESETS: dict[str, Settings] = {
         nerf2=Nerf2Config(samples=8, directions=64, width=32, depth=3, radiance_widths=(32,)),
         optim=OptimConfig(steps=200, batch=4),
         density=DensityConfig(every=100, start=50, max_gaussians=640),
+        search=SearchConfig(rounds=1, spectra=96),
         loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),
     ),
     # The default without a GPU.

@@ -216,7 +216,7 @@ class Run:
     def restore(self) -> bool:
         """Load the newest checkpoint, if there is one."""
         steps = checkpoint.checkpoint_steps(self.checkpoints)
-        _forget_later_metrics(self.folder / "metrics.jsonl", steps[-1] if steps else 0)
+        _forget_later_metrics(self.folder / "metrics.jsonl", steps[-1] if steps else -1)
         if not steps:
             return False
         metadata = checkpoint.load_metadata(self.checkpoints, steps[-1])
@@ -278,9 +278,9 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
     run = Run(dataset, field_name, settings, seed, folder)
     if resume:
         run.restore()
-    run.search()
     loop, total = settings.loop, settings.optim.steps
     with _deferred_interrupt() as interrupt, TrainingProgress(total, run.step) as progress:
+        run.search()
         while run.step < total:
             before = run.step
             loss, ssim = run.epoch()
