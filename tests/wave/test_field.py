@@ -141,3 +141,17 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(scene, rng):
 def test_more_facets_than_can_be_numbered_are_refused():
     with pytest.raises(UserError, match="max-facets is 4094; the most is 4093"):
         field_of(room(), RX, max_facets=4094)
+
+
+def test_phase_blind_spectra_of_next_to_nothing_have_gradients():
+    """Behind metal everywhere: powers far below single precision."""
+    shell = [box((0.6, 0.6, 0.8), (1.4, 1.4, 1.6))]
+    params, plan = field_of(shell, RX, permittivity=4.0, conductivity=1e3, mirror_areas=(0.0,))
+    query = make_query([[3.0, 2.0, 1.0]], 94e9)
+    traced = jax.jit(wave.trace)(params, plan, query.tx_position)
+
+    def brightness(params):
+        return jnp.sum(wave.phase_blind_pas(params, plan, traced, query.frequency_hz))
+
+    gradients = jax.jit(jax.grad(brightness))(params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients.materials))

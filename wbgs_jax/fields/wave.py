@@ -44,6 +44,8 @@ from wbgs_jax.wave.transfer import Arrivals, Slabs, arrivals, snapshot
 STARTS_FROM = "mesh"
 TRACED_AT_ONCE = 16
 """Transmitters."""
+FAINTEST = 1e-30
+"""Amplitude that stands for nothing; its square would vanish in single precision."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Beyond it (S/m) every material is a mirror, and single precision ends."""
 
@@ -275,8 +277,9 @@ def phase_blind_pas(
     def covariance(traced, f):
         found = arrivals_at(params, plan, traced, f)
         steering = steering_vector(plan.receiver.element_positions, found.direction)
-        power = squared_magnitude(found.amplitude)
-        weighted = steering * (power / jnp.sum(power))[:, None]
+        strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(found.amplitude)))
+        power = squared_magnitude(found.amplitude / jnp.maximum(strongest, FAINTEST))
+        weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
         return steering.T @ weighted.conj()  # sum of power times a a^H
 
     grid = steering_vector(plan.receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
