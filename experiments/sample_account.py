@@ -18,6 +18,7 @@ import tyro
 from jaxtyping import Float
 
 from wbgs_jax import metrics
+from wbgs_jax.array import pas_directions
 from wbgs_jax.config import WaveConfig
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
@@ -58,10 +59,20 @@ def main() -> None:
     kept = {"line of sight": reflections == 0, "one reflection": reflections <= 1, "two reflections": reflections <= 2}
     kept |= {"two reflections, nothing passes": (reflections <= 2) & (passes == 0), "no line of sight": reflections > 0}
     scores = {name: ssim(dataset, params, plan, keep(traced, mask)) for name, mask in kept.items()}
-    report = {"dataset": dataset.name, "groups": by_group(dataset, sine_of_elevation(dataset), scores)} | environment()
-    write_json(command.out / "sample_account.json", report)
-    for group, row in report["groups"].items():
-        print(f"{group:28}", *(f"{name} {value}" for name, value in row.items()), sep="  ", file=sys.stderr)
+    local = in_sight(dataset)
+    sine, sight = local[:, 2], power_in_sight(dataset, local)
+    horizon = [
+        round(float(np.median(sight[dataset.tx_index == tx])), 3) for tx in np.unique(dataset.tx_index[np.abs(sine) < 0.01])
+    ]
+    report: dict[str, Any] = {
+        "dataset": dataset.name,
+        "groups": by_group(dataset, sine, scores),
+        "obstructed_transmitters": [i for i, tx in enumerate(dataset.tx_positions[first]) if obstructed(dataset, tx)],
+        "power_in_sight_on_the_horizon": horizon,
+    }
+    write_json(command.out / "sample_account.json", report | environment())
+    for name, row in (report.pop("groups") | report).items():
+        print(f"{name:28}", row, file=sys.stderr)
 
 
 def keep(traced: wave.Traced, mask: np.ndarray) -> wave.Traced:
@@ -85,11 +96,31 @@ def ssim(dataset: Dataset, params: Any, plan: Any, traced: wave.Traced) -> Float
     return np.concatenate(found)
 
 
-def sine_of_elevation(dataset: Dataset) -> Float[np.ndarray, "n"]:
-    """Of every spectrum's transmitter above the array's horizon."""
+def in_sight(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
+    """Unit vector to every spectrum's transmitter in the receiver's frame; its third component is above the array's horizon."""
     offset = dataset.tx_positions - np.asarray(dataset.receiver.position, np.float64)
     local = np.asarray(to_local(jnp.asarray(offset, jnp.float32), dataset.receiver.orientation))
-    return local[:, 2] / np.linalg.norm(local, axis=-1)
+    return local / np.linalg.norm(local, axis=-1, keepdims=True)
+
+
+def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Of every observed spectrum: its power at the pixel nearest to the transmitter's direction, relative to its largest."""
+    nearest = np.argmax(np.asarray(pas_directions(), np.float32).reshape(-1, 3) @ local.T, 0)
+    spectra = (np.asarray(dataset.pas(np.array([i]))).reshape(-1) for i in range(len(dataset)))
+    return np.array([spectrum[pixel] ** 2 for spectrum, pixel in zip(spectra, nearest, strict=True)])
+
+
+def obstructed(dataset: Dataset, tx_position: Float[np.ndarray, "3"]) -> bool:
+    """Whether any triangle of the whole mesh lies between a transmitter and the receiver (Moeller and Trumbore 1997)."""
+    start = np.asarray(dataset.receiver.position, np.float64)
+    a, b, c = (dataset.vertices[dataset.faces[:, i]].astype(np.float64) for i in range(3))
+    along, offset = tx_position - start, start - a
+    across = np.cross(along, c - a)
+    volume = np.sum((b - a) * across, -1)
+    scale = np.where(np.abs(volume) > 1e-12, 1 / np.where(volume == 0, 1, volume), 0)
+    turned = np.cross(offset, b - a)
+    u, v, t = np.sum(offset * across, -1) * scale, turned @ along * scale, np.sum((c - a) * turned, -1) * scale
+    return bool(((scale != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6) & (t < 1 - 1e-6)).any())
 
 
 def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
