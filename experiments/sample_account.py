@@ -130,6 +130,8 @@ def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, n
     for role, members in (("training", ~test), ("test", test)):
         for place, there in (("above the horizon", sine > 0.05), ("at it or below", sine <= 0.05)):
             chosen = members & there
+            if not chosen.any():
+                continue
             count = {"transmitters": len(np.unique(dataset.tx_index[chosen]))}
             groups[f"{role}, {place}"] = count | {name: round(float(np.median(s[chosen])), 3) for name, s in scores.items()}
     return groups
