@@ -15,11 +15,11 @@ FIELDS = ("wideband", "wave", REFERENCES)
 
 
 def jobs() -> list[Job]:
-    """Every field in every scene, first as the paper does it."""
+    """Every field in every scene, the harder version first."""
     return [
         Job(scene, field, combination, all_tx)
         for field in FIELDS
-        for all_tx in (True, False)
+        for all_tx in (False, True)
         for scene in SCENES
         for combination in COMBINATIONS
     ]
