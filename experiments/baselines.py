@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments import table1
-from experiments.cells import NAMES, NOT_RUN, at_transmitters, ceiling, cell, median_cell, scores
+from experiments.cells import NAMES, at_transmitters, ceiling, cell, median_cell, paired_cells, scores
 from experiments.jobs import REFERENCES, SCORED, Job
 from experiments.paper import GHZ_10, SCENES
 from experiments.report import markdown
 from experiments.results import Results
-from experiments.statistics import compare
 
 TITLE = "Baselines"
 NAMES_OF_REFERENCES = ("mean_image", "nearest_tx", "inverse_distance", "line_of_sight")
@@ -56,12 +55,8 @@ def volume(results: Results) -> str:
         slow = Job(scene, "nerf2")
         jobs = {m: [slow] if m[0] == "nerf2" else table1.jobs_of(scene, *m) for m in models}
         values = {m: at_transmitters(results, jobs[m], slow, GHZ_10) for m in models}
-        ours, theirs = values["wideband", ""], values["nerf2", ""]
-        test = [NOT_RUN, NOT_RUN]
-        if ours is not None and theirs is not None:
-            found = compare(ours, theirs)
-            test = [f"{100 * found.share:.0f} % of {found.transmitters}", f"{found.p:.1e}"]
-        rows.append([scene, *(median_cell(v) for v in values.values()), *test])
+        better, _, p = paired_cells(values["wideband", ""], values["nerf2", ""])
+        rows.append([scene, *(median_cell(v) for v in values.values()), better, p])
     note = (
         f"A NeRF2-style volume marches rays and is slow to ask: it is scored on {SCORED['nerf2']} of the held-out transmitters,"
         " and here so are the others. It has the frequency as an input and sees as many spectra as ours, some pixels of each."

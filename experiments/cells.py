@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from experiments.jobs import Job
 from experiments.results import Results
-from experiments.statistics import estimate, typical
+from experiments.statistics import compare, estimate, typical
 from wbgs_jax.data import released_scenes
 from wbgs_jax.data.schema import load_scene
 
@@ -70,6 +70,14 @@ def summary_cells(values: Scores | None, paper: float | None = None) -> list[str
     if len(found.seeds) > 1:
         seeds += f": {min(found.seeds):.3f}-{max(found.seeds):.3f}"
     return [cell(found.value, paper), f"{found.low:.3f}-{found.high:.3f}", seeds]
+
+
+def paired_cells(ours: Scores | None, theirs: Scores | None) -> list[str]:
+    """At how many transmitters ours is better, the median difference, and the p-value of the paired test."""
+    if ours is None or theirs is None:
+        return [NOT_RUN] * 3
+    test = compare(ours, theirs)
+    return [f"{100 * test.share:.0f} % of {test.transmitters}", f"{test.difference:+.3f}", f"{test.p:.1e}"]
 
 
 SUMMARY = ("average (paper)", "95 %", "seeds")

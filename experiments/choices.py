@@ -13,6 +13,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -139,12 +140,37 @@ def measure(dataset: Dataset, settings: Settings, seed: int, field: str = "wideb
     }
 
 
+def chosen_names(only: tuple[str, ...], known: dict[str, Any], kind: str) -> tuple[str, ...]:
+    """What a command line asks for, all by default; an unknown name is a `UserError`."""
+    if unknown := [name for name in only if name not in known]:
+        raise UserError(f"unknown {kind} {unknown[0]!r}; choose among: {', '.join(known)}")
+    return only or tuple(known)
+
+
+Measurement = Callable[[str, int], dict[str, Any]]
+"""(name, seed) -> scores of one training."""
+
+
+def run_series(path: Path, report: dict[str, Any], names: tuple[str, ...], seeds: tuple[int, ...], run: Measurement) -> None:
+    """Measure what the report does not hold yet, by name and seed; write it after every run."""
+    origin = environment()
+    for seed in seeds:
+        for name in names:
+            runs = report["changes"].setdefault(name, {"runs": []})["runs"]
+            if any(done["seed"] == seed for done in runs):
+                continue
+            begin = time.perf_counter()
+            runs.append(run(name, seed) | origin)
+            report["changes"][name]["median_of_medians"] = statistics.median(done["median_ssim"] for done in runs)
+            write_json(path, report)
+            scores = f"{runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}"
+            print(f"{name:32} {scores}  {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+
+
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.choices")
-    names = command.only or tuple(CHANGES)
-    if unknown := [name for name in names if name not in CHANGES]:
-        raise UserError(f"unknown change {unknown[0]!r}; choose among: {', '.join(CHANGES)}")
+    names = chosen_names(command.only, CHANGES, "change")
     dataset = load_dataset(command.data)
     if command.train_ghz:
         dataset = unseen_frequencies(dataset, command.train_ghz)
@@ -160,20 +186,12 @@ def main() -> None:
             f"{path} holds runs of {report[effort]:g} {effort}, not {amount:g}; move it away, give it a --label"
             f" or use --{effort} {report[effort]:g}"
         )
-    for seed in command.seeds:
-        for change in names:
-            runs = report["changes"].setdefault(change, {"runs": []})["runs"]
-            if any(run["seed"] == seed for run in runs):
-                continue
-            begin = time.perf_counter()
-            steps = command.steps if command.seconds is None else steps_within(dataset, change, command.seconds, seed)
-            runs.append(measure(dataset, changed_settings(change, steps), seed) | environment())
-            report["changes"][change]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
-            write_json(path, report)
-            print(
-                f"{change:26} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}  {time.perf_counter() - begin:.0f} s",
-                file=sys.stderr,
-            )
+
+    def run(change: str, seed: int) -> dict[str, Any]:
+        steps = command.steps if command.seconds is None else steps_within(dataset, change, command.seconds, seed)
+        return measure(dataset, changed_settings(change, steps), seed)
+
+    run_series(path, report, names, command.seeds, run)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib import pyplot as plt
 
 from experiments.cells import NOT_RUN, SUMMARY, Scores, ceiling, cell, median_cell, scores, summary_cells
@@ -68,8 +69,8 @@ def row(letter: str, values: Scores | None, full: Scores | None) -> list[str]:
     text = ", ".join(f"{f:g}" for f in trained) if len(trained) < 12 else f"all but {', '.join(f'{f:g}' for f in unseen)}"
     spread = ""
     if values is not None:
-        by_frequency = np.median(np.median(values, 1), 0)
-        spread = f"{by_frequency.min():.3f}-{by_frequency.max():.3f}"
+        medians = by_frequency(values)
+        spread = f"{medians.min():.3f}-{medians.max():.3f}"
     summary = summary_cells(values, FIGURE_8.get(letter))
     seen = median_cell(None if full is None else full[..., among])
     return [letter, text, *summary, spread, seen, cell(ceiling(DENSE_SCENE, unseen))]
@@ -80,6 +81,11 @@ def unseen_ghz(letter: str) -> list[float]:
     return [float(f) for f in GHZ_21 if f not in COMBINATIONS[letter]]
 
 
+def by_frequency(values: Scores) -> Float[np.ndarray, "ghz"]:
+    """Median over transmitters, then over seeds."""
+    return np.median(np.median(values, 1), 0)
+
+
 def draw(values: dict[str, Scores | None]) -> plt.Figure:
     """A bar a combination, a dot a frequency, the paper's value where its text gives one."""
     figure, axis = plt.subplots(figsize=(8.5, 3.8), layout="constrained")
@@ -87,9 +93,9 @@ def draw(values: dict[str, Scores | None]) -> plt.Figure:
         if v is None:
             axis.text(i, 0.02, NOT_RUN, rotation=90, ha="center", va="bottom", fontsize=8, color="0.4")
         else:
-            by_frequency = np.median(np.median(v, 1), 0)
-            axis.bar(i, by_frequency.mean(), color="C0", alpha=0.45, width=0.65, label="average" if letter == "D" else None)
-            axis.plot([i] * len(by_frequency), by_frequency, ".", color="C0", ms=4)
+            medians = by_frequency(v)
+            axis.bar(i, medians.mean(), color="C0", alpha=0.45, width=0.65, label="average" if letter == "D" else None)
+            axis.plot([i] * len(medians), medians, ".", color="C0", ms=4)
         if letter in FIGURE_8:
             label = "paper" if letter == "D" else None
             axis.plot([i - 0.33, i + 0.33], [FIGURE_8[letter]] * 2, color="C3", lw=1.5, label=label)

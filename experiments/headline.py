@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments import figure7, figure8, table1, table3
-from experiments.cells import NAMES, NOT_RUN, Scores, cell, scores
+from experiments.cells import NAMES, NOT_RUN, Scores, cell, paired_cells, scores
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_AVERAGE, TABLE_1_OVERALL, ZERO_SHOT_DROP
 from experiments.report import markdown
 from experiments.results import Results
-from experiments.statistics import compare, typical
+from experiments.statistics import typical
 
 TITLE = "Headline"
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
@@ -58,10 +58,9 @@ def gain_cells(ours: Scores | None, theirs: Scores | None, paper: dict[str, floa
     values = [None if v is None else average(v) for v in (ours, theirs)]
     shown = [cell(v, paper[name]) for v, name in zip(values, ("wideband", "wrfgs"), strict=True)]
     if ours is None or theirs is None:
-        return [*shown, *[NOT_RUN] * 4]
-    test = compare(ours, theirs)
+        return [*shown, NOT_RUN, *paired_cells(ours, theirs)]
     gain = percent(average(ours) / average(theirs) - 1, paper["wideband"] / paper["wrfgs"] - 1)
-    return [*shown, gain, f"{100 * test.share:.0f} % of {test.transmitters}", f"{test.difference:+.3f}", f"{test.p:.1e}"]
+    return [*shown, gain, *paired_cells(ours, theirs)]
 
 
 def average_row(pairs: list[tuple[float, float]]) -> list[str]:

@@ -82,17 +82,11 @@ def keep(traced: wave.Traced, mask: np.ndarray) -> wave.Traced:
 
 def ssim(dataset: Dataset, params: Any, plan: Any, traced: wave.Traced) -> Float[np.ndarray, "n"]:
     """Of every spectrum."""
-
-    @jax.jit
-    def predict(traced, frequency_hz):
-        return wave.to_pas(wave.carry(params, plan, traced, frequency_hz), dataset.receiver)
-
-    found = []
+    observe, found = jax.jit(wave.observe), []
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
-        chosen = jax.tree.map(lambda leaf, i=index: leaf[dataset.tx_index[i]], traced)
-        predicted = np.asarray(predict(chosen, jnp.asarray(dataset.frequencies_hz[index], jnp.float32)))
-        found.append(metrics.ssim(predicted, np.asarray(dataset.pas(index))))
+        seen = observe(params, (plan, traced), dataset.receiver, dataset.query(index), jnp.asarray(dataset.tx_index[index]))
+        found.append(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index))))
     return np.concatenate(found)
 
 

@@ -7,8 +7,6 @@ what is there already is skipped. docs/wave.md quotes it.
 """
 
 import dataclasses
-import statistics
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,13 +15,12 @@ import numpy as np
 import trimesh
 import tyro
 
-from experiments.choices import measure
+from experiments.choices import chosen_names, measure, run_series
 from wbgs_jax.config import Settings, preset_settings
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.eval import environment
-from wbgs_jax.files import read_json, write_json
+from wbgs_jax.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 Change = dict[str, Any]
@@ -101,9 +98,7 @@ def displaced(dataset: Dataset, metres: float, seed: int) -> Dataset:
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.wave_choices")
-    names = command.only or tuple(VARIANTS)
-    if unknown := [name for name in names if name not in VARIANTS]:
-        raise UserError(f"unknown variant {unknown[0]!r}; choose among: {', '.join(VARIANTS)}")
+    names = chosen_names(command.only, VARIANTS, "variant")
     dataset = load_dataset(command.data)
     path = command.out / f"wave_choices_{dataset.name}.json"
     report: dict[str, Any] = (
@@ -111,17 +106,13 @@ def main() -> None:
     )
     if report["steps"] != command.steps:
         raise UserError(f"{path} holds runs of {report['steps']} steps; move it away or use --steps {report['steps']}")
-    for seed in command.seeds:
-        for name in names:
-            runs = report["changes"].setdefault(name, {"runs": []})["runs"]
-            if any(run["seed"] == seed for run in runs):
-                continue
-            variant = VARIANTS[name]
-            changed = displaced(dataset, variant.displacement, seed) if variant.displacement else dataset
-            runs.append(measure(changed, settings_of(variant, command.steps), seed, "wave") | environment())
-            report["changes"][name]["median_of_medians"] = statistics.median(run["median_ssim"] for run in runs)
-            write_json(path, report)
-            print(f"{name:18} {runs[-1]['median_ssim']:.3f} / {runs[-1]['mean_ssim']:.3f}", file=sys.stderr, flush=True)
+
+    def run(name: str, seed: int) -> dict[str, Any]:
+        variant = VARIANTS[name]
+        changed = displaced(dataset, variant.displacement, seed) if variant.displacement else dataset
+        return measure(changed, settings_of(variant, command.steps), seed, "wave")
+
+    run_series(path, report, names, command.seeds, run)
 
 
 if __name__ == "__main__":

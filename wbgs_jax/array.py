@@ -54,6 +54,14 @@ def steering_vector(
     return jnp.exp(2j * jnp.pi * (directions @ element_positions.T))
 
 
+def array_response(
+    element_positions: Float[Array, "elements 3"], first: Float[Array, "n 3"], second: Float[Array, "m 3"]
+) -> Float[Array, "n m"]:
+    """|a(u)^H a(v)| / elements, 0..1: what the array hears in unit directions u of plane waves from v (receiver's frame)."""
+    steering_first, steering_second = (steering_vector(element_positions, u) for u in (first, second))
+    return jnp.abs(steering_first @ steering_second.conj().T) / element_positions.shape[0]
+
+
 def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m elements"]) -> Float[Array, "*nm"]:
     """Amplitude of conventional beamforming |a^H y| for every snapshot and every steering vector: shape (*n, *m)."""
     return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]]))

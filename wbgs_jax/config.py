@@ -272,7 +272,7 @@ def from_dict(values: Any) -> Settings:
             raise KeyError(f"{cls.__name__}.{min(missing)}")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
 
-    sections = {f.name: type(getattr(Settings(), f.name)) for f in dataclasses.fields(Settings)}
+    sections = {name: type(section) for name, section in vars(Settings()).items()}
     try:
         built = {name: build(sections[name], value) for name, value in values.items()}
         return Settings(**built | {name: built[name] for name in sections})

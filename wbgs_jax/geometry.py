@@ -75,3 +75,8 @@ def pixel_to_angles(
     """Azimuth and zenith (radians) of continuous pixel coordinates (x: column, y: row)."""
     sx, sy = pixels_per_radian(projection)
     return pixels[..., 0] / sx - jnp.pi, pixels[..., 1] / sy
+
+
+def smooth_length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
+    """Length (metres), rounded up to a millimetre so that it is differentiable everywhere."""
+    return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)

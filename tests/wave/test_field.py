@@ -12,6 +12,7 @@ from rooms import box, field_of, room
 from synthetic import tiny_scene, tiny_settings
 
 from wbgs_jax import load_trained, make_query, predict, predictor, train
+from wbgs_jax.array import cbf
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.schema import save_scene
 from wbgs_jax.data.surface import make_mesh
@@ -134,7 +135,7 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(scene, rng):
     drawn = jax.vmap(lambda p: wave.snapshot(arrived._replace(amplitude=arrived.amplitude * p), plan.receiver))(phases)
     drawn = drawn / jnp.abs(drawn).max()
     grid = wave.steering_vector(plan.receiver.element_positions, jnp.asarray(wave.pas_directions(), jnp.float32))
-    power = jnp.mean(wave.cbf(drawn, grid) ** 2, 0)
+    power = jnp.mean(cbf(drawn, grid) ** 2, 0)
     np.testing.assert_allclose(found, jnp.sqrt(power / power.max()), atol=0.05)
 
 

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, pas_directions, steering_vector
+from wbgs_jax.array import PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
 from wbgs_jax.checks import check_query, check_receiver
 from wbgs_jax.config import Nerf2Config
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
 from wbgs_jax.fields.observation import Observation
-from wbgs_jax.geometry import rotation_matrix, to_local
+from wbgs_jax.geometry import rotation_matrix, smooth_length, to_local
 from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, signal_activation
 from wbgs_jax.pytree import pytree, static
 from wbgs_jax.types import Query, Receiver
@@ -28,7 +28,7 @@ from wbgs_jax.types import Query, Receiver
 STARTS_FROM = "box"
 PIXELS = PAS_HEIGHT * PAS_WIDTH
 MIN_LENGTH = 1e-3
-"""Metres: shorter rays and legs are taken to be this long."""
+"""Metres: shorter rays are taken to be this long."""
 
 
 @pytree
@@ -210,17 +210,13 @@ def _relative_inputs(params: Nerf2Params, receiver: Receiver, rays: Rays, query:
     Of a direction: its angle to the TX and the array's response to the TX there. Of a place: the cosine of the bounce, and
     distance and direction to the TX.
     """
-    to_tx = _unit(to_local(query.tx_position - receiver.position, receiver.orientation))[0]
-    steering_ray, steering_tx = (steering_vector(receiver.element_positions, u) for u in (rays.local, to_tx))
-    response = jnp.abs(steering_ray @ steering_tx.conj().T) / receiver.element_positions.shape[0]
+    to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
+    to_tx = to_tx / smooth_length(to_tx)
+    response = array_response(receiver.element_positions, rays.local, to_tx)
     of_ray = jnp.stack([rays.local @ to_tx.T, response], -1)[:, None]
     points = _points(receiver, rays, params.config.samples)
-    direction, distance = _unit(query.tx_position - points[:, :, None])
+    leg = query.tx_position - points[:, :, None]
+    distance = smooth_length(leg)
+    direction = leg / distance
     bounce = -jnp.sum(direction * rays.world[:, None, None], -1, keepdims=True)
     return [of_ray, jnp.concatenate([bounce, distance / _half_extent(params.box), direction], -1)]
-
-
-def _unit(vectors: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 1"]]:
-    """Directions and lengths, differentiable everywhere."""
-    length = jnp.sqrt(jnp.sum(vectors * vectors, -1, keepdims=True) + MIN_LENGTH**2)
-    return vectors / length, length

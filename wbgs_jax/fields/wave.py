@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax.array import cbf, normalise, pas_directions, steering_vector
+from wbgs_jax.array import normalise, pas_directions, snapshot_to_pas, steering_vector
 from wbgs_jax.checks import check_query, check_receiver
 from wbgs_jax.config import WaveConfig
 from wbgs_jax.errors import UserError
@@ -265,8 +265,7 @@ def carry(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Floa
 def to_pas(y: Complex[Array, "b elements"], receiver: Receiver) -> Float[Array, "b 90 360"]:
     """Spectra of snapshots of any scale."""
     y = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + 1e-30)
-    steering = steering_vector(receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
-    return normalise(cbf(y, steering))
+    return snapshot_to_pas(y, receiver.element_positions)
 
 
 def phase_blind_pas(

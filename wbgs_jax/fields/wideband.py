@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from wbgs_jax.array import steering_vector
+from wbgs_jax.array import array_response
 from wbgs_jax.checks import check_query, check_receiver, check_surface
 from wbgs_jax.config import WidebandConfig
 from wbgs_jax.encoding import frequency_encoding, positional_encoding
 from wbgs_jax.fields.observation import Observation
-from wbgs_jax.geometry import to_local
+from wbgs_jax.geometry import smooth_length, to_local
 from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, attenuation_activation, signal_activation
 from wbgs_jax.pytree import pytree, static
 from wbgs_jax.splat import Capacity, GeometryPlan, geometry_plan, render_splats
@@ -181,11 +181,6 @@ def _inputs(
     return gaussian, both, [encoded] if config.radiance_frequency else []
 
 
-def _length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
-    """Length, rounded up to a millimetre so that it is differentiable everywhere."""
-    return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)
-
-
 def _relative_features(
     means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]
 ) -> Float[Array, "n b 7"]:
@@ -195,12 +190,11 @@ def _relative_features(
     line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
     """
     to_g, to_tx = (to_local(p - receiver.position, receiver.orientation) for p in (means, query.tx_position))
-    to_g, to_tx = to_g / _length(to_g), to_tx / _length(to_tx)
-    steering_g, steering_tx = (steering_vector(receiver.element_positions, u) for u in (to_g, to_tx))
-    response = jnp.abs(steering_g @ steering_tx.conj().T) / receiver.element_positions.shape[0]
+    to_g, to_tx = to_g / smooth_length(to_g), to_tx / smooth_length(to_tx)
+    response = array_response(receiver.element_positions, to_g, to_tx)
     leg, back = query.tx_position[None] - means[:, None], receiver.position - means
-    distance = _length(leg)
+    distance = smooth_length(leg)
     direction = leg / distance
-    bounce = jnp.sum(direction * (back / _length(back))[:, None], -1)
+    bounce = jnp.sum(direction * (back / smooth_length(back))[:, None], -1)
     scalars = jnp.stack([to_g @ to_tx.T, response, bounce], -1)
     return jnp.concatenate([scalars, distance / size, direction], -1)
