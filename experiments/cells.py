@@ -16,9 +16,11 @@ NOT_RUN = "not run yet"
 Scores = Float[np.ndarray, "seeds tx ghz"]
 NAMES = {
     ("wideband", ""): "wideband (ours)",
+    ("wideband", "long"): "wideband (ours), 5x samples",
     ("wave", ""): "coherent (ours)",
-    ("wrfgs", ""): "WRF-GS, equal samples",
-    ("wrfgs", "long"): "WRF-GS, long",
+    ("wrfgs", ""): "WRF-GS",
+    ("wrfgs", "long"): "WRF-GS, 5x samples",
+    ("wrfgs", "longest"): "WRF-GS, 10x samples",
     ("nerf2", ""): "NeRF2-style",
 }
 """Of fields and variants, for people."""

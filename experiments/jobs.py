@@ -32,10 +32,15 @@ VARIANTS: dict[str, dict[str, Any]] = {
     # name: changes of the wideband field
     "": {},
     "long": {},
+    "longest": {},
     "no_attenuation": {"attenuation_frequency": False},
     "no_radiance": {"radiance_frequency": False},
     "no_frequency": {"attenuation_frequency": False, "radiance_frequency": False},
 }
+
+
+BUDGETS = {"long": 5, "longest": 10}
+"""Variants that see so many times the usual number of spectra."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class Job:
     @property
     def pictured(self) -> bool:
         """Whether predicted pictures are kept."""
-        everywhere = self.field not in (REFERENCES, *SCORED) and not self.combination
+        everywhere = self.field not in (REFERENCES, *SCORED) and not self.combination and self.variant != "longest"
         return everywhere and self.scene in PICTURED_SCENES and self.seed == 0
 
     def dataset(self) -> Dataset:
@@ -113,9 +118,7 @@ class Profile:
 
     preset: str
     steps: int
-    """Of a field for all frequencies. Models of one frequency share as many between them ..."""
-    long_steps: int
-    """... or, in the variant `long`, have so many each."""
+    """Of a field for all frequencies. Models of one frequency share as many between them."""
     wave_steps: int
     changes: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Section of the settings: what differs from the preset."""
@@ -124,10 +127,10 @@ class Profile:
 GAUSSIANS = {"gaussians": 1000}
 TINY = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance_widths": (8,)}
 PROFILES = {
-    "quick": Profile("cpu", 1000, 500, 600, {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS, "loop": {"epoch_steps": 25}}),
-    "paper": Profile("gpu", 14_000, 14_000, 4000),
+    "quick": Profile("cpu", 1000, 600, {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS, "loop": {"epoch_steps": 25}}),
+    "paper": Profile("gpu", 14_000, 4000),
     # Proves within minutes that everything works.
-    "smoke": Profile("smoke", 8, 4, 4, {"wideband": TINY, "wrfgs": TINY, "optim": {"batch": 2}, "loop": {"epoch_steps": 2}}),
+    "smoke": Profile("smoke", 8, 4, {"wideband": TINY, "wrfgs": TINY, "optim": {"batch": 2}, "loop": {"epoch_steps": 2}}),
 }
 
 
@@ -153,9 +156,8 @@ def wanted_steps(job: Job, profile: Profile) -> float:
     """Steps of one model of a job."""
     if job.field == "wave":
         return profile.wave_steps
-    if job.field not in ONE_FREQUENCY:
-        return profile.steps
-    return profile.long_steps if job.variant == "long" else profile.steps / len(job.test_ghz)
+    steps = profile.steps * BUDGETS.get(job.variant, 1)
+    return steps / len(job.test_ghz) if job.field in ONE_FREQUENCY else steps
 
 
 def changed(settings: Settings, section: str, **values: Any) -> Settings:

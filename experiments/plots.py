@@ -12,7 +12,8 @@ from wbgs_jax.files import atomic_write
 matplotlib.use("Agg")
 
 STYLES: dict[tuple[str, str], dict[str, Any]] = {
-    ("wideband", ""): {"color": "C0", "lw": 2, "marker": "o", "ms": 4},
+    ("wideband", ""): {"color": "C0", "lw": 1.4, "marker": "o", "ms": 3, "ls": "--"},
+    ("wideband", "long"): {"color": "C0", "lw": 2, "marker": "o", "ms": 4},
     ("wrfgs", ""): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3, "ls": "--"},
     ("wrfgs", "long"): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3},
     ("wave", ""): {"color": "C2", "lw": 2, "marker": "^", "ms": 4},

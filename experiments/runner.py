@@ -20,7 +20,7 @@ import jax
 import tyro
 
 from experiments.execute import execute
-from experiments.jobs import DENSE_SCENE, PROFILES, Job
+from experiments.jobs import BUDGETS, DENSE_SCENE, PROFILES, Job
 from experiments.results import FOLDER, Results
 from experiments.tables import EXPERIMENTS, unique_jobs
 from wbgs_jax.compilation import use_compilation_cache
@@ -91,11 +91,11 @@ class Clock:
 
 
 def all_jobs(names: tuple[str, ...] = ()) -> list[Job]:
-    """The jobs of some experiments (all by default), each once, first seeds first."""
+    """The jobs of some experiments (all by default), each once, first seeds first, repetitions of costly jobs last."""
     if unknown := [name for name in names if name not in EXPERIMENTS]:
         raise UserError(f"there is no experiment {unknown[0]!r}; choose among: {', '.join(EXPERIMENTS)}")
     jobs = unique_jobs(names)
-    return sorted(jobs, key=lambda job: (job.seed > 0 and job.variant == "long", job.seed))  # the longest repetitions last
+    return sorted(jobs, key=lambda job: (job.seed > 0 and (job.variant in BUDGETS or job.field == "wave"), job.seed))
 
 
 def chosen_jobs(command: Command) -> list[Job]:
@@ -135,12 +135,13 @@ class Durations:
     @staticmethod
     def kind(job: Job) -> tuple:
         """Jobs of a kind take about as long."""
-        return job.field, job.variant == "long", job.scene == DENSE_SCENE and not job.combination, job.all_tx
+        return job.field, BUDGETS.get(job.variant, 1), job.scene == DENSE_SCENE and not job.combination, job.all_tx
 
     def expect(self, job: Job) -> float | None:
         """Seconds; None if no such job is done."""
-        known = self.known.get(self.kind(job)) or [
-            s for kind, all_s in self.known.items() if kind[0] == job.field for s in all_s
+        field, budget, *_ = kind = self.kind(job)
+        known = self.known.get(kind) or [
+            s * budget / other[1] for other, seconds in self.known.items() if other[0] == field for s in seconds
         ]
         return statistics.median(known) if known else None
 

@@ -15,7 +15,6 @@ import tyro
 
 from experiments import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 from experiments.jobs import PROFILES, Job, Profile
-from experiments.paper import GHZ_10
 from experiments.results import FOLDER, Results
 from wbgs_jax.errors import run_command
 from wbgs_jax.files import atomic_write
@@ -71,8 +70,9 @@ published and the data here are others, traced with exact physics: compare order
 * **coherent (ours)**: the [coherent field](wave.md), which knows the mesh's facets and learns materials; one model for all
   frequencies.
 * **WRF-GS**: the state of the art that the paper compares with, a splatting field without frequency; *one model for every
-  frequency*. "Equal samples": all models of a scene together see as many spectra as ours does.
-  "Long": {long_budget(profile)}.
+  frequency*, all of which together see as many spectra as ours does.
+* **5x, 10x samples**: trained on so many times the usual number of spectra. WRF-GS with 10x has, at ten frequencies, as many
+  for every frequency as ours has for all of them.
 * **NeRF2-style**: a volume marched along rays, with the frequency as an input.
 * **Predictors that learn nothing**, and the **phase-blind ceiling**: the score of the best possible predictor that knows every
   path but not its phase ([dataset card](dataset.md)).
@@ -93,12 +93,6 @@ def profile_text(profile: Profile) -> str:
     gaussians = profile.changes.get("wideband", {}).get("gaussians")
     size = f"the `{profile.preset}` preset" + (f" with {gaussians:,} Gaussians at the start" if gaussians else "")
     return f"{size}, {profile.steps:,} steps (the coherent field {profile.wave_steps:,})"
-
-
-def long_budget(profile: Profile) -> str:
-    """How long the long variant trains."""
-    times = len(GHZ_10) * profile.long_steps / profile.steps
-    return f"{profile.long_steps:,} steps for every frequency, at ten frequencies {times:.1f} times our samples in total"
 
 
 def provenance(results: Results) -> str:

@@ -59,19 +59,20 @@ def search_materials(
 ) -> tuple[Any, SearchReport]:
     """Parameters with the materials that fit some training spectra best."""
     score, chosen = _make_scores(field), jnp.asarray(spectra, jnp.int32)
-    before, taken = np.zeros(len(spectra)), dict[int, str]()
-    for turn in range(config.rounds):
-        known = dict(taken)
-        for material in range(len(params.materials.slope)):
-            candidates = [params.materials, *_entries(params.materials, material)]
-            scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates), data, chosen))
-            best = 1 + int(np.argmin(scores[1:].mean(1)))
-            before = scores[0] if turn == material == 0 else before
-            unseen = np.ptp(scores.mean(1)) < UNSEEN
-            if not unseen and not _surely_better(scores[0], scores[best], config.sure):
-                params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
-                taken[material] = list(ITU_MATERIALS)[best - 1]
-        if taken == known:
+    before, taken, settled = np.zeros(len(spectra)), dict[int, str](), 0
+    count = len(params.materials.slope)
+    for turn in range(config.rounds * count):
+        material = turn % count
+        candidates = [params.materials, *_entries(params.materials, material)]
+        scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates), data, chosen))
+        best = 1 + int(np.argmin(scores[1:].mean(1)))
+        before = before if turn else scores[0]
+        settled += 1
+        if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
+            if taken.get(material) != (entry := list(ITU_MATERIALS)[best - 1]):
+                taken[material], settled = entry, 1
+            params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
+        if settled == count:  # all others are what they were when each was looked at
             break
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import figure8, paper, table1, table2
-from experiments.jobs import ONE_FREQUENCY, PROFILES, REFERENCES, SCORED, Job, settings
+from experiments.jobs import BUDGETS, ONE_FREQUENCY, PROFILES, REFERENCES, SCORED, Job, settings
 from experiments.tables import EXPERIMENTS, unique_jobs
 from wbgs_jax.config import check
 
@@ -111,14 +111,21 @@ def test_all_settings_can_work_and_have_the_steps_of_the_profile(profile):
         chosen = settings(job, size)
         check(chosen)
         assert chosen.optim.min_steps == chosen.optim.steps  # no data set cuts them
-        if job.field in ONE_FREQUENCY and job.variant != "long":
-            block, share = chosen.loop.epoch_steps, size.steps / len(job.test_ghz)
+        if job.field in ONE_FREQUENCY:
+            block, share = chosen.loop.epoch_steps, size.steps * BUDGETS.get(job.variant, 1) / len(job.test_ghz)
             assert chosen.optim.steps == block or abs(chosen.optim.steps - share) <= block / 2
 
 
-def test_wrfgs_sees_as_many_spectra_as_the_wideband_field():
-    ours, theirs = (settings(Job("1", field), PROFILES["quick"]).optim for field in ("wideband", "wrfgs"))
+@pytest.mark.parametrize("variant", ["", "long"])
+def test_wrfgs_sees_as_many_spectra_as_the_wideband_field(variant):
+    ours, theirs = (settings(Job("1", field, variant=variant), PROFILES["quick"]).optim for field in ("wideband", "wrfgs"))
     assert 10 * theirs.steps * theirs.batch == ours.steps * ours.batch
+
+
+def test_the_longest_wrfgs_sees_as_many_spectra_at_every_frequency():
+    ours = settings(Job("1", "wideband"), PROFILES["quick"]).optim
+    theirs = settings(Job("1", "wrfgs", variant="longest"), PROFILES["quick"]).optim
+    assert theirs.steps * theirs.batch == ours.steps * ours.batch
 
 
 def test_variants_change_what_they_name():

@@ -16,7 +16,7 @@ import pytest
 import synthetic
 
 from experiments import execute, jobs, runner
-from experiments.jobs import Job
+from experiments.jobs import BUDGETS, Job
 from experiments.results import Results
 from wbgs_jax.data.schema import save_scene
 from wbgs_jax.errors import run_command
@@ -259,7 +259,19 @@ def test_a_list_of_numbers_is_one_line(command):
 def test_jobs_come_in_the_order_of_importance():
     listed = runner.all_jobs()
     assert listed[0] == Job("1", "wideband")
-    assert [job.seed for job in listed if job.variant != "long"] == sorted(j.seed for j in listed if j.variant != "long")
+    costly = [job for job in listed if job.seed and (job.variant in BUDGETS or job.field == "wave")]
+    cheap = [job for job in listed if job not in costly]
+    assert listed == cheap + costly
+    for some in (cheap, costly):
+        assert [job.seed for job in some] == sorted(job.seed for job in some)
+
+
+@pytest.mark.usefixtures("calls")
+def test_times_of_another_budget_are_scaled(command):
+    runner.run([JOB], command)
+    durations = runner.Durations(Results(command.profile, command.results), [JOB])
+    usual = durations.expect(dataclasses.replace(JOB, scene="2"))
+    assert durations.expect(dataclasses.replace(JOB, variant="long")) == usual * BUDGETS["long"] > 0
 
 
 def test_a_listing_says_what_is_done(command, calls):

@@ -11,7 +11,7 @@ from rooms import box, field_of, room
 from synthetic import tiny_scene, tiny_settings
 from test_field import make_mesh_arrays
 
-from wbgs_jax import make_query
+from wbgs_jax import make_query, material_search
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
 from wbgs_jax.material_search import ITU_MATERIALS
@@ -62,6 +62,26 @@ def test_what_fits_better_than_the_list_is_kept(tmp_path):
     before = np.asarray(run.state.params.materials.log_susceptibility)
     run.search()
     np.testing.assert_array_equal(before, np.asarray(run.state.params.materials.log_susceptibility))
+
+
+def test_it_ends_when_nothing_is_left_to_change(tmp_path, monkeypatch):
+    """Where the last change was that of material k, nobody looks again at k and those behind it."""
+    run = run_on([ITU_MATERIALS["wood"]] * len(PARTS), tmp_path)
+    looked_at = []
+
+    def scores(_field):
+        def score(params, candidates, *_):
+            susceptibility = np.asarray(candidates.log_susceptibility)
+            looked_at.append(int(np.argmax(np.ptp(susceptibility, 0))))
+            wanted = np.log(5.24 - 1 if looked_at[-1] == 2 else 4.0 - 1)  # concrete, or what is there
+            return np.abs(susceptibility[:, looked_at[-1], None] - wanted) + np.zeros(48)
+
+        return score
+
+    monkeypatch.setattr(material_search, "_make_scores", scores)
+    run.search()
+    count = len(PARTS)
+    assert looked_at == [*range(count), 0, 1]
 
 
 @pytest.mark.parametrize("steps, rounds", [(5, 3), (0, 0)])
