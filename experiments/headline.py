@@ -14,10 +14,13 @@ from experiments.statistics import typical
 
 TITLE = "Headline"
 COMPARISONS = {
-    # variant of ours, of WRF-GS: in words
-    ("", ""): "Equal samples: all models of WRF-GS together see as many spectra as ours",
-    ("long", "long"): f"Equal samples, {BUDGETS['long']} times as many",
-    ("", "longest"): f"WRF-GS sees {BUDGETS['longest']} times our samples: as many for every frequency as ours for all",
+    # (ours, theirs), each a field and its variant: in words
+    (("wideband", ""), ("wrfgs", "")): "Equal samples: all models of WRF-GS together see as many spectra as ours",
+    (("wideband", "long"), ("wrfgs", "long")): f"Equal samples, {BUDGETS['long']} times as many",
+    (("wideband", ""), ("wrfgs", "longest")): (
+        f"WRF-GS sees {BUDGETS['longest']} times our samples: as many for every frequency as ours for all"
+    ),
+    (("wave", ""), ("wrfgs", "longest")): "The coherent field against the same",
 }
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
 
@@ -37,13 +40,13 @@ def gain_over_wrfgs(results: Results) -> str:
     for (own, other), words in COMPARISONS.items():
         rows, pairs = [], []
         for scene in SCENES:
-            ours = scores(results, table1.jobs_of(scene, "wideband", own), GHZ_10)
-            theirs = scores(results, table1.jobs_of(scene, "wrfgs", other), GHZ_10)
-            rows.append([scene, *gain_cells(ours, theirs, TABLE_1_AVERAGE[scene])])
+            ours = scores(results, table1.jobs_of(scene, *own), GHZ_10)
+            theirs = scores(results, table1.jobs_of(scene, *other), GHZ_10)
+            rows.append([scene, *gain_cells(ours, theirs, [TABLE_1_AVERAGE[scene].get(field) for field, _ in (own, other)])])
             if ours is not None and theirs is not None:
                 pairs.append((average(ours), average(theirs)))
-        rows.append(average_row(pairs))
-        names = [f"{NAMES[model]} (paper)".replace(" (ours)", "") for model in (("wideband", own), ("wrfgs", other))]
+        rows.append(average_row(pairs, [TABLE_1_OVERALL.get(field) for field, _ in (own, other)]))
+        names = [f"{NAMES[model]} (paper)".replace(" (ours)", "") for model in (own, other)]
         head = ["scene", *names, "gain (paper)", "better at", "median difference", "p"]
         parts += [f"*{words}:*", markdown(head, rows)]
     return "\n\n".join(parts)
@@ -60,25 +63,27 @@ def percent(ratio: float, paper: float | None = None) -> str:
     return own if paper is None else f"{own} ({100 * paper:+.1f} %)"
 
 
-def gain_cells(ours: Scores | None, theirs: Scores | None, paper: dict[str, float]) -> list[str]:
+def gain_cells(ours: Scores | None, theirs: Scores | None, papers: list[float | None]) -> list[str]:
     """Both averages, the gain, the paired test."""
     values = [None if v is None else average(v) for v in (ours, theirs)]
-    shown = [cell(v, paper[name]) for v, name in zip(values, ("wideband", "wrfgs"), strict=True)]
+    shown = [cell(v, paper) for v, paper in zip(values, papers, strict=True)]
     if ours is None or theirs is None:
         return [*shown, NOT_RUN, *paired_cells(ours, theirs)]
-    gain = percent(average(ours) / average(theirs) - 1, paper["wideband"] / paper["wrfgs"] - 1)
+    own, other = papers
+    gain = percent(average(ours) / average(theirs) - 1, own / other - 1 if own and other else None)
     return [*shown, gain, *paired_cells(ours, theirs)]
 
 
-def average_row(pairs: list[tuple[float, float]]) -> list[str]:
+def average_row(pairs: list[tuple[float, float]], papers: list[float | None]) -> list[str]:
     """Over the scenes that both have run in."""
+    gain = GAIN if all(papers) else None
     if not pairs:
-        missing = [cell(None, TABLE_1_OVERALL[name]) for name in ("wideband", "wrfgs")]
-        return ["**average**", *missing, f"{NOT_RUN} ({100 * GAIN:+.1f} %)", "", "", ""]
+        missing = [cell(None, paper) for paper in papers]
+        return ["**average**", *missing, NOT_RUN if gain is None else f"{NOT_RUN} ({100 * gain:+.1f} %)", "", "", ""]
     label = "average" if len(pairs) == len(SCENES) else f"average of {len(pairs)} scenes"
-    ours, theirs = np.mean(pairs, 0).tolist()
-    shown = [cell(ours, TABLE_1_OVERALL["wideband"]), cell(theirs, TABLE_1_OVERALL["wrfgs"])]
-    return [f"**{label}**", *shown, f"**{percent(ours / theirs - 1, GAIN)}**", "", "", ""]
+    means = np.mean(pairs, 0).tolist()
+    shown = [cell(value, paper) for value, paper in zip(means, papers, strict=True)]
+    return [f"**{label}**", *shown, f"**{percent(means[0] / means[1] - 1, gain)}**", "", "", ""]
 
 
 def zero_shot_drop(results: Results) -> str:

@@ -88,10 +88,11 @@ def test_table_1_has_medians_intervals_seeds_and_ceilings(everything):
 
 def test_the_headline_is_computed(everything, tmp_path):
     text = headline.gain_over_wrfgs(everything)
-    _, equal, long, longest = re.split(r"\n\*.*:\*\n", text)
+    _, equal, long, longest, coherent = re.split(r"\n\*.*:\*\n", text)
     assert row(equal, "**average**")[:3] == ["0.810 (0.66)", "0.650 (0.56)", "**+24.6 % (+17.8 %)**"]
     assert row(long, "**average**")[:3] == ["0.860 (0.66)", "0.760 (0.56)", "**+13.2 % (+17.8 %)**"]
     assert row(longest, "**average**")[:3] == ["0.810 (0.66)", "0.810 (0.56)", "**+0.0 % (+17.8 %)**"]
+    assert row(coherent, "**average**")[:3] == ["0.910", "0.810 (0.56)", "**+12.3 %**"]
     assert row(equal, "2")[2:] == ["+24.6 % (+13.5 %)", "100 % of 7", "+0.160", "1.6e-02"]
     mixed, alike = rows(headline.zero_shot_drop(everything))
     assert mixed[1:] == ["0.790", "0.810", "2.5 % (2.8 %)"]
