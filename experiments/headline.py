@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib import pyplot as plt
 
 from experiments import figure7, figure8, table1, table3
-from experiments.cells import NAMES, NOT_RUN, Scores, cell, paired_cells, scores
-from experiments.jobs import BUDGETS
+from experiments.baselines import NAMES_OF_REFERENCES, reference_average
+from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, paired_cells, scores
+from experiments.jobs import BUDGETS, REFERENCES, Job
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_AVERAGE, TABLE_1_OVERALL, ZERO_SHOT_DROP
+from experiments.plots import STYLES, save
 from experiments.report import markdown
 from experiments.results import Results
 from experiments.statistics import typical
@@ -26,8 +29,38 @@ UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
 
 
 def render(results: Results, images: Path) -> str:
-    """The two comparisons the paper draws its conclusions from."""
-    return "\n\n".join([gain_over_wrfgs(results), zero_shot_drop(results)])
+    """The two comparisons the paper draws its conclusions from, and a picture of the first."""
+    parts = [gain_over_wrfgs(results), zero_shot_drop(results)]
+    bars = {m: [scores(results, table1.jobs_of(scene, *m), GHZ_10) for scene in SCENES] for m in table1.MODELS}
+    if any(v is not None for values in bars.values() for v in values):
+        parts.insert(0, save(draw(bars, best_of_nothing(results)), images, "headline", "average SSIM by scene and model"))
+    return "\n\n".join(parts)
+
+
+def best_of_nothing(results: Results) -> list[float | None]:
+    """Scene by scene, the best predictor that learns nothing."""
+    found = [[reference_average(results, Job(scene, REFERENCES), name) for name in NAMES_OF_REFERENCES] for scene in SCENES]
+    return [max((v for v in values if v is not None), default=None) for values in found]
+
+
+def draw(bars: dict[tuple[str, str], list[Scores | None]], nothing: list[float | None]) -> plt.Figure:
+    """A group a scene, a bar a model; lines for the ceiling and for what learns nothing."""
+    figure, axis = plt.subplots(figsize=(8.5, 4), layout="constrained")
+    width = 0.8 / len(bars)
+    for i, (model, values) in enumerate(bars.items()):
+        places = [scene + (i - (len(bars) - 1) / 2) * width for scene, v in enumerate(values) if v is not None]
+        heights = [average(v) for v in values if v is not None]
+        style = {"hatch": "//", "alpha": 0.5} if STYLES[model].get("ls") else {"alpha": 0.5 if model[1] == "longest" else 1}
+        axis.bar(places, heights, 0.9 * width, color=STYLES[model]["color"], label=NAMES[model], **style)
+    best = [ceiling(scene, GHZ_10) for scene in SCENES]
+    for levels, line, label in ((best, "-", "phase-blind ceiling"), (nothing, ":", "best that learns nothing")):
+        known = [(scene, level) for scene, level in enumerate(levels) if level is not None]
+        left, right = ([scene + side for scene, _ in known] for side in (-0.43, 0.43))
+        axis.hlines([level for _, level in known], left, right, color="k", lw=1.2, ls=line, label=label)
+    axis.set(xticks=range(len(SCENES)), xticklabels=[f"scene {scene}" for scene in SCENES], ylabel="SSIM", ylim=(0, 1))
+    axis.grid(axis="y", alpha=0.3)
+    axis.legend(fontsize=7.5, ncols=4, loc="lower center", framealpha=0.95)
+    return figure
 
 
 def gain_over_wrfgs(results: Results) -> str:
@@ -42,12 +75,13 @@ def gain_over_wrfgs(results: Results) -> str:
         for scene in SCENES:
             ours = scores(results, table1.jobs_of(scene, *own), GHZ_10)
             theirs = scores(results, table1.jobs_of(scene, *other), GHZ_10)
-            rows.append([scene, *gain_cells(ours, theirs, [TABLE_1_AVERAGE[scene].get(field) for field, _ in (own, other)])])
+            papers = [TABLE_1_AVERAGE[scene].get(field) for field, _ in (own, other)]
+            rows.append([scene, *gain_cells(ours, theirs, papers)])
             if ours is not None and theirs is not None:
                 pairs.append((average(ours), average(theirs)))
         rows.append(average_row(pairs, [TABLE_1_OVERALL.get(field) for field, _ in (own, other)]))
-        names = [f"{NAMES[model]} (paper)".replace(" (ours)", "") for model in (own, other)]
-        head = ["scene", *names, "gain (paper)", "better at", "median difference", "p"]
+        names = [NAMES[model].replace(" (ours)", "") + " (paper)" * (model[0] in TABLE_1_OVERALL) for model in (own, other)]
+        head = ["scene", *names, "gain" + " (paper)" * (own[0] in TABLE_1_OVERALL), "better at", "median difference", "p"]
         parts += [f"*{words}:*", markdown(head, rows)]
     return "\n\n".join(parts)
 

@@ -16,6 +16,7 @@ STYLES: dict[tuple[str, str], dict[str, Any]] = {
     ("wideband", "long"): {"color": "C0", "lw": 2, "marker": "o", "ms": 4},
     ("wrfgs", ""): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3, "ls": "--"},
     ("wrfgs", "long"): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3},
+    ("wrfgs", "longest"): {"color": "C1", "lw": 1, "marker": "x", "ms": 3},
     ("wave", ""): {"color": "C2", "lw": 2, "marker": "^", "ms": 4},
 }
 

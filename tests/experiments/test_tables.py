@@ -138,6 +138,6 @@ def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
     for module in tables.PAGES:
         assert f"## {module.TITLE}" in text
     shown = set(re.findall(r"\(images/(\S+?)\)", text))
-    assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 5
+    assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
     assert cells.NOT_RUN not in text
     assert "`abc123`" in text and "nan" not in text
