@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from experiments.choices import RESULTS, chosen_names, measure, run_series
-from experiments.jobs import PROFILES, SCORED, Job, changed, settings, some_test_transmitters
+from experiments.jobs import PROFILES, SCORED_SLOW, Job, changed, settings, some_test_transmitters
 from wbgs_jax.errors import run_command
 from wbgs_jax.files import read_json
 
@@ -64,9 +64,7 @@ def measure_change(change: Change, scene: str, seed: int) -> dict[str, Any]:
     chosen = settings(job, PROFILES[PROFILE])
     for section, values in change.values.items():
         chosen = changed(chosen, section, **values)
-    parts = [
-        measure(some_test_transmitters(dataset, SCORED["nerf2"]), chosen, seed, change.field) for _, dataset in job.models()
-    ]
+    parts = [measure(some_test_transmitters(dataset, SCORED_SLOW), chosen, seed, change.field) for _, dataset in job.models()]
     means = {name: round(float(np.mean([part[name] for part in parts])), 4) for name in ("median_ssim", "mean_ssim")}
     sums = {name: round(sum(part[name] for part in parts), 1) for name in ("steps", "seconds")}
     return {"seed": seed, **means, **sums, "models": len(parts)}

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from experiments.jobs import Job
 from experiments.results import Results
-from experiments.statistics import compare, estimate, typical
+from experiments.statistics import compare, estimate, level
 from wbgs_jax.data import released_scenes
 from wbgs_jax.data.schema import load_scene
 
@@ -17,6 +17,7 @@ Scores = Float[np.ndarray, "seeds tx ghz"]
 NAMES = {
     ("wideband", ""): "wideband (ours)",
     ("wideband", "long"): "wideband (ours), 5x samples",
+    ("wideband", "no_frequency"): "wideband, not told the frequency",
     ("wave", ""): "coherent (ours)",
     ("wrfgs", ""): "WRF-GS",
     ("wrfgs", "long"): "WRF-GS, 5x samples",
@@ -26,45 +27,34 @@ NAMES = {
 """Of fields and variants, for people."""
 
 
-def seeds_of(job: Job, jobs: Sequence[Job]) -> list[Job]:
-    """The jobs that differ from one in their seed alone."""
-    return [other for other in jobs if _unseeded(other) == _unseeded(job)]
-
-
-def _unseeded(job: Job) -> tuple:
-    return job.scene, job.field, job.combination, job.all_tx, job.variant
-
-
-def scores(results: Results, jobs: Sequence[Job], ghz: Sequence[float] = ()) -> Scores | None:
-    """SSIM of the seeds that were run, at some frequencies (default: all that were asked); None if there are none."""
+def scores(results: Results, jobs: Sequence[Job], ghz: Sequence[float] = (), tx: Sequence[int] = ()) -> Scores | None:
+    """SSIM of the seeds that were run, at some of the frequencies and transmitters (default: all that were asked); None if
+    there are none."""
     found = results.all(list(jobs))
     if not found:
         return None
-    return np.stack([result.at(list(ghz) or result.ghz) for result in found])
+    return np.stack([result.at(list(ghz) or result.ghz, list(tx) or result.tx.tolist()) for result in found])
 
 
-def at_transmitters(results: Results, jobs: Sequence[Job], like: Job, ghz: Sequence[float] = ()) -> Scores | None:
-    """`scores` at the transmitters of another job: they must be among those that were scored."""
-    all_scores, other = scores(results, jobs, ghz), results.get(like)
-    if all_scores is None or other is None:
-        return None
-    known = results.all(list(jobs))[0].tx.tolist()
-    return all_scores[:, [known.index(tx) for tx in other.tx.tolist()]]
-
-
-def cell(value: float | None, paper: float | None = None, digits: int = 3) -> str:
+def cell(value: float | None, paper: float | None = None) -> str:
     """A figure, the paper's behind it in parentheses."""
-    own = NOT_RUN if value is None else f"{value:.{digits}f}"
+    own = NOT_RUN if value is None else f"{value:.3f}"
     return own if paper is None else f"{own} ({paper:.2f})"
+
+
+def percent(ratio: float | None, paper: float | None = None) -> str:
+    """A relative gain, the paper's behind it."""
+    own = NOT_RUN if ratio is None else f"{100 * ratio:+.1f} %"
+    return own if paper is None else f"{own} ({100 * paper:+.1f} %)"
 
 
 def median_cell(values: Scores | None, paper: float | None = None) -> str:
     """Median over seeds of the average of medians."""
-    return cell(None if values is None else float(np.median(typical(values))), paper)
+    return cell(None if values is None else level(values), paper)
 
 
 def summary_cells(values: Scores | None, paper: float | None = None) -> list[str]:
-    """Median over seeds of the average of medians, its interval over transmitters, the seeds and their range."""
+    """Median over seeds of the average of medians, its interval over transmitters and seeds, the seeds and their range."""
     if values is None:
         return [cell(None, paper), NOT_RUN, NOT_RUN]
     found = estimate(values)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, settings
 from wbgs_jax import metrics
-from wbgs_jax.config import Settings, preset_settings
+from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
@@ -60,10 +60,8 @@ def execute(
         return reference_scores(job) | origin, None
     chosen = settings(job, PROFILES[profile])
     parts = [part(job, profile, dataset, chosen, folder / name, may_go_on) for name, dataset in job.models()]
-    preset = PROFILES[profile].preset
-    changes = {"preset": preset, "settings": difference(chosen, preset_settings(preset, job.field), job.field)}
     pictures = np.concatenate([p.pictures for p in parts]) if job.pictured else None
-    return merged(parts, chosen.optim.batch) | changes | origin, pictures
+    return merged(parts, chosen.optim.batch) | {"preset": PROFILES[profile].preset} | origin, pictures
 
 
 def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
@@ -157,17 +155,6 @@ def reference_scores(job: Job) -> dict[str, Any]:
         medians = np.median(values["ssim"], 0)
         scores[name] = {f"{f:g}": rounded(m) for f, m in zip(values["ghz"], medians, strict=True)}
     return {"references": scores, "evaluation_seconds": round(time.perf_counter() - begin, 1)}
-
-
-def difference(chosen: Settings, base: Settings, field: str) -> dict[str, Any]:
-    """A field's settings that are not the preset's."""
-    pairs = [
-        (f"{section}.{name}", value, getattr(getattr(base, section), name))
-        for section, values in dataclasses.asdict(chosen).items()
-        if section in (field, "optim", "density", "search", "loop")
-        for name, value in values.items()
-    ]
-    return {name: value for name, value, other in pairs if value != other}
 
 
 def rounded(values: Any) -> Any:

@@ -26,7 +26,7 @@ def render(results: Results, images: Path) -> str:
     """A picture a scene: a row a model, a column a frequency and a held-out transmitter."""
     note = (
         "Every column is another held-out transmitter, drawn without a look at the results; in a picture zenith runs down from"
-        " 0 to 90 degrees, azimuth to the right. Above each prediction stands its SSIM."
+        " 0 to 90 degrees, azimuth to the right, and colours go from 0 (dark) to 1. Above each prediction stands its SSIM."
     )
     return "\n\n".join([note, *(scene_picture(results, images, scene) for scene in PICTURED_SCENES)])
 

@@ -22,8 +22,10 @@ ONE_FREQUENCY = ("wrfgs",)
 """Fields that know one frequency: a model for each, all of them one job."""
 REFERENCES = "references"
 """In the place of a field: the predictors that learn nothing."""
-SCORED = {"all_tx": 200, "nerf2": 24}
-"""Transmitters that are scored where all have trained, and with a field that is slow to ask; drawn once for all."""
+SLOW = ("nerf2",)
+"""Fields that are slow to ask."""
+SCORED_TRAINED, SCORED_SLOW = 200, 24
+"""Transmitters that are scored where all have trained, and with a slow field; drawn once for all."""
 PICTURED_SCENES = ("1", "4")
 """Scenes whose predicted pictures are kept (figure 4)."""
 PICTURED_GHZ = (1, 10, 24.25, 37, 47, 60, 77, 94)
@@ -81,7 +83,7 @@ class Job:
     @property
     def pictured(self) -> bool:
         """Whether predicted pictures are kept."""
-        everywhere = self.field not in (REFERENCES, *SCORED) and not self.combination and self.variant != "longest"
+        everywhere = self.field not in (REFERENCES, *SLOW) and not self.combination and self.variant != "longest"
         return everywhere and self.scene in PICTURED_SCENES and self.seed == 0
 
     def dataset(self) -> Dataset:
@@ -92,8 +94,8 @@ class Job:
             dataset = dataclasses.replace(dataset, train=everything, test=everything)
         if self.combination:
             dataset = unseen_frequencies(dataset, self.train_ghz)
-        count = SCORED["all_tx"] if self.all_tx else SCORED.get(self.field, 0)
-        return some_test_transmitters(dataset, count) if count else dataset
+        count = SCORED_TRAINED if self.all_tx else SCORED_SLOW if self.field in SLOW else None
+        return some_test_transmitters(dataset, count)
 
     def models(self) -> Iterator[tuple[str, Dataset]]:
         """A name and the data set of every model that is trained."""
@@ -105,8 +107,8 @@ class Job:
             yield f"{ghz:g}GHz", select_frequencies(dataset, [ghz], [ghz])
 
 
-def some_test_transmitters(dataset: Dataset, count: int) -> Dataset:
-    """Test spectra of `count` transmitters alone; larger counts contain the smaller ones."""
+def some_test_transmitters(dataset: Dataset, count: int | None) -> Dataset:
+    """Test spectra of `count` transmitters alone (None: of all); larger counts contain the smaller ones."""
     known = np.unique(dataset.tx_index[dataset.test])
     chosen = np.random.default_rng([0, 5]).permutation(known)[:count]
     return dataclasses.replace(dataset, test=dataset.test[np.isin(dataset.tx_index[dataset.test], chosen)])
@@ -150,6 +152,18 @@ def settings(job: Job, profile: Profile) -> Settings:
     base = changed(base, "density", **shrunk)
     loop = {"evaluate_spectra": 0, "checkpoint_every": max(steps // 5, 100), "keep_checkpoints": 1}
     return changed(base, "loop", **loop)
+
+
+def differences(job: Job, profile: Profile) -> dict[str, Any]:
+    """A job's settings that are not the preset's, as JSON has them."""
+    chosen, base = settings(job, profile), preset_settings(profile.preset, job.field)
+    pairs = [
+        (f"{section}.{name}", value, getattr(getattr(base, section), name))
+        for section, values in dataclasses.asdict(chosen).items()
+        if section in (job.field, "optim", "density", "search", "loop")
+        for name, value in values.items()
+    ]
+    return {name: list(value) if isinstance(value, tuple) else value for name, value, other in pairs if value != other}
 
 
 def wanted_steps(job: Job, profile: Profile) -> float:

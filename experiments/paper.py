@@ -73,8 +73,13 @@ TABLE_3: dict[tuple[bool, bool], tuple[float, float]] = {
 FIGURE_7_AVERAGE = {"wideband": 0.72, "wrfgs": 0.63}
 """Averages over 21 frequencies ..."""
 FIGURE_7_GAIN = 0.143
-FIGURE_7_POINTS = {25: {"wideband": 0.73, "wrfgs": 0.65}, 70: {"wideband": 0.71, "wrfgs": 0.61}}
-"""... and the two frequencies it names."""
+FIGURE_7_POINTS = {
+    25: {"wideband": 0.73, "wrfgs": 0.65},
+    50: {"wideband": 0.73},
+    70: {"wideband": 0.71, "wrfgs": 0.61},
+    100: {"wideband": 0.72},
+}
+"""... and the frequencies that the text (A.5, A.6) names."""
 
 FIGURE_8 = {"B": 0.71, "C": 0.71, "D": 0.70, "H": 0.62, "I": 0.56}
 """Averages that appendix A.6 names. (Table 3 gives 0.73 for what is combination D too.)"""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from experiments.jobs import PICTURED_GHZ, Job
+from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, differences
 from wbgs_jax.files import atomic_write, read_json
 
 FOLDER = Path(__file__).parent / "results"
@@ -39,9 +39,10 @@ class Result:
         """Of every scored spectrum."""
         return np.array(list(self.values["ssim"].values())).T
 
-    def at(self, ghz: tuple[float, ...] | list[float]) -> Float[np.ndarray, "tx ghz"]:
-        """SSIM at some of the frequencies."""
-        return self.ssim[:, [self.ghz.index(float(f)) for f in ghz]]
+    def at(self, ghz: list[float], tx: list[int]) -> Float[np.ndarray, "tx ghz"]:
+        """SSIM of some of the transmitters at some of the frequencies."""
+        known = self.tx.tolist()
+        return self.ssim[np.ix_([known.index(i) for i in tx], [self.ghz.index(float(f)) for f in ghz])]
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,16 @@ class Results:
         return self.path(job).with_suffix(".png")
 
     def get(self, job: Job) -> Result | None:
-        """A job's result; None if it has not been run yet."""
+        """A job's result; None if it has not been run yet, or with other settings."""
         path = self.path(job)
-        return Result(read_json(path)) if path.exists() else None
+        if not path.exists():
+            return None
+        values = read_json(path)
+        return Result(values) if values.get("settings", {}) == self.settings(job) else None
+
+    def settings(self, job: Job) -> dict[str, Any]:
+        """What a job's result says of its settings: those that are not the preset's."""
+        return {} if job.field == REFERENCES else differences(job, PROFILES[self.profile])
 
     def all(self, jobs: list[Job]) -> list[Result]:
         """Those that there are."""
@@ -81,7 +89,8 @@ class Results:
         if pictures is not None:
             with atomic_write(self.pictures_path(job)) as stream:
                 Image.fromarray(pictures.reshape(-1, pictures.shape[-1])).save(stream, format="png", optimize=True)
-        text = json.dumps({"job": dataclasses.asdict(job)} | values, indent=2, allow_nan=False)
+        whole = {"job": dataclasses.asdict(job)} | values | {"settings": self.settings(job)}
+        text = json.dumps(whole, indent=2, allow_nan=False)
         with atomic_write(self.path(job)) as stream:
             stream.write((one_line_lists(text) + "\n").encode())
 

@@ -18,7 +18,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Estimate:
-    """A median SSIM with its bootstrap interval over transmitters, and its range over seeds."""
+    """A median SSIM with its bootstrap interval over transmitters and seeds, and the seeds' own values."""
 
     value: float
     low: float
@@ -31,14 +31,18 @@ def typical(scores: Float[np.ndarray, "seeds tx ghz"]) -> Float[np.ndarray, "see
     return np.median(scores, axis=-2).mean(-1)
 
 
+def level(scores: Float[np.ndarray, "seeds tx ghz"]) -> float:
+    """Median over seeds of `typical`: what stands in a cell."""
+    return float(np.median(typical(scores)))
+
+
 def estimate(scores: Float[np.ndarray, "seeds tx ghz"]) -> Estimate:
-    """Median over seeds of the average of medians; the interval is of drawing other transmitters from the same scene."""
-    seeds = typical(scores)
+    """The level, and the interval of drawing other transmitters from the same scene, and other seeds."""
     rng = np.random.default_rng(SEED)
-    n = scores.shape[1]
-    draws = [np.median(typical(scores[:, rng.integers(0, n, n)])) for _ in range(DRAWS)]
+    k, n, _ = scores.shape
+    draws = [level(scores[np.ix_(rng.integers(0, k, k), rng.integers(0, n, n))]) for _ in range(DRAWS)]
     low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Estimate(float(np.median(seeds)), float(low), float(high), tuple(seeds.tolist()))
+    return Estimate(level(scores), float(low), float(high), tuple(typical(scores).tolist()))
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ class Comparison:
 
 
 def compare(ours: Float[np.ndarray, "seeds tx ghz"], theirs: Float[np.ndarray, "seeds2 tx ghz"]) -> Comparison:
-    """Paired over transmitters, each with the mean of its spectra and seeds."""
-    gap = ours.mean((0, 2)) - theirs.mean((0, 2))
+    """Paired over transmitters, each with the mean of its spectra and of as many seeds on both sides, the first ones."""
+    seeds = min(len(ours), len(theirs))
+    gap = ours[:seeds].mean((0, 2)) - theirs[:seeds].mean((0, 2))
     p = float(wilcoxon(gap).pvalue) if np.any(gap) else 1.0
     return Comparison(float(np.median(gap)), float(np.mean(gap > 0)), p, len(gap))

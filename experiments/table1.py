@@ -35,7 +35,7 @@ def render(results: Results, images: Path) -> str:
     """A table a scene."""
     note = (
         "Median SSIM by frequency (GHz); in parentheses the paper's. 95 %: bootstrap interval of the average over the scene's"
-        " held-out transmitters; seeds: how many, and the range of their averages."
+        " held-out transmitters and the seeds; seeds: how many, and the range of their averages."
     )
     return "\n\n".join([note, *(scene_table(results, scene) for scene in SCENES)])
 
@@ -44,9 +44,9 @@ def scene_table(results: Results, scene: str) -> str:
     """One scene: a row a model, the ceiling below."""
     rows = []
     for field, variant in MODELS:
-        jobs, paper = jobs_of(scene, field, variant), TABLE_1[scene].get(field)
+        jobs, paper = jobs_of(scene, field, variant), None if variant else TABLE_1[scene].get(field)
         each = [median_cell(scores(results, jobs, [f]), paper[i] if paper else None) for i, f in enumerate(GHZ_10)]
-        average = summary_cells(scores(results, jobs, GHZ_10), TABLE_1_AVERAGE[scene].get(field))
+        average = summary_cells(scores(results, jobs, GHZ_10), TABLE_1_AVERAGE[scene][field] if paper else None)
         rows.append([NAMES[field, variant], *each, *average])
     best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])

@@ -13,7 +13,8 @@ def test_the_average_of_medians():
 
 def test_a_value_is_the_median_of_the_seeds():
     found = estimate(np.stack([np.full((5, 2), level) for level in (0.5, 0.9, 0.6)]))
-    assert found.value == found.low == found.high == pytest.approx(0.6)
+    assert found.value == pytest.approx(0.6)
+    assert (found.low, found.high) == pytest.approx((0.5, 0.9))  # the median of three draws is an outer seed in 14 of 27
     assert found.seeds == pytest.approx((0.5, 0.9, 0.6))
 
 
@@ -60,5 +61,6 @@ def test_equal_fields_are_not_told_apart():
     assert compare(scores + noise, scores).p > 0.1
 
 
-def test_seeds_need_not_be_equally_many():
-    assert compare(np.full((3, 8, 2), 0.7), np.full((1, 8, 2), 0.5)).difference == pytest.approx(0.2)
+def test_as_many_seeds_are_compared_on_both_sides():
+    ours = np.stack([np.full((8, 2), level) for level in (0.7, 0.9, 0.9)])
+    assert compare(ours, np.full((1, 8, 2), 0.5)).difference == pytest.approx(0.2)
