@@ -30,7 +30,7 @@ def render(results: Results, images: Path) -> str:
     if len(missing) == len(found):
         return mark
     curves = {scene: result.values["curve"] for scene, result in found.items() if result}
-    note = "The wideband field's loss, first seed: means of blocks of steps (pale), and their average over a tenth of all steps."
+    note = "The wideband field's loss, first seed: means of blocks of steps (pale), and their mean over a tenth of all steps."
     return "\n\n".join(filter(None, [note, mark, save(draw(curves), images, "figure6", "training loss by scene")]))
 
 
