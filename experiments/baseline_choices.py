@@ -21,7 +21,7 @@ from wbgs_jax.errors import run_command
 from wbgs_jax.files import read_json
 
 PROFILE = "quick"
-RATES = ("1e-3", "2e-3", "8e-3", "1.6e-2")
+RATES = ("1e-3", "2e-3", "8e-3", "1.6e-2", "3.2e-2")
 """Of the networks; the presets' is 4e-3."""
 
 

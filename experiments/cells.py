@@ -16,10 +16,12 @@ NOT_RUN = "not run yet"
 Scores = Float[np.ndarray, "seeds tx ghz"]
 NAMES = {
     ("wideband", ""): "wideband (ours)",
+    ("wideband", "fast"): "wideband (ours), higher rate",
     ("wideband", "long"): "wideband (ours), 5x samples",
     ("wideband", "no_frequency"): "wideband, not told the frequency",
     ("wave", ""): "coherent (ours)",
     ("wrfgs", ""): "WRF-GS",
+    ("wrfgs", "fast"): "WRF-GS, higher rate",
     ("wrfgs", "long"): "WRF-GS, 5x samples",
     ("wrfgs", "longest"): "WRF-GS, 10x samples",
     ("nerf2", ""): "NeRF2-style",

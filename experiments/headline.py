@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 from experiments import figure7, figure8, table1, table3
 from experiments.baselines import best_reference
 from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, paired_cells, percent, scores
-from experiments.jobs import BUDGETS
+from experiments.jobs import BUDGETS, VARIANTS, Job
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_AVERAGE, TABLE_1_OVERALL, ZERO_SHOT_DROP
 from experiments.plots import STYLES, save
 from experiments.report import markdown
@@ -22,11 +22,18 @@ Model = tuple[str, str]
 COMPARISONS: dict[tuple[Model, Model], str] = {
     # (ours, theirs): in words
     (("wideband", ""), ("wrfgs", "")): "equal samples",
+    (("wideband", "fast"), ("wrfgs", "fast")): f"equal samples, learning rate {VARIANTS['fast']['optim']['network_lr']:g}",
     (("wideband", "long"), ("wrfgs", "long")): f"equal samples, {BUDGETS['long']} times as many",
     (("wideband", ""), ("wrfgs", "longest")): "WRF-GS sees as many for every frequency as ours for all",
     (("wave", ""), ("wrfgs", "longest")): "the same WRF-GS; the coherent field knows much more",
 }
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
+
+
+def jobs() -> list[Job]:
+    """Jobs of table 1, and those with another learning rate."""
+    models = dict.fromkeys(model for pair in COMPARISONS for model in pair)
+    return [job for scene in SCENES for model in models for job in table1.jobs_of(scene, *model)]
 
 
 def render(results: Results, images: Path) -> str:

@@ -30,14 +30,16 @@ PICTURED_SCENES = ("1", "4")
 """Scenes whose predicted pictures are kept (figure 4)."""
 PICTURED_GHZ = (1, 10, 24.25, 37, 47, 60, 77, 94)
 
-VARIANTS: dict[str, dict[str, Any]] = {
-    # name: changes of the wideband field
+OWN = "the field's own"
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    # name: section of the settings: what differs
     "": {},
     "long": {},
     "longest": {},
-    "no_attenuation": {"attenuation_frequency": False},
-    "no_radiance": {"radiance_frequency": False},
-    "no_frequency": {"attenuation_frequency": False, "radiance_frequency": False},
+    "fast": {"optim": {"network_lr": 1.6e-2}},
+    "no_attenuation": {OWN: {"attenuation_frequency": False}},
+    "no_radiance": {OWN: {"radiance_frequency": False}},
+    "no_frequency": {OWN: {"attenuation_frequency": False, "radiance_frequency": False}},
 }
 
 
@@ -142,8 +144,8 @@ def settings(job: Job, profile: Profile) -> Settings:
     preset_steps = base.optim.steps
     for section, values in profile.changes.items():
         base = changed(base, section, **values)
-    if VARIANTS[job.variant]:
-        base = changed(base, job.field, **VARIANTS[job.variant])
+    for section, values in VARIANTS[job.variant].items():
+        base = changed(base, job.field if section == OWN else section, **values)
     block = base.loop.epoch_steps
     steps = whole(wanted_steps(job, profile), block)
     base = changed(base, "optim", steps=steps, min_steps=steps)

@@ -22,6 +22,7 @@ from wbgs_jax.files import atomic_write
 EXPERIMENTS: dict[str, ModuleType] = {
     # In the order of importance, for the runner.
     "table1": table1,
+    "headline": headline,
     "figure4": figure4,
     "figure6": figure6,
     "figure7": figure7,

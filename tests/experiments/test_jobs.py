@@ -131,6 +131,9 @@ def test_the_longest_wrfgs_sees_as_many_spectra_at_every_frequency():
 def test_variants_change_what_they_name():
     blind = settings(Job("1_21f", "wideband", variant="no_frequency"), PROFILES["quick"]).wideband
     assert not blind.attenuation_frequency and not blind.radiance_frequency and blind.gaussians == 1000
+    usual, fast = (settings(Job("1", "wrfgs", variant=variant), PROFILES["quick"]) for variant in ("", "fast"))
+    assert fast.optim.network_lr > usual.optim.network_lr and fast.optim.steps == usual.optim.steps
+    assert fast.wrfgs == usual.wrfgs
 
 
 def test_the_papers_averages_are_those_of_its_rows():

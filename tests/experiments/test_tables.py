@@ -12,8 +12,10 @@ from experiments.results import Results
 
 LEVELS = {
     ("wideband", ""): 0.8,
+    ("wideband", "fast"): 0.82,
     ("wideband", "long"): 0.85,
     ("wrfgs", ""): 0.64,
+    ("wrfgs", "fast"): 0.7,
     ("wrfgs", "long"): 0.75,
     ("wrfgs", "longest"): 0.81,
     ("wave", ""): 0.9,
@@ -89,15 +91,16 @@ def test_table_1_has_medians_intervals_seeds_and_ceilings(everything):
 
 
 def test_the_headline_is_computed(everything):
-    equal, long, longest, coherent = (cells[3:] for cells in rows(headline.gain_in_short(everything)))
+    equal, fast, long, longest, coherent = (cells[3:] for cells in rows(headline.gain_in_short(everything)))
     assert equal == ["0.810 (0.66)", "0.650 (0.56)", "+24.6 % (+17.8 %)", "6 of 6"]
+    assert fast == ["0.830", "0.710", "+16.9 %", "6 of 6"]
     assert long == ["0.860", "0.760", "+13.2 %", "6 of 6"]
     assert longest == ["0.810", "0.810", "+0.0 %", "0 of 6"]
     assert coherent == ["0.910", "0.810", "+12.3 %", "6 of 6"]
     scenes = rows(headline.gain_by_scene(everything))
-    assert len(scenes) == 4 * 6
+    assert len(scenes) == 5 * 6
     assert scenes[1] == ["2", "0.810 (0.59)", "0.650 (0.52)", "+24.6 %", "100 % of 7", "+0.160", "1.6e-02"]
-    assert scenes[13][1:5] == ["0.810 (0.59)", "0.810", "+0.0 %", "0 % of 7"]  # one seed of each: 0.80 and 0.81
+    assert scenes[19][1:5] == ["0.810 (0.59)", "0.810", "+0.0 %", "0 % of 7"]  # one seed of each: 0.80 and 0.81
     mixed, alike, blind = rows(headline.zero_shot_drop(everything))
     assert mixed[1:] == ["0.790", "0.810", "-2.5 % (-2.8 %)"]
     assert alike[1:] == ["0.790", "0.810", "-2.5 %"]
@@ -109,7 +112,7 @@ def test_scenes_that_are_missing_are_left_out_of_the_average_and_counted(tmp_pat
     for scene in ("1", "4"):
         for field in ("wideband", "wrfgs"):
             results.write(Job(scene, field), made_up(Job(scene, field)))
-    equal, long, *_ = rows(headline.gain_in_short(results))
+    equal, _, long, *_ = rows(headline.gain_in_short(results))
     assert equal[5:] == ["+25.0 % (+17.8 %)", "2 of 2"]
     assert long[3:] == [cells.NOT_RUN] * 4
     assert row(headline.gain_by_scene(results), "3")[2] == cells.NOT_RUN
