@@ -134,9 +134,11 @@ def test_a_second_interrupt_does_not_wait(dataset, tmp_path, monkeypatch):
         train(dataset, "wideband", SETTINGS, 0, tmp_path)
 
 
-def test_an_interrupt_in_the_last_epoch_is_a_finished_run(dataset, tmp_path, monkeypatch):
-    interrupt_after(monkeypatch, STEPS // 2)
-    assert train(dataset, "wideband", SETTINGS, 0, tmp_path).steps == STEPS
+def test_an_interrupt_in_the_last_epoch_is_passed_on(dataset, tmp_path, monkeypatch, uninterrupted):
+    interrupt_after(monkeypatch, STEPS // SETTINGS.loop.epoch_steps)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, "wideband", SETTINGS, 0, tmp_path)
+    assert_same_run(dataset, tmp_path, uninterrupted(SETTINGS), SETTINGS)
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_anew(dataset, tmp_path, uninterrupted):

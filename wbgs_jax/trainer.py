@@ -244,16 +244,18 @@ def _forget_later_metrics(path: Path, step: int) -> None:
 
 @contextlib.contextmanager
 def _deferred_interrupt() -> Iterator[dict[str, bool]]:
-    """Turn the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once.
+    """Turn the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once. One that comes too
+    late to be looked at is passed on at the end.
 
     Signals reach the main thread only; elsewhere the flag is never set.
     """
-    flag = {"set": False}
+    flag, received = {"set": False}, list[int]()
 
     def handler(signum, frame):
         if flag["set"]:
             raise KeyboardInterrupt
         flag["set"] = True
+        received.append(signum)
 
     signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
     previous = {s: signal.signal(s, handler) for s in signals}
@@ -262,6 +264,8 @@ def _deferred_interrupt() -> Iterator[dict[str, bool]]:
     finally:
         for s, old in previous.items():
             signal.signal(s, old)
+    for number in received:  # nobody was told
+        signal.raise_signal(number)
 
 
 def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:
@@ -271,6 +275,7 @@ def train(dataset: Dataset, field_name: str, settings: Settings, seed: int, fold
         UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder,
             no training spectra.
         Interrupted: Ctrl-C; the state is saved.
+        KeyboardInterrupt: Ctrl-C in the last epoch; the state is saved, and nothing is left to train.
     """
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
