@@ -83,9 +83,9 @@ def gain_in_short(results: Results) -> str:
         rows.append([NAMES[own], NAMES[other], words, *shown, gain, f"{above} of {len(pairs)}" if pairs else NOT_RUN])
     note = (
         "**Gain over WRF-GS**: averages over ten frequencies of the median SSIM, averaged over the scenes that both were run in"
-        " (in parentheses the paper's, which trains all models in full). A model of WRF-GS that starts anew at every frequency"
-        " needs more samples than one model for all of them: the gain is in the training, and shrinks as WRF-GS is trained"
-        " longer."
+        " (in parentheses the paper's, which trains all models in full). WRF-GS starts anew at every frequency and so needs more"
+        " samples than one model for all of them: rows with a rate that suits short trainings, and with more samples, say how"
+        " much of the gain that is."
     )
     head = ["ours", "theirs", "", "ours (paper)", "theirs (paper)", "gain (paper)", "ours above in"]
     return note + "\n\n" + markdown(head, rows)
