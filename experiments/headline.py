@@ -83,7 +83,7 @@ def gain_in_short(results: Results) -> str:
         rows.append([NAMES[own], NAMES[other], words, *shown, gain, f"{above} of {len(pairs)}" if pairs else NOT_RUN])
     note = (
         "**Gain over WRF-GS**: averages over ten frequencies of the median SSIM, averaged over the scenes that both were run in"
-        " (in parentheses the paper's, which trains all models in full). WRF-GS starts anew at every frequency and so needs more"
+        " (in parentheses the paper's, which trains all models in full). WRF-GS starts anew at every frequency and needs more"
         " samples than one model for all of them: rows with a rate that suits short trainings, and with more samples, say how"
         " much of the gain that is."
     )
