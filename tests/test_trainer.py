@@ -136,8 +136,12 @@ def test_a_second_interrupt_does_not_wait(dataset, tmp_path, monkeypatch):
 
 def test_an_interrupt_in_the_last_epoch_is_passed_on(dataset, tmp_path, monkeypatch, uninterrupted):
     interrupt_after(monkeypatch, STEPS // SETTINGS.loop.epoch_steps)
-    with pytest.raises(KeyboardInterrupt):
-        train(dataset, "wideband", SETTINGS, 0, tmp_path)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(dataset, "wideband", SETTINGS, 0, tmp_path)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert_same_run(dataset, tmp_path, uninterrupted(SETTINGS), SETTINGS)
 
 
