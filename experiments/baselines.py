@@ -47,7 +47,7 @@ def without_learning(results: Results) -> str:
     note = (
         "Predictors that learn nothing, on all held-out transmitters: the mean of all training spectra, that of the nearest"
         " training transmitter, their average weighted by 1/d², and the array's answer to the straight line. The phase-blind"
-        " ceiling knows every path but not its phase. Averages over ten frequencies of the median SSIM."
+        " ceiling is that of the true paths with random phases. Averages over ten frequencies of the median SSIM."
     )
     names = [name.replace("_", " ").replace("tx", "TX") for name in NAMES_OF_REFERENCES]
     return note + "\n\n" + markdown(["scene", "wideband", "coherent", *names, "ceiling"], rows)
