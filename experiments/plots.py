@@ -23,9 +23,9 @@ STYLES: dict[tuple[str, str], dict[str, Any]] = {
 
 
 def save(figure: Figure, images: Path, name: str, alt: str) -> str:
-    """Write docs/images/results_<name>.png; returns the markdown that shows it."""
+    """Write results_<name>.png in a folder beside the page; returns the markdown that shows it."""
     path = images / f"results_{name}.png"
     with atomic_write(path) as stream:
         figure.savefig(stream, format="png", dpi=100, metadata={"Software": None})
     plt.close(figure)
-    return f"![{alt}](images/{path.name})"
+    return f"![{alt}]({images.name}/{path.name})"

@@ -1,7 +1,7 @@
 """Every table and figure of the paper from the results that there are: `python -m experiments.tables [--profile quick]`.
 
-Writes docs/results.md (docs/results_<profile>.md for other profiles than quick) and its pictures. Nothing in it is typed
-in: what has not been run says so.
+Writes docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick). Nothing
+in it is typed in: what has not been run says so.
 """
 
 from collections import Counter
@@ -123,11 +123,12 @@ def provenance(results: Results) -> str:
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.tables")
-    name = "results.md" if command.profile == "quick" else f"results_{command.profile}.md"
-    text = page(Results(command.profile, command.results), command.docs / "images")
-    with atomic_write(command.docs / name) as stream:
+    suffix = "" if command.profile == "quick" else f"_{command.profile}"
+    text = page(Results(command.profile, command.results), command.docs / f"images{suffix}")
+    path = command.docs / f"results{suffix}.md"
+    with atomic_write(path) as stream:
         stream.write(text.encode())
-    print(command.docs / name)
+    print(path)
 
 
 if __name__ == "__main__":

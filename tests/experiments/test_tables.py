@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -155,7 +156,19 @@ def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
     text = tables.page(everything, tmp_path)
     for module in tables.PAGES:
         assert f"## {module.TITLE}" in text
-    shown = set(re.findall(r"\(images/(\S+?)\)", text))
+    shown = set(re.findall(rf"\({tmp_path.name}/(\S+?)\)", text))
     assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
     assert cells.NOT_RUN not in text
     assert "`abc123`" in text and "nan" not in text
+
+
+def test_pages_of_two_profiles_share_no_picture(tmp_path, monkeypatch):
+    job = Job("1", "wideband")
+    for profile in ("quick", "smoke"):
+        Results(profile, tmp_path).write(job, made_up(job))
+        arguments = ["--profile", profile, "--results", str(tmp_path), "--docs", str(tmp_path / "docs")]
+        monkeypatch.setattr(sys, "argv", ["tables", *arguments])
+        tables.main()
+    assert "(images/results_headline.png)" in (tmp_path / "docs" / "results.md").read_text()
+    assert "(images_smoke/results_headline.png)" in (tmp_path / "docs" / "results_smoke.md").read_text()
+    assert (tmp_path / "docs" / "images_smoke" / "results_headline.png").exists()
