@@ -61,9 +61,7 @@ class Command:
 def measure_change(change: Change, scene: str, seed: int) -> dict[str, Any]:
     """Train all models of a field and average their scores."""
     job = Job(scene, change.field, seed=seed)
-    chosen = settings(job, PROFILES[PROFILE])
-    for section, values in change.values.items():
-        chosen = changed(chosen, section, **values)
+    chosen = changed(settings(job, PROFILES[PROFILE]), change.values)
     parts = [measure(some_test_transmitters(dataset, SCORED_SLOW), chosen, seed, change.field) for _, dataset in job.models()]
     means = {name: round(float(np.mean([part[name] for part in parts])), 4) for name in ("median_ssim", "mean_ssim")}
     sums = {name: round(sum(part[name] for part in parts), 1) for name in ("steps", "seconds")}

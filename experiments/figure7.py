@@ -12,7 +12,7 @@ from experiments.paper import DENSE_SCENE, FIGURE_7_AVERAGE, FIGURE_7_GAIN, FIGU
 from experiments.plots import STYLES, save
 from experiments.report import markdown
 from experiments.results import Results
-from experiments.statistics import level
+from experiments.statistics import gain
 
 TITLE = "Figure 7: scene 1 at 21 frequencies"
 MODELS = (("wideband", ""), ("wideband", "long"), ("wideband", "no_frequency"), ("wrfgs", ""), ("wrfgs", "long"), ("wave", ""))
@@ -61,8 +61,7 @@ def gain_cells(values: dict[tuple[str, str], Scores | None], model: tuple[str, s
         return ["", "", ""]
     ours, theirs = values["wideband", variant], values[model]
     better, _, p = paired_cells(ours, theirs)
-    gain = None if ours is None or theirs is None else level(ours) / level(theirs) - 1
-    return [percent(gain, None if variant else FIGURE_7_GAIN), better, p]
+    return [percent(gain(ours, theirs), None if variant else FIGURE_7_GAIN), better, p]
 
 
 def by_frequency(values: dict[tuple[str, str], Scores | None]) -> str:

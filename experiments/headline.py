@@ -8,13 +8,13 @@ from matplotlib.patches import Patch
 
 from experiments import figure7, figure8, table1, table3
 from experiments.baselines import best_reference
-from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, paired_cells, percent, scores
+from experiments.cells import NAMES, NOT_RUN, Scores, ceiling, cell, median_cell, paired_cells, percent, scores
 from experiments.jobs import BUDGETS, VARIANTS, Job
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_AVERAGE, TABLE_1_OVERALL, ZERO_SHOT_DROP
 from experiments.plots import STYLES, save
 from experiments.report import markdown
 from experiments.results import Results
-from experiments.statistics import level
+from experiments.statistics import gain, level
 
 TITLE = "Headline"
 Model = tuple[str, str]
@@ -77,10 +77,10 @@ def gain_in_short(results: Results) -> str:
         pairs = [(ours, theirs) for ours, theirs in both if ours is not None and theirs is not None]
         papers = [TABLE_1_OVERALL.get(own[0]), TABLE_1_OVERALL["wrfgs"]] if words == "equal samples" else [None, None]
         means = np.mean([[level(v) for v in pair] for pair in pairs], 0).tolist() if pairs else []
-        gain = percent(means[0] / means[1] - 1 if means else None, GAIN if all(papers) else None)
+        above_it = percent(means[0] / means[1] - 1 if means else None, GAIN if all(papers) else None)
         above = sum(level(ours) > level(theirs) for ours, theirs in pairs)
         shown = [cell(value, paper) for value, paper in zip(means or [None, None], papers, strict=True)]
-        rows.append([NAMES[own], NAMES[other], words, *shown, gain, f"{above} of {len(pairs)}" if pairs else NOT_RUN])
+        rows.append([NAMES[own], NAMES[other], words, *shown, above_it, f"{above} of {len(pairs)}" if pairs else NOT_RUN])
     note = (
         "**Gain over WRF-GS**: averages over ten frequencies of the median SSIM, averaged over the scenes that both were run in"
         " (in parentheses the paper's, which trains all models in full). WRF-GS starts anew at every frequency and needs more"
@@ -117,9 +117,8 @@ def pair_of(results: Results, scene: str, own: Model, other: Model) -> tuple[Sco
 
 def gain_cells(ours: Scores | None, theirs: Scores | None, papers: list[float | None]) -> list[str]:
     """Both averages, the gain, the paired test."""
-    shown = [cell(None if v is None else level(v), paper) for v, paper in zip((ours, theirs), papers, strict=True)]
-    gain = None if ours is None or theirs is None else level(ours) / level(theirs) - 1
-    return [*shown, percent(gain), *paired_cells(ours, theirs)]
+    shown = [median_cell(v, paper) for v, paper in zip((ours, theirs), papers, strict=True)]
+    return [*shown, percent(gain(ours, theirs)), *paired_cells(ours, theirs)]
 
 
 def zero_shot_drop(results: Results) -> str:
@@ -145,6 +144,5 @@ def zero_shot_drop(results: Results) -> str:
 
 def drop_cells(partial: Scores | None, full: Scores | None, paper: float | None = None) -> list[str]:
     """Both averages and the relative change; `paper` is the paper's drop."""
-    shown = [cell(None if v is None else level(v)) for v in (partial, full)]
-    change = None if partial is None or full is None else level(partial) / level(full) - 1
-    return [*shown, percent(change, None if paper is None else -paper)]
+    change = percent(gain(partial, full), None if paper is None else -paper)
+    return [median_cell(partial), median_cell(full), change]

@@ -142,18 +142,14 @@ def settings(job: Job, profile: Profile) -> Settings:
     """A job's settings: the preset with the profile's and the variant's changes, schedules that count steps in proportion."""
     base = preset_settings(profile.preset, job.field)
     preset_steps = base.optim.steps
-    for section, values in profile.changes.items():
-        base = changed(base, section, **values)
-    for section, values in VARIANTS[job.variant].items():
-        base = changed(base, job.field if section == OWN else section, **values)
+    base = changed(base, profile.changes)
+    base = changed(base, {job.field if name == OWN else name: values for name, values in VARIANTS[job.variant].items()})
     block = base.loop.epoch_steps
     steps = whole(wanted_steps(job, profile), block)
-    base = changed(base, "optim", steps=steps, min_steps=steps)
     control = {name: getattr(base.density, name) for name in ("every", "start", "reset_every")}
     shrunk = {name: whole(count * steps / preset_steps, block) for name, count in control.items() if count}
-    base = changed(base, "density", **shrunk)
     loop = {"evaluate_spectra": 0, "checkpoint_every": max(steps // 5, 100), "keep_checkpoints": 1}
-    return changed(base, "loop", **loop)
+    return changed(base, {"optim": {"steps": steps, "min_steps": steps}, "density": shrunk, "loop": loop})
 
 
 def differences(job: Job, profile: Profile) -> dict[str, Any]:
@@ -176,9 +172,10 @@ def wanted_steps(job: Job, profile: Profile) -> float:
     return steps / len(job.test_ghz) if job.field in ONE_FREQUENCY else steps
 
 
-def changed(settings: Settings, section: str, **values: Any) -> Settings:
-    """Settings with other values in one section."""
-    return dataclasses.replace(settings, **{section: dataclasses.replace(getattr(settings, section), **values)})
+def changed(settings: Settings, changes: dict[str, dict[str, Any]]) -> Settings:
+    """Settings with other values in some sections."""
+    sections = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in changes.items()}
+    return dataclasses.replace(settings, **sections)
 
 
 def whole(count: float, block: int) -> int:

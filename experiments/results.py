@@ -79,7 +79,7 @@ class Results:
     def pictures(self, job: Job) -> UInt8[np.ndarray, "k 90 360"] | None:
         """The kept pictures, one for each of `PICTURED_GHZ`."""
         path = self.pictures_path(job)
-        if not path.exists():
+        if self.get(job) is None or not path.exists():
             return None
         with Image.open(path) as image:
             return np.asarray(image).reshape(len(PICTURED_GHZ), -1, image.width)

@@ -36,6 +36,11 @@ def level(scores: Float[np.ndarray, "seeds tx ghz"]) -> float:
     return float(np.median(typical(scores)))
 
 
+def gain(ours: Float[np.ndarray, "seeds tx ghz"] | None, theirs: Float[np.ndarray, "seeds2 tx ghz"] | None) -> float | None:
+    """By how much one level is above another, relative to that; None if one of them is missing."""
+    return None if ours is None or theirs is None else level(ours) / level(theirs) - 1
+
+
 def estimate(scores: Float[np.ndarray, "seeds tx ghz"]) -> Estimate:
     """The level, and the interval of drawing other transmitters from the same scene, and other seeds."""
     rng = np.random.default_rng(SEED)

@@ -45,8 +45,10 @@ def scene_table(results: Results, scene: str) -> str:
     rows = []
     for field, variant in MODELS:
         jobs, paper = jobs_of(scene, field, variant), None if variant else TABLE_1[scene].get(field)
-        each = [median_cell(scores(results, jobs, [f]), paper[i] if paper else None) for i, f in enumerate(GHZ_10)]
-        average = summary_cells(scores(results, jobs, GHZ_10), TABLE_1_AVERAGE[scene][field] if paper else None)
+        values = scores(results, jobs, GHZ_10)
+        by_frequency = [None if values is None else values[..., i : i + 1] for i in range(len(GHZ_10))]
+        each = [median_cell(v, paper[i] if paper else None) for i, v in enumerate(by_frequency)]
+        average = summary_cells(values, TABLE_1_AVERAGE[scene][field] if paper else None)
         rows.append([NAMES[field, variant], *each, *average])
     best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])
