@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from wbgs_jax.array import snapshot_to_pas
-from wbgs_jax.metrics import ssim
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.radio.array import snapshot_to_pas
 
 if TYPE_CHECKING:
     from data_gen.solve import TxPaths

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex
 
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.array import snapshot_to_pas
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.metrics import ssim
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.radio.array import snapshot_to_pas
+from wbgs_jax.radio.channel import correlation
 
 TX_SEED = 0
 
@@ -39,14 +41,6 @@ class Options:
     """First-order diffraction."""
     depth: int = SolverSettings.max_depth
     """Interactions a path may have."""
-
-
-def correlation(
-    first: Complex[np.ndarray, "*n elements"], second: Complex[np.ndarray, "*n elements"]
-) -> Float[np.ndarray, "*n"]:
-    """|a^H b| / (|a| |b|) of every pair of snapshots; 1 means equal images."""
-    inner = np.abs((first.conj() * second).sum(-1))
-    return inner / (np.linalg.norm(first, axis=-1) * np.linalg.norm(second, axis=-1))
 
 
 def settings(effort: float, diffraction: bool = True, depth: int = SolverSettings.max_depth) -> SolverSettings:
@@ -83,15 +77,22 @@ def _lines(options: Options, snapshots: Sequence[Complex[np.ndarray, "freq tx el
     elements = jnp.asarray(ArraySettings().element_positions())
     lines = []
     for i, ghz in enumerate(options.frequencies):
-        best = snapshots[-1][i]
-        truth = np.asarray(snapshot_to_pas(jnp.asarray(best), elements))
-        for effort, cost, snapshot in zip(options.effort, costs, snapshots, strict=True):
-            same = correlation(snapshot[i], best)
-            score = ssim(np.asarray(snapshot_to_pas(jnp.asarray(snapshot[i]), elements)), truth)
+        best = _scaled(snapshots[-1][i])
+        truth = np.asarray(snapshot_to_pas(best, elements))
+        for effort, cost, by_frequency in zip(options.effort, costs, snapshots, strict=True):
+            snapshot = _scaled(by_frequency[i])
+            same = np.asarray(correlation(snapshot, best))
+            score = ssim(np.asarray(snapshot_to_pas(snapshot, elements)), truth)
             cells = (f"{options.scene} | {ghz:g} | {effort:g}", *(f"{v:.3f}" for v in (np.median(same), same.min())),
                      *(f"{v:.3f}" for v in (np.median(score), np.percentile(score, 10))), f"{cost:.2f}")  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def _scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
+    """Returns snapshots with a maximum of 1: what is compared has no scale, and squares of weak ones stay normal numbers."""
+    peak = np.abs(snapshots).max(-1, keepdims=True)
+    return jnp.asarray(snapshots / np.where(peak > 0, peak, 1), jnp.complex64)
 
 
 def main() -> None:

@@ -21,10 +21,11 @@ from data_gen.llvm import CUDA, find_backend
 from data_gen.options import Options, make_job
 from data_gen.own_scene import describe
 from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
-from wbgs_jax.data.schema import TEST, SceneFile, save_scene
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.scene_file import TEST, SceneFile, save_scene
 from wbgs_jax.data.splits import tx_disjoint_split
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.progress import CountProgress
+from wbgs_jax.training.progress import CountProgress
 
 TEST_FRACTION = 0.2
 SPLIT_SEED = 0
@@ -81,12 +82,12 @@ def _assemble(job: jobs.Job, folder: Path, backend: str) -> SceneFile:
         raise UserError(f"no transmitter of {spec.name} has a path at every frequency; raise --samples or --depth")
     read_back = found.pop("read_back_hz")
     found = {key: value[reached] for key, value in found.items()}
-    tx = job.tx_positions[reached]
+    tx, mesh = job.tx_positions[reached], spec.mesh_arrays()
     scene = SceneFile(
-        name=spec.name, snapshots=found["snapshots"], tx_positions=tx, frequencies_hz=np.array(job.frequencies_hz),
-        rx_position=np.array(spec.rx_position), rx_orientation=np.array(spec.rx_orientation),
-        element_positions=job.array.element_positions(), split=_split(len(tx)), meta=_provenance(job, backend),
-        **spec.mesh_arrays(),
+        name=spec.name, snapshots=found["snapshots"][:, None], tx_positions=tx, frequencies_hz=np.array(job.frequencies_hz),
+        rx_position=np.array([spec.rx_position]), rx_orientation=np.array([spec.rx_orientation]),
+        element_positions=job.array.element_positions()[None], element_pattern=job.array.pattern, split=_split(len(tx)),
+        vertices=mesh["vertices"], faces=mesh["faces"], face_part=mesh["face_part"], meta=_provenance(job, backend),
     )  # fmt: skip
     scene.meta.update(
         tx_kept=len(tx), tx_without_path=int((~reached).sum()), frequencies_read_back_hz=read_back.tolist(),

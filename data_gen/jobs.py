@@ -24,8 +24,8 @@ from jaxtyping import Float
 from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.errors import UserError
-from wbgs_jax.files import atomic_write
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
 
 if TYPE_CHECKING:
     from data_gen.solve import Simulator, TxPaths

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable that names the library; it is respected when set."""

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 VALID_HZ = (1e9, 100e9)
 """Lowest and highest frequency (hertz, both included) of a scene, and of every material in `THICKNESS`."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from data_gen.scenes.base import Part
 from data_gen.scenes.geometry import distance
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 TOUCH = 1e-4
 """Metres: surfaces that are nearer lie on each other."""

@@ -13,7 +13,8 @@ from data_gen.own_scene import own_scene
 from data_gen.scenes import SceneSpec, get_scene
 from data_gen.scenes.base import FREQUENCIES_21_HZ
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.load import RELEASED
 
 HERE = Path(__file__).parent
 SUBSET_SEED = 0
@@ -77,7 +78,7 @@ class Options(SceneOptions):
     """Generate a scene file with Sionna RT. The same command continues an interrupted run."""
 
     out: Path | None = None
-    """Scene file to write; data_gen/released/scene<N>.npz or <name of your file>.npz unless given."""
+    """Scene file to write; wbgs_jax/data/released/scene<N>.npz or <name of your file>.npz unless given."""
     frequencies: tuple[float, ...] = ()
     """GHz; those of the frequency set unless given."""
     frequency_set: Literal["10", "21"] = "10"
@@ -111,7 +112,7 @@ class Options(SceneOptions):
         if any(getattr(self, name) != getattr(usual, name) for name in same):
             raise UserError("with settings of your own the released file must not be replaced; give another one with --out")
         suffix = "_21f" if self.frequency_set == "21" else ""
-        return HERE / "released" / f"scene{self.scene}{suffix}.npz"
+        return RELEASED / f"scene{self.scene}{suffix}.npz"
 
 
 def make_job(options: Options) -> Job:

@@ -18,7 +18,7 @@ from data_gen.mesh_checks import check_surfaces, is_solid, kind, outward, place
 from data_gen.scene_files import FileObject, read_objects
 from data_gen.scenes.base import FREQUENCIES_HZ, RX_CLEARANCE, Part, SceneSpec, grid_3d
 from data_gen.scenes.geometry import Vec3, distance, winding_number
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 EXTENT = (0.5, 200.0)
 """Metres: the largest side of a scene is in between, or its unit is not the metre."""

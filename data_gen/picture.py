@@ -24,8 +24,8 @@ from scipy.spatial import ConvexHull
 
 from data_gen.options import SceneOptions
 from data_gen.scenes import Part, SceneSpec
-from wbgs_jax.errors import run_command
-from wbgs_jax.files import atomic_write
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.files import atomic_write
 
 COLORS = {
     "concrete": "#9a9a96", "plasterboard": "#e3ddcf", "wood": "#b98a56", "glass": "#8fc3e0", "ceiling_board": "#f0f0ea",

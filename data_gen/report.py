@@ -1,6 +1,6 @@
 """Tables of the dataset card from the meta of scene files, as markdown.
 
-python -m data_gen.report data_gen/released/*.npz
+python -m data_gen.report wbgs_jax/data/released/*.npz
 """
 
 import hashlib
@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from wbgs_jax.data.schema import SceneFile, load_scene
-from wbgs_jax.errors import run_command
+from wbgs_jax._util.command import run_command
+from wbgs_jax.data.scene_file import SceneFile, load_scene
 
 CEILINGS = {
     "order<=0": "order <= 0", "order<=1": "<= 1", "order<=2": "<= 2", "order<=3": "<= 3", "phase_blind": "phase-blind",
@@ -50,9 +50,9 @@ def report(files: tuple[Path, ...]) -> str:
 
 def _row(item: tuple[Path, SceneFile]) -> list[str]:
     file, scene = item
-    n_tx, n_freq, _ = scene.snapshots.shape
+    n_tx, n_rx, n_freq = scene.observations.shape[:3]
     content = file.read_bytes()
-    counts = (n_tx, n_freq, n_tx * n_freq, len(scene.faces), round(len(content) / 1000))
+    counts = (n_tx, n_freq, n_tx * n_rx * n_freq, len(scene.faces), round(len(content) / 1000))
     return [file.name, *(f"{count:,}" for count in counts), f"`{hashlib.sha256(content).hexdigest()[:16]}`"]
 
 

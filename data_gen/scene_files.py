@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from data_gen.materials import Law, own_material
 from data_gen.scenes.geometry import merge
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 """(x, y, z) of a y-up file becomes (x, -z, y), as Blender does it."""

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from wbgs_jax.array import planar_array
+from wbgs_jax.radio.array import planar_array
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class ArraySettings:
-    """The receiver's array. The default is that of the published sample (shapes and phases: `wbgs_jax/array.py`)."""
+    """The receiver's array. The default is that of the published sample (shapes and phases: `wbgs_jax/radio/array.py`)."""
 
     rows: int = 4
     columns: int = 4

@@ -5,30 +5,30 @@ import numpy as np
 from data_gen.ceilings import NAMES
 from data_gen.jobs import Results
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.data.schema import TEST, SceneFile
-from wbgs_jax.metrics import ssim
-from wbgs_jax.references import references
+from wbgs_jax.data.scene_file import TEST, SceneFile
+from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.metrics import ssim
 
 DIGITS = 4
 """Decimals kept: far below the spread over transmitters, far above rounding noise."""
 
 
 def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
-    """Median SSIM by frequency: the ceilings, over the transmitters they were measured on, and the predictors that learn
-    nothing (`wbgs_jax.references`), over all test transmitters."""
-    learned_nothing = _references(scene)
+    """Returns the median SSIM by frequency: the ceilings, over the transmitters they were measured on, and the baselines
+    (`wbgs_jax.evaluation.baselines`), over all test transmitters."""
+    baseline_scores = _baselines(scene)
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
         ceilings = zip(NAMES, np.nanmedian(found["ceilings"][:, i], 0), strict=True) if _measured(found) else ()
-        row = dict(ceilings) | {name: np.median(values[i]) for name, values in learned_nothing.items()}
+        row = dict(ceilings) | {name: np.median(values[i]) for name, values in baseline_scores.items()}
         rows.append({"frequency_ghz": float(frequency / 1e9), **{k: round(float(v), DIGITS) for k, v in row.items()}})
     return rows
 
 
 def channel_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
-    """By frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the path gain to an
-    element (5th, 50th and 95th percentile over transmitters, dB)."""
-    gain_db = 10 * np.log10(np.mean(np.abs(scene.snapshots.astype(np.complex128)) ** 2, -1))
+    """Returns by frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the path gain
+    to an element (5th, 50th and 95th percentile over transmitters, dB), all of the first receiver."""
+    gain_db = 10 * np.log10(np.mean(np.abs(scene.observations[:, 0].astype(np.complex128)) ** 2, -1))
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
         p05, p50, p95 = np.percentile(gain_db[:, i], (5, 50, 95))
@@ -45,8 +45,8 @@ def _measured(found: Results) -> bool:
     return bool(np.isfinite(found["ceilings"]).any())
 
 
-def _references(scene: SceneFile) -> dict[str, list[np.ndarray]]:
-    """SSIM of every reference on the test spectra: an array for every frequency. Nothing where there is nothing to compare."""
+def _baselines(scene: SceneFile) -> dict[str, list[np.ndarray]]:
+    """Returns the SSIM of every baseline on the test spectra, an array a frequency; none where there is nothing to compare."""
     if not 0 < (scene.split == TEST).sum() < len(scene.split):
         return {}
     dataset = scene_dataset(scene)
@@ -54,5 +54,5 @@ def _references(scene: SceneFile) -> dict[str, list[np.ndarray]]:
     truths = [np.asarray(dataset.pas(chosen)) for chosen in by_frequency]
     return {
         name: [ssim(predict(chosen), truth) for chosen, truth in zip(by_frequency, truths, strict=True)]
-        for name, predict in references(dataset).items()
+        for name, predict in baselines(dataset).items()
     }

@@ -24,7 +24,7 @@ from data_gen.materials import own_law
 from data_gen.rays import RayLauncher
 from data_gen.settings import SolverSettings
 from data_gen.utd import diffraction_matrix, end_unused_vertices
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 
 class BalancedMaterial(rt.RadioMaterial):

@@ -17,8 +17,8 @@ import tyro
 
 from experiments.choices import RESULTS, chosen_names, measure, run_series
 from experiments.jobs import PROFILES, SCORED_SLOW, Job, changed, settings, some_test_transmitters
-from wbgs_jax.errors import run_command
-from wbgs_jax.files import read_json
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.files import read_json
 
 PROFILE = "quick"
 RATES = ("1e-3", "2e-3", "8e-3", "1.6e-2", "3.2e-2")

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from wbgs_jax.data.schema import TEST, TRAIN, SceneFile, save_scene
-from wbgs_jax.errors import UserError, run_command
+from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile, save_scene
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
 
 THICKNESS = 0.1
 """Metres."""

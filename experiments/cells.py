@@ -10,7 +10,7 @@ from experiments.jobs import Job
 from experiments.results import Results
 from experiments.statistics import compare, estimate, level
 from wbgs_jax.data import released_scenes
-from wbgs_jax.data.schema import load_scene
+from wbgs_jax.data.scene_file import load_scene
 
 NOT_RUN = "not run yet"
 Scores = Float[np.ndarray, "seeds tx ghz"]

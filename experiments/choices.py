@@ -20,17 +20,18 @@ from typing import Any
 import numpy as np
 import tyro
 
-from wbgs_jax import metrics
+from wbgs_jax.evaluation import metrics
 from wbgs_jax.config import PRESETS, DensityConfig, OptimConfig, Settings, WidebandConfig
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import unseen_frequencies
-from wbgs_jax.errors import UserError, run_command
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
-from wbgs_jax.files import read_json, write_json
-from wbgs_jax.inference import predict_spectra
-from wbgs_jax.trainer import Run, train
+from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.training.loop import Run, train
 
 RESULTS = Path(__file__).parent / "results"
 Change = dict[str, Any]

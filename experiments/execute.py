@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, settings
-from wbgs_jax import metrics
+from wbgs_jax.evaluation import metrics
 from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import get_field
-from wbgs_jax.files import atomic_write
-from wbgs_jax.inference import predict_spectra
-from wbgs_jax.references import references
-from wbgs_jax.runs import RunConfig
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.evaluation.baselines import references
+from wbgs_jax.training.run_folder import RunConfig
 from wbgs_jax.train import prepare_folder
-from wbgs_jax.trainer import train
+from wbgs_jax.training.loop import train
 
 CURVE_POINTS = 200
 ENVIRONMENT = environment()

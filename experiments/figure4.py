@@ -12,7 +12,7 @@ from experiments.execute import pictured
 from experiments.jobs import PICTURED_GHZ, PICTURED_SCENES, Job
 from experiments.plots import save
 from experiments.results import Results
-from wbgs_jax import metrics
+from wbgs_jax.evaluation import metrics
 
 TITLE = "Figure 4: predicted spectra"
 

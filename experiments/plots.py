@@ -7,7 +7,7 @@ import matplotlib
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from wbgs_jax.files import atomic_write
+from wbgs_jax._util.files import atomic_write
 
 matplotlib.use("Agg")
 

@@ -4,7 +4,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from wbgs_jax.files import read_json
+from wbgs_jax._util.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, differences
-from wbgs_jax.files import atomic_write, read_json
+from wbgs_jax._util.files import atomic_write, read_json
 
 FOLDER = Path(__file__).parent / "results"
 

@@ -23,9 +23,10 @@ from experiments.execute import execute
 from experiments.jobs import BUDGETS, DENSE_SCENE, PROFILES, Job
 from experiments.results import FOLDER, Results
 from experiments.tables import EXPERIMENTS, unique_jobs
-from wbgs_jax.compilation import use_compilation_cache
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.trainer import Interrupted
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.training.loop import Interrupted
 
 RUNS = Path("runs/experiments")
 

@@ -17,18 +17,18 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from wbgs_jax import metrics
-from wbgs_jax.array import pas_directions
+from wbgs_jax.evaluation import metrics
+from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.config import WaveConfig
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import make_mesh
-from wbgs_jax.errors import run_command
+from wbgs_jax._util.command import run_command
 from wbgs_jax.eval import environment
 from wbgs_jax.fields import wave
-from wbgs_jax.files import write_json
-from wbgs_jax.geometry import to_local
-from wbgs_jax.wave.paths import REFLECTED, TRANSMITTED
+from wbgs_jax._util.files import write_json
+from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = WaveConfig(

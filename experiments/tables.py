@@ -16,8 +16,8 @@ import tyro
 from experiments import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 from experiments.jobs import PROFILES, Job, Profile
 from experiments.results import FOLDER, Results
-from wbgs_jax.errors import run_command
-from wbgs_jax.files import atomic_write
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.files import atomic_write
 
 EXPERIMENTS: dict[str, ModuleType] = {
     # In the order of importance, for the runner.

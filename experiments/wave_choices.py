@@ -19,8 +19,9 @@ from experiments.choices import chosen_names, measure, run_series
 from wbgs_jax.config import Settings, preset_settings
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.files import read_json
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_json
 
 RESULTS = Path(__file__).parent / "results"
 Change = dict[str, Any]

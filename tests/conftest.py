@@ -54,14 +54,3 @@ def x64():
 
     with jax.enable_x64(True):
         yield
-
-
-@pytest.fixture
-def compile_once(monkeypatch):
-    """Lets equal tiny runs of one process share their optimiser and their compiled epoch."""
-    import synthetic
-
-    from wbgs_jax import trainer
-
-    monkeypatch.setattr(trainer, "make_optimizer", synthetic.make_optimizer)
-    monkeypatch.setattr(trainer, "make_epoch", synthetic.make_epoch)

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.choices import CHANGES, changed_settings
 from wbgs_jax.config import PRESETS, Settings, check, from_dict, limit_steps, to_dict
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

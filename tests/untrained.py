@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from synthetic import tiny_dataset, tiny_scene, tiny_settings
 
-from wbgs_jax import checkpoint
-from wbgs_jax.data.schema import save_scene
-from wbgs_jax.data.surface import make_surface
-from wbgs_jax.fields import wideband
-from wbgs_jax.pytree import pytree
-from wbgs_jax.runs import RunConfig, TrainedField, write_config
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.wideband import WidebandField, WidebandParams
+from wbgs_jax.training import checkpoint
+from wbgs_jax.training.run_folder import RunConfig, TrainedField, write_config
 
 SETTINGS = tiny_settings()
 STEP = 5
@@ -27,10 +28,13 @@ class State:
     params: Any
 
 
-def make_params() -> wideband.WidebandParams:
+def make_field() -> Field:
     """60 Gaussians in the room of `tiny_scene`."""
-    surface = jax.tree.map(jnp.asarray, make_surface(tiny_dataset(), SETTINGS.wideband.gaussians, seed=0))
-    params = wideband.init(jax.random.key(0), surface, SETTINGS.wideband, SETTINGS.wideband.gaussians)
+    return WidebandField.make(SETTINGS.field, DatasetScene(tiny_dataset()), 0)
+
+
+def make_params() -> WidebandParams:
+    params = make_field().init(jax.random.key(0))
     rng = np.random.default_rng(0)
     shaken = jax.tree.map(lambda a: jnp.asarray(a + rng.normal(0, 0.2, a.shape), jnp.float32), params.networks)
     return dataclasses.replace(params, networks=shaken)
@@ -41,8 +45,8 @@ def make_run(folder: Path) -> Path:
     scene = folder.with_suffix(".npz")
     save_scene(scene, tiny_scene())
     write_config(folder, run_config(scene))
-    metadata = {"sizes": {"gaussians": SETTINGS.wideband.gaussians}, "seconds": 1.0}
-    checkpoint.save(folder / "checkpoints", STEP, State(make_params()), metadata, keep=1)
+    metadata = {"limits": None, "seconds": 1.0}
+    checkpoint.save(folder / "checkpoints", STEP, State(make_params()), make_field(), metadata, keep=1)
     return folder
 
 
@@ -54,4 +58,4 @@ def make_trained(folder: Path) -> TrainedField:
     """As `load_trained(make_run(...))`, without files but the scene's."""
     scene = folder / "box.npz"
     save_scene(scene, tiny_scene())
-    return TrainedField(run_config(scene), wideband, make_params(), STEP, 1.0)
+    return TrainedField(run_config(scene), make_field(), make_params(), STEP, 1.0)

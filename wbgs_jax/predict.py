@@ -1,12 +1,15 @@
 """Ask a trained field for spectra, or export it:
 
-python -m wbgs_jax.predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
-python -m wbgs_jax.predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
-python -m wbgs_jax.predict --run RUN --export field.zip
+wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
+wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
+wbgs-jax predict --run RUN --export field.zip
 """
 
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +23,20 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 import wbgs_jax
-from wbgs_jax import channel
-from wbgs_jax.array import cbf, pas_directions, steering_vector
-from wbgs_jax.compilation import use_compilation_cache
+from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.encoding import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.export import export_field
-from wbgs_jax.files import atomic_write
-from wbgs_jax.inference import BLOCK, predict_many, predictor, scene_box, trained_band
-from wbgs_jax.runs import TrainedField, load_trained
-from wbgs_jax.types import Query, Receiver
-from wbgs_jax.wave.transfer import Arrivals, snapshot
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.inference.export import export_field
+from wbgs_jax.inference.maps import predict_many
+from wbgs_jax.inference.predictor import BLOCK, predictor, trained_band
+from wbgs_jax.radio import channel
+from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
+from wbgs_jax.training.run_folder import TrainedField, load_trained
+from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Query, Receiver
 
 SHOWN = 12
 """Spectra in a picture."""
@@ -49,7 +54,7 @@ class Command:
     ghz: tuple[float, ...] = ()
     """Frequencies, 1 to 100; every transmitter is asked at every one of them."""
     what: Literal["spectra", "snapshot", "power", "beamforming-gain", "k-factor", "delay-spread"] = "spectra"
-    """What to ask for: power angular spectra, or quantities of the channel, which the wave field knows."""
+    """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
     out: Path | None = None
     """Write the answers to this .npz file."""
     picture: Path | None = None
@@ -69,7 +74,7 @@ class Spectra:
 
 
 def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
-    """Positions in metres from "x,y,z" each; anything else is a `UserError`."""
+    """Returns positions in metres from "x,y,z" each; anything else is a `UserError`."""
 
     def parse(word: str) -> list[float]:
         try:
@@ -84,7 +89,7 @@ def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
 
 
 def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, "freq"]:
-    """Hertz; outside the band of the model is a `UserError`."""
+    """Returns hertz; outside the band of the model is a `UserError`."""
     low, high = MIN_FREQUENCY_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
     if wrong := [f for f in ghz if not low <= f <= high]:
         raise UserError(f"--ghz {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
@@ -107,8 +112,8 @@ def check(command: Command) -> None:
 
 
 def doubts(dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]) -> list[str]:
-    """Why some of the answers should not be trusted: one line each."""
-    (low, high), band = scene_box(dataset), trained_band(dataset)
+    """Returns why some of the answers should not be trusted: one line each."""
+    (low, high), band = DatasetScene(dataset).box, trained_band(dataset)
     box = f"the box of {dataset.name}, {_point(low)} to {_point(high)}"
     lines = [f"TX {_point(tx)} lies outside {box}" for tx in tx_positions if ((tx < low) | (tx > high)).any()]
     trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
@@ -123,55 +128,64 @@ def _point(position: Float[np.ndarray, "3"]) -> str:
 def ask(
     trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]
 ) -> Spectra:
-    """The spectra of every transmitter at every frequency."""
+    """Returns the spectra of every transmitter at every frequency."""
     shape = len(tx_positions), len(frequencies_hz)
     tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
-    pas = predict_many(predictor(trained, dataset.receiver), tx, frequency, block=min(BLOCK, len(tx)))
+    pas = predict_many(predictor(trained, dataset.receiver()), tx, frequency, block=min(BLOCK, len(tx)))
     return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz)
 
 
 def ask_channel(
     what: str, trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """{name with unit: values (tx, freq) or (tx, freq, elements)} of every transmitter at every frequency.
+    """Returns {name with unit: values (tx, freq) or (tx, freq, elements)} of every transmitter at every frequency.
 
     Raises:
-        UserError: the field knows no phases.
+        UserError: the field knows no paths.
     """
-    if not hasattr(trained.field, "channels"):
-        raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field wave")
-    field: Any = trained.field
-    plan = field.plan(trained.params, dataset.receiver)
+    if "paths" not in trained.field.gives:
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+        raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field {able}")
+    plan = trained.field.plan(trained.params, dataset.receiver())
     name, measure = CHANNEL[what]
 
     @jax.jit
-    def one(tx: Any, frequency: Any) -> Any:
-        found = field.channels(trained.params, plan, Query(tx[None], frequency[None]))
-        return measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver)
+    def one(field: Field, params: Any, plan: Any, tx: Any, frequency: Any) -> Any:
+        found = field.arrivals(params, plan, Query(tx[None], frequency[None]))
+        return measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency)
 
     positions, frequencies = (jnp.asarray(a, jnp.float32) for a in (tx_positions, frequencies_hz))
-    rows = [[np.asarray(one(tx, f)) for f in frequencies] for tx in positions]
+    rows = [[np.asarray(one(trained.field, trained.params, plan, tx, f)) for f in frequencies] for tx in positions]
     return {name: np.array(rows), "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
 
 
-def _beamforming_gain(arrivals: Arrivals, receiver: Receiver) -> Any:
-    y = snapshot(arrivals, receiver)
-    steering = steering_vector(receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
+def _snapshot(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
+    return channel.snapshots_of_arrivals(arrivals, receiver.element_wavelengths(frequency_hz))
+
+
+def _power(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
+    return channel.received_power_db(_snapshot(arrivals, receiver, frequency_hz))
+
+
+def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
+    elements = receiver.element_wavelengths(frequency_hz)
+    y = channel.snapshots_of_arrivals(arrivals, elements)
+    steering = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
     return channel.beamforming_gain_db(y, jnp.max(cbf(y, steering)))
 
 
-CHANNEL: dict[str, tuple[str, Callable[[Arrivals, Receiver], Any]]] = {
-    "snapshot": ("snapshots", snapshot),
-    "power": ("power_db", lambda arrivals, receiver: channel.received_power_db(snapshot(arrivals, receiver))),
+CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]] = {
+    "snapshot": ("snapshots", _snapshot),
+    "power": ("power_db", _power),
     "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
-    "k-factor": ("k_factor_db", lambda arrivals, _: channel.k_factor_db(arrivals)),
-    "delay-spread": ("delay_spread_s", lambda arrivals, _: channel.delay_spread_s(arrivals)),
+    "k-factor": ("k_factor_db", lambda arrivals, *_: channel.k_factor_db(arrivals)),
+    "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
 }
 """Name in the file, and how it follows from what arrives."""
 
 
 def write_channel(path: Path, answer: dict[str, np.ndarray], trained: TrainedField, dataset: Dataset) -> None:
-    """The answer's arrays, and where they come from as JSON text in `meta`."""
+    """Writes the answer's arrays, and where they come from as JSON text in `meta`."""
     arrays: dict[str, Any] = answer
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(_source(trained, dataset))))
@@ -182,13 +196,13 @@ def _source(trained: TrainedField, dataset: Dataset) -> dict[str, Any]:
 
 
 def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: Dataset) -> None:
-    """`pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, and where they come from as JSON text in `meta`."""
+    """Writes `pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, and where they come from as JSON text in `meta`."""
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **vars(spectra), meta=np.array(json.dumps(_source(trained, dataset))))
 
 
 def draw(spectra: Spectra) -> Figure:
-    """The first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter side by side or below each other."""
+    """Returns the first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter side by side or below each other."""
     images = spectra.pas.reshape(-1, *spectra.pas.shape[2:])[:SHOWN]
     columns = min(2, len(images))
     rows = -(-len(images) // columns)
@@ -208,19 +222,14 @@ def draw(spectra: Spectra) -> Figure:
     return figure
 
 
-def say(line: str) -> None:
-    """A line for people, on stderr."""
-    print(line, file=sys.stderr, flush=True)
-
-
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m wbgs_jax.predict")
+    use_compilation_cache()
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax predict")
     check(command)
     tx_positions, frequencies_hz = positions(command.tx), frequencies(command.ghz)
-    use_compilation_cache()
     trained = load_trained(command.run)
-    dataset = trained.config.dataset()
+    dataset = trained.dataset()
     if command.export:
         export_field(trained, command.export, dataset=dataset)
         say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")

@@ -1,27 +1,33 @@
-"""Train a field: `python -m wbgs_jax.train --scene 1`, `--data FOLDER`, `--preset smoke|cpu|gpu`, `--resume`, `--help`."""
+"""Train a field: `wbgs-jax train --scene 1`, `--data FOLDER`, `--preset smoke|cpu|gpu`, `--resume`, `--help`."""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
 
 import dataclasses
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import tyro
 
-from wbgs_jax.compilation import use_compilation_cache
-from wbgs_jax.config import PRESETS, Settings, check, preset_settings
+from wbgs_jax._util.command import option_value, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.config import PRESETS, Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.fields import get_field
-from wbgs_jax.runs import RunConfig, difference, read_config, write_config
-from wbgs_jax.trainer import TrainResult, train
+from wbgs_jax.fields import default_field, get_field
+from wbgs_jax.training.loop import TrainResult, train
+from wbgs_jax.training.run_folder import RunConfig, prepare_folder
+
+PROGRAM = "wbgs-jax train"
 
 
 @dataclass(frozen=True)
 class Command:
-    """Train a radiance field on the spectra of one scene."""
+    """Train a radiance field on the spectra of one scene, and leave it in a run folder."""
 
     scene: str | None = None
     """Released scene (1, 2, ...) or a scene file (.npz)."""
@@ -32,8 +38,9 @@ class Command:
     field: str = "wideband"
     """The model."""
     preset: str = "cpu"
-    """smoke (< 1 min), cpu (the default without a GPU) or gpu (the paper's size)."""
+    """smoke (less than a minute), cpu (the default without a GPU) or gpu (the paper's size)."""
     seed: int = 0
+    """Seed of everything that is drawn at random."""
     resume: bool = False
     """Go on where the run folder's newest checkpoint ends; starts anew where there is none."""
     frequency_ghz: float | None = None
@@ -42,71 +49,86 @@ class Command:
     """Train at these frequencies alone; the evaluation asks for the others (held-out transmitters, unseen frequencies)."""
     train_tx: int = 0
     """Train with this number of transmitters; 0: all that are not held out."""
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
-    """Every setting of the preset can be overridden."""
+    validation: float = 0.0
+    """Share of the training transmitters that is held out for the curves and for choices, beside the test transmitters."""
+    receiver: int | None = None
+    """Look at this receiver alone, of data that have several."""
 
 
 def default_preset() -> str:
-    """`gpu` where JAX finds one, else `cpu`."""
+    """Returns `gpu` where JAX finds one, else `cpu`."""
     return "gpu" if jax.default_backend() == "gpu" else "cpu"
 
 
-def parse(arguments: list[str]) -> Command:
-    """The command line; field and preset are looked at first because they set the defaults of everything else."""
-    field, preset = _value(arguments, "--field", "wideband"), _value(arguments, "--preset", default_preset())
+def parse(arguments: list[str]) -> tuple[Command, Settings]:
+    """Returns the command and its settings. Field and preset are looked at first: they say which settings there are, and their
+    defaults. `--help` lists the command's options, `--help-settings` those of the field too."""
+    field = option_value(arguments, "--field", default_field())
+    preset = option_value(arguments, "--preset", default_preset())
+    kind = get_field(field)
     if preset not in PRESETS:
         raise UserError(f"unknown preset {preset!r}; choose one of: {', '.join(PRESETS)}")
-    default = Command(field=field, preset=preset, settings=preset_settings(preset, field))
-    return tyro.cli(Command, default=default, args=arguments, prog="python -m wbgs_jax.train")
+    parts = sections(kind.presets[preset], field)
+    everything = "--help-settings" in arguments
+    if everything:
+        arguments = [argument for argument in arguments if argument != "--help-settings"] + ["--help"]
+    command_type = Command if {"-h", "--help"} & set(arguments) and not everything else _with_settings(parts)
+    parsed = tyro.cli(
+        command_type,
+        default=command_type(field=field, preset=preset),
+        args=arguments,
+        prog=PROGRAM,
+        description=f"{Command.__doc__} Settings of the field: {PROGRAM} --field {field} --help-settings.",
+    )
+    values = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Command)}
+    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, field)
 
 
-def _value(arguments: list[str], name: str, default: str) -> str:
-    """What follows an option on the command line."""
-    for i, argument in enumerate(arguments):
-        if argument == name:
-            return "".join(arguments[i + 1 : i + 2])
-        if argument.startswith(f"{name}="):
-            return argument.split("=", 1)[1]
-    return default
+def _with_settings(parts: dict[str, Any]) -> type[Command]:
+    """Returns the command's type with the sections of settings as further options, --SECTION.NAME."""
+    fields = [
+        (name, Annotated[type(part), tyro.conf.arg(help="")], dataclasses.field(default=part)) for name, part in parts.items()
+    ]
+    made: Any = dataclasses.make_dataclass("CommandWithSettings", fields, bases=(Command,), frozen=True)
+    made.__doc__ = Command.__doc__
+    return made
 
 
-def run_config(command: Command) -> RunConfig:
-    """Check what was asked for before any work is done."""
+def run_config(command: Command, settings: Settings) -> RunConfig:
+    """Returns what determines the run, checked before any work is done."""
     if (command.scene is None) == (command.data is None):
         raise UserError("give either --scene (1, 2, ... or a .npz file) or --data (a folder of spectra)")
-    get_field(command.field)
-    check(command.settings)
+    if not 0 <= command.validation < 1:
+        raise UserError(f"--validation is {command.validation}; it is a share of the training transmitters, 0 to 1")
+    check(settings)
+    get_field(command.field).check(settings.field)
     source = command.scene if command.data is None else command.data
     if Path(str(source)).exists():
         source = str(Path(str(source)).resolve())
-    chosen = (command.field, command.preset, command.seed, command.frequency_ghz, command.settings)
-    return RunConfig(str(source), *chosen, tuple(command.train_ghz), command.train_tx)
-
-
-def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
-    """Make the run folder, or make sure that the one there belongs to the same run."""
-    if not (folder / "config.json").exists():
-        if folder.is_dir() and any(folder.iterdir()):
-            raise UserError(f"{folder} holds other files; choose another OUT")
-        write_config(folder, config)
-    elif found := difference(read_config(folder), config):
-        raise UserError(f"{folder} holds a run of another configuration ({found}); choose another OUT or remove the folder")
-    elif not resume:
-        raise UserError(f"{folder} already holds this run; add --resume to go on with it, or choose another OUT")
-    if not os.access(folder, os.W_OK):
-        raise UserError(f"cannot write to run folder {folder}; choose another OUT or mend its permissions")
+    return RunConfig(
+        source=str(source),
+        field=command.field,
+        preset=command.preset,
+        seed=command.seed,
+        frequency_ghz=command.frequency_ghz,
+        settings=settings,
+        train_ghz=tuple(command.train_ghz),
+        train_tx=command.train_tx,
+        validation=command.validation,
+        receiver=command.receiver,
+    )
 
 
 def default_folder(dataset: Dataset, config: RunConfig) -> Path:
-    """runs/<scene>-<field>-<preset>-seed<seed>."""
+    """Returns runs/<scene>-<field>-<preset>-seed<seed>."""
     return Path("runs") / f"{dataset.name}-{config.field}-{config.preset}-seed{config.seed}"
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = parse(sys.argv[1:])
     use_compilation_cache()
-    config = run_config(command)
+    command, settings = parse(sys.argv[1:] if arguments is None else arguments)
+    config = run_config(command, settings)
     dataset = config.dataset()
     folder = command.out or default_folder(dataset, config)
     prepare_folder(folder, config, command.resume)
@@ -117,14 +139,9 @@ def main() -> None:
 
 
 def summary(result: TrainResult, folder: Path) -> str:
-    """One line at the end."""
-    size = f"{result.gaussians} Gaussians, {result.compilations} compilations"
-    return f"trained {result.steps} steps in {result.seconds:.0f} s, {size}: {folder}"
-
-
-def say(line: str) -> None:
-    """A line for people, on stderr: stdout is for results."""
-    print(line, file=sys.stderr, flush=True)
+    """Returns one line for the end."""
+    sizes = ", ".join(f"{count} {name}" for name, count in result.sizes.items())
+    return f"trained {result.steps} steps in {result.seconds:.0f} s, {sizes}, {result.compilations} compilations: {folder}"
 
 
 if __name__ == "__main__":

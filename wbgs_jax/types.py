@@ -1,18 +1,39 @@
-"""Pytrees that cross module borders."""
+"""The pytrees that cross rooms: receivers, queries, links, batches, Gaussians and surfaces.
 
-from typing import Any
+SI units: metres, hertz, radians. Constructors check what they are given; arrays are float32 on the device.
+"""
 
+from typing import Any, Literal, Protocol
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int, Key
 
-from wbgs_jax.array import planar_array
-from wbgs_jax.pytree import pytree
+from wbgs_jax._util.checks import check_array, concrete
+from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
+from wbgs_jax.radio.patterns import pattern_exponent
+
+ElementUnit = Literal["wavelengths", "metres"]
+"""Unit of element positions: "wavelengths" is an array that scales with the frequency, "metres" one of fixed size."""
+SurfaceSampling = Literal["solid_angle", "area"]
+"""How points are spread: evenly over the receiver's directions, or over the area of the surface."""
+MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 1e9, 100e9
+"""The band of the paper."""
+LOWEST_FREQUENCY_HZ = 1e6
+"""Smaller numbers are gigahertz or megahertz by mistake."""
+LARGEST_COORDINATE_M = 1e5
+"""Larger numbers are millimetres by mistake, or no indoor scene."""
 
 
 @pytree
 class Gaussians:
-    """Stored (unconstrained) parameters of N 3D Gaussians in the world frame; `alive` masks the padding of the capacity."""
+    """Stored (unconstrained) parameters of N 3D Gaussians in the world frame.
+
+    Slots that hold no Gaussian, the room into which density control grows, have an opacity logit of minus infinity: they
+    attenuate nothing, and no gradient reaches them.
+    """
 
     means: Float[Array, "n 3"]
     """Centres, metres."""
@@ -22,30 +43,68 @@ class Gaussians:
     """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
     opacity_logits: Float[Array, "n"]
     """delta_o of the paper (section 4.5), before the sigmoid."""
-    alive: Float[Array, "n"]
-    """1 for a Gaussian, 0 for padding up to the capacity, which never contributes and never receives a gradient. A float, so
-    that `jax.grad` works on the whole pytree; its gradient is zero."""
+
+    @property
+    def alive(self) -> Bool[Array, "n"]:
+        """Which slots hold a Gaussian."""
+        return self.opacity_logits > -jnp.inf
 
 
 @pytree
 class Receiver:
-    """A fixed receiver array."""
+    """A fixed receiver array; with a leading axis on every array, R receivers of equal numbers of elements."""
 
-    position: Float[Array, "3"]
+    position: Float[Array, "*r 3"]
     """World frame, metres."""
-    orientation: Float[Array, "4"]
+    orientation: Float[Array, "*r 4"]
     """Unit quaternion (wxyz) that turns the receiver's local frame into the world frame."""
-    element_positions: Float[Array, "elements 3"]
-    """Local frame, wavelengths."""
+    element_positions: Float[Array, "*r elements 3"]
+    """Local frame, in `unit`."""
+    pattern_exponent: Float[Array, "*r"]
+    """Exponent of the elements' gain: 1 for the element of 3GPP TR 38.901, 0 for isotropic ones (`radio/patterns.py`)."""
+    unit: ElementUnit = static(default="wavelengths")
+
+    def element_wavelengths(self, frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b_elements 3"]:
+        """Returns the element positions in wavelengths: (elements, 3) if they are stored so, else (*b, elements, 3)."""
+        if self.unit == "wavelengths":
+            return self.element_positions
+        return self.element_positions * (frequency_hz / SPEED_OF_LIGHT)[..., None, None]
 
 
 @pytree
 class Query:
-    """What is asked of a field: a batch of transmitter positions and frequencies."""
+    """A batch of questions to a field about one receiver: transmitter positions and frequencies."""
 
     tx_position: Float[Array, "*b 3"]
     """World frame, metres."""
     frequency_hz: Float[Array, "*b"]
+
+
+@pytree
+class Links:
+    """What can be observed: (transmitter position, receiver, frequency)."""
+
+    query: Query
+    receiver_index: Int[Array, "*b"]
+    """Which of the dataset's receivers."""
+    tx_index: Int[Array, "*b"]
+    """Which of the dataset's transmitters: links of one position share it."""
+
+
+@pytree
+class Batch:
+    """B links of one receiver, and what was observed on them: whichever kinds the data allow."""
+
+    links: Links
+    receiver: Receiver
+    pas: Float[Array, "b 90 360"] | None
+    """Normalised power angular spectra."""
+    snapshots: Complex[Array, "b elements"] | None
+    """Complex array snapshots."""
+    power_db: Float[Array, "b"] | None
+    """Received power relative to the transmitted power, dB."""
+    key: Key[Array, ""]
+    """Randomness of this training step."""
 
 
 @pytree
@@ -65,24 +124,93 @@ class Mesh:
     vertices: Float[Array, "v 3"]
     """World frame, metres."""
     faces: Int[Array, "t 3"]
-    cluster: Int[Array, "t"]
-    """Material of every triangle: what shares a cluster shares its properties."""
+    part: Int[Array, "t"]
+    """Object of the scene that a triangle belongs to."""
+    material: Int[Array, "t"]
+    """Material of every triangle: what shares a material shares its properties."""
     thickness: Float[Array, "m"]
-    """Of every material, metres; 0 where it is not known."""
-    directivity: Float[Array, ""]
-    """Of the receiver's elements: 1 for 3GPP TR 38.901, 0 for isotropic ones."""
+    """Thickness of every material, metres; 0 where it is not known."""
 
 
-def make_receiver(position: Any, orientation: Any = (1.0, 0.0, 0.0, 0.0), element_positions: Any = None) -> Receiver:
-    """A float32 receiver; the default array is the 4x4 half-wavelength one in the local y-z plane."""
+class Scene(Protocol):
+    """What a field may ask about a place when it is made (`data.surface.DatasetScene`)."""
+
+    @property
+    def receivers(self) -> Receiver:
+        """All receivers, with a leading axis."""
+        ...
+
+    @property
+    def box(self) -> Float[np.ndarray, "2 3"]:
+        """Smallest and largest coordinates of surfaces, transmitters and receivers, metres."""
+        ...
+
+    def surface(self, count: int, seed: int, sampling: SurfaceSampling) -> Surface:
+        """Points on the surfaces; 0: as many as the mesh has vertices, within bounds."""
+        ...
+
+    def mesh(self) -> Mesh:
+        """The surfaces themselves; a `UserError` where only points are known."""
+        ...
+
+
+def make_receiver(
+    position: Any,
+    orientation: Any = (1.0, 0.0, 0.0, 0.0),
+    element_positions: Any = None,
+    unit: ElementUnit = "wavelengths",
+    pattern: str = "",
+) -> Receiver:
+    """Returns a float32 receiver.
+
+    Args:
+        position: (3,), world frame, metres.
+        orientation: quaternion (wxyz) of any non-zero length that turns local vectors into world ones.
+        element_positions: (elements, 3) in the local frame; default: the 4x4 half-wavelength array in the local y-z plane.
+        unit: of the element positions.
+        pattern: of the elements, a name that `radio.patterns.PATTERN_EXPONENTS` knows; empty stands for isotropic ones.
+    """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion)
-    return Receiver(*(jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements)))
+    arrays = (position, quaternion, elements, pattern_exponent(pattern))
+    return Receiver(*(jnp.asarray(np.asarray(a), jnp.float32) for a in arrays), unit)
+
+
+def stack_receivers(receivers: list[Receiver]) -> Receiver:
+    """Returns receivers of equal numbers of elements and one unit as one, with a leading axis on every array."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
 def make_query(tx_position: Any, frequency_hz: Any) -> Query:
-    """A float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one number in hertz."""
+    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one number in hertz."""
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
     frequency = jnp.broadcast_to(jnp.asarray(frequency_hz, jnp.float32), position.shape[:1])
     return Query(position, frequency)
+
+
+def check_query(query: Query) -> None:
+    """Raises unless positions are (b, 3) in metres and frequencies (b,) in hertz."""
+    check_array("tx_position", query.tx_position, ("b", 3))
+    check_array("frequency_hz", query.frequency_hz, (query.tx_position.shape[0],))
+    frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)
+    if frequency is not None and frequency.size and not frequency.min() >= LOWEST_FREQUENCY_HZ:
+        raise ValueError(f"frequency_hz holds {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")
+    if position is not None and position.size and not np.abs(position).max() <= LARGEST_COORDINATE_M:
+        raise ValueError(f"tx_position holds {np.abs(position).max():g}; positions are in metres and finite")
+
+
+def check_receiver(receiver: Receiver) -> None:
+    """Raises unless it is one receiver: position (3,), quaternion (4,) of non-zero length, element positions (elements, 3)."""
+    check_array("receiver.position", receiver.position, (3,))
+    check_array("receiver.orientation", receiver.orientation, (4,))
+    check_array("receiver.element_positions", receiver.element_positions, ("elements", 3))
+    orientation = concrete(receiver.orientation)
+    if orientation is not None and not np.linalg.norm(orientation) > 1e-6:
+        raise ValueError("receiver.orientation has zero length; give a quaternion (w, x, y, z), (1, 0, 0, 0) for no rotation")
+
+
+def check_surface(surface: Surface) -> None:
+    """Raises unless points are (n, 3) and their spacing (n,)."""
+    check_array("surface.points", surface.points, ("n", 3))
+    check_array("surface.spacing", surface.spacing, (surface.points.shape[0],))

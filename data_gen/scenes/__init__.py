@@ -9,7 +9,7 @@ from data_gen.scenes.scene3 import scene3
 from data_gen.scenes.scene4 import scene4
 from data_gen.scenes.scene5 import scene5
 from data_gen.scenes.scene6 import scene6
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 SCENES: dict[int, Callable[[], SceneSpec]] = {1: scene1, 2: scene2, 3: scene3, 4: scene4, 5: scene5, 6: scene6}
 

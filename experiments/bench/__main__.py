@@ -22,9 +22,10 @@ from rich.console import Console
 
 from experiments.bench import gate, quality, queries, renderer, training
 from experiments.bench.timing import Effort, Report, say
-from wbgs_jax.errors import UserError, run_command
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.eval import device_name, environment
-from wbgs_jax.files import read_json, write_json
+from wbgs_jax._util.files import read_json, write_json
 
 RESULTS = Path(__file__).parents[1] / "results"
 Part = Literal["renderer", "training", "queries", "memory", "quality"]

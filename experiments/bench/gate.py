@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 Metrics = dict[str, dict[str, Any]]
 

@@ -18,7 +18,7 @@ import jax
 from experiments.bench.timing import Effort, Report, say
 from experiments.bench.training import preset, start_run
 from wbgs_jax.config import PRESETS
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 TARGETS = (0.72, 0.80, 0.85)
 PLATEAU = 0.01

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.bench.timing import Effort, Report, interleaved, say, timed
 from experiments.bench.training import start_run
-from wbgs_jax.inference import BLOCK, make_predictor
+from wbgs_jax.inference.predictor import BLOCK, make_predictor
 
 QUERIES = 1000
 

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.geometry import AZIMUTH_PERIOD
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat import Splats
 from wbgs_jax.splat.footprint import CUT, GAIN
 

@@ -19,11 +19,11 @@ from experiments.bench.timing import Effort, Report, interleaved, say
 from wbgs_jax.config import PRESETS, limit_steps
 from wbgs_jax.data import load_dataset
 from wbgs_jax.fields import wideband
-from wbgs_jax.losses import image_loss
+from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, render_splats
 from wbgs_jax.train import default_preset
-from wbgs_jax.train_step import loss_and_gradients
-from wbgs_jax.trainer import Run
+from wbgs_jax.training.step import loss_and_gradients
+from wbgs_jax.training.loop import Run
 
 STEPS = 10
 """Steps of one timed block."""

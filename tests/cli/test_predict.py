@@ -10,8 +10,8 @@ from PIL import Image
 from untrained import make_run
 
 from wbgs_jax import predict as predict_command
-from wbgs_jax.errors import run_command
-from wbgs_jax.export import load_exported
+from wbgs_jax._util.command import run_command
+from wbgs_jax.inference.export import load_exported
 
 INSIDE = ["1,0.5,1.5", "-1,1,1.2"]
 

@@ -17,10 +17,10 @@ from synthetic import tiny_scene
 
 from wbgs_jax import eval as eval_command
 from wbgs_jax import train as train_command
-from wbgs_jax.checkpoint import checkpoint_steps
+from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.data.layout import export_layout
-from wbgs_jax.data.schema import save_scene
-from wbgs_jax.errors import run_command
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax._util.command import run_command
 
 pytestmark = pytest.mark.slow
 

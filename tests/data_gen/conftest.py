@@ -2,7 +2,7 @@
 
 import pytest
 
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 
 @pytest.fixture(scope="session")

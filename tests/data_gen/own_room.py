@@ -6,7 +6,7 @@ import trimesh
 
 from data_gen.example.make_room import HERE, OBJECTS, obj
 from data_gen.own_scene import own_scene
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 ROOM, TOML = HERE / "room.obj", HERE / "materials.toml"
 RX, GRID = "0.8,2.4,1.2", "1.6,0.5,0.5:5.4,4,2.3:9,7,4"

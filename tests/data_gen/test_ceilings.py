@@ -9,7 +9,7 @@ from data_gen import ceilings
 from data_gen.convergence import correlation
 from data_gen.picture import draw
 from data_gen.scenes import get_scene
-from wbgs_jax.array import planar_array
+from wbgs_jax.radio.array import planar_array
 
 
 @dataclass

@@ -18,9 +18,9 @@ from data_gen.generate import generate
 from data_gen.options import Options, make_job
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.array import planar_array
-from wbgs_jax.data.schema import load_scene
-from wbgs_jax.errors import UserError
+from wbgs_jax.radio.array import planar_array
+from wbgs_jax.data.scene_file import load_scene
+from wbgs_jax._util.errors import UserError
 
 
 def options(folder, **changes):

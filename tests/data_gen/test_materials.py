@@ -6,7 +6,7 @@ import pytest
 
 from data_gen import materials
 from data_gen.materials import Law, check_material_frequencies, own_law, own_material
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 
 def test_materials_of_the_released_scenes_cover_the_whole_band():

@@ -14,8 +14,8 @@ from own_room import FREQUENCIES, GRID, ROOM, RX, TOML, load, meshes, refused, t
 
 from data_gen.example.make_room import OBJECTS, obj
 from data_gen.own_scene import describe, own_scene
-from wbgs_jax.data.schema import load_scene
-from wbgs_jax.errors import UserError
+from wbgs_jax.data.scene_file import load_scene
+from wbgs_jax._util.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 GUIDE = (ROOT / "docs" / "own_scene.md").read_text()

@@ -16,7 +16,7 @@ from data_gen.scenes import get_scene
 from data_gen.scenes.base import Part, SceneSpec, part
 from data_gen.scenes.geometry import box
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.array import SPEED_OF_LIGHT
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.usefixtures("simulator_backend")
 

@@ -10,8 +10,8 @@ import pytest
 import data_gen
 from data_gen.scenes import FREQUENCIES_21_HZ, FREQUENCIES_HZ, SCENES, get_scene
 from data_gen.settings import SolverSettings
-from wbgs_jax.array import lag_basis, planar_array, snapshot_to_pas
-from wbgs_jax.data.schema import TEST, load_scene
+from wbgs_jax.radio.array import lag_basis, planar_array, snapshot_to_pas
+from wbgs_jax.data.scene_file import TEST, load_scene
 
 RELEASED = Path(data_gen.__file__).parent / "released"
 FILES = {**{f"scene{n}": (n, FREQUENCIES_HZ) for n in SCENES}, "scene1_21f": (1, FREQUENCIES_21_HZ)}

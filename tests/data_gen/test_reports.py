@@ -9,11 +9,11 @@ from synthetic import tiny_scene
 from data_gen import ceilings, report, samples, statistics
 from data_gen.convergence import settings
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.array import planar_array
+from wbgs_jax.radio.array import planar_array
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.data.schema import save_scene
-from wbgs_jax.metrics import ssim
-from wbgs_jax.references import references
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.evaluation.baselines import references
 
 
 @pytest.fixture

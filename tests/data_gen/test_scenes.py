@@ -31,7 +31,7 @@ from data_gen.scenes.furniture import (
 )  # fmt: skip
 from data_gen.scenes.geometry import box, crossings, distance, winding_number
 from data_gen.scenes.walls import Door, inner_wall, wall
-from wbgs_jax.errors import UserError
+from wbgs_jax._util.errors import UserError
 
 RELEASED = Path(__file__).parents[2] / "data_gen" / "released" / "scene1.npz"
 MORE = [bed(1.6), bench(1.5), cabinet(1, 0.5, 1), counter(2), desk(1.5), monitor(0.7), office_chair(), wardrobe(1.2)]

@@ -11,7 +11,8 @@ import pytest
 from experiments import choices
 from experiments.bench import __main__ as command_line
 from experiments.bench import gate, quality, renderer, timing
-from wbgs_jax.errors import UserError, run_command
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.splat import project, render_dense
 from wbgs_jax.types import Gaussians, make_receiver
 

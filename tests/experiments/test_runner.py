@@ -18,9 +18,9 @@ import synthetic
 from experiments import execute, jobs, runner
 from experiments.jobs import BUDGETS, Job
 from experiments.results import Results
-from wbgs_jax.data.schema import save_scene
-from wbgs_jax.errors import run_command
-from wbgs_jax.trainer import Run
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax._util.command import run_command
+from wbgs_jax.training.loop import Run
 
 JOB = Job("1", "wideband")
 VALUES = {

@@ -1,20 +1,26 @@
-"""What a trainer, an evaluation or an experiment sees of any data: queries, observations, receiver, surface, split."""
+"""What a trainer, an evaluation or an experiment sees of any data: links, observations, receivers, surface, split."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 
-from wbgs_jax.array import snapshot_to_pas
-from wbgs_jax.types import Query, Receiver
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas
+from wbgs_jax.types import Links, Query, Receiver
+
+Kind = Literal["snapshot", "pas", "power"]
+"""Kind of the observations of a data set."""
 
 
 @dataclass(frozen=True)
 class Materials:
     """Which triangles share a material. Not its electrical properties: those are for a field to find out."""
 
-    cluster: Int[np.ndarray, "faces"]
+    material: Int[np.ndarray, "faces"]
     """int32: the material of every triangle."""
     names: tuple[str, ...]
     """A label of every material."""
@@ -24,41 +30,105 @@ class Materials:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Spectra of one scene with a fixed receiver; spectrum i was observed for query i."""
+    """Observations of the links of one scene: observation i belongs to link (transmitter position, receiver, frequency) i."""
 
     name: str
-    receiver: Receiver
+    receivers: Receiver
+    """All receivers: every array has a leading axis R."""
     tx_positions: Float[np.ndarray, "n 3"]
     """World frame, metres, float64."""
     frequencies_hz: Float[np.ndarray, "n"]
+    receiver_index: Int[np.ndarray, "n"]
+    """Which of the receivers."""
     tx_index: Int[np.ndarray, "n"]
-    """Which transmitter (0, 1, ...): spectra of one TX position share it; splits never cut through it."""
+    """Which transmitter: links of one TX position share it; 0, 1, ... without gaps. Splits never cut through it."""
     train: Int[np.ndarray, "n_train"]
-    """Indices of the training spectra."""
+    """Indices of the training links."""
+    validation: Int[np.ndarray, "n_validation"]
+    """Indices of the links that decide between settings; may be empty."""
     test: Int[np.ndarray, "n_test"]
-    snapshots: Complex[np.ndarray, "n elements"] | None
-    """Complex array snapshots where they are known (scene files) ..."""
-    images: UInt8[np.ndarray, "n 90 360"] | None
-    """... else 8-bit images of the published layout. Exactly one of the two is not None."""
-    vertices: Float[np.ndarray, "vertices 3"]
-    """The scene's surface in the world frame, metres, float32; empty where no mesh is known."""
-    faces: Int[np.ndarray, "faces 3"]
+    snapshots: Complex[np.ndarray, "n elements"] | None = None
+    """Complex array snapshots, or ..."""
+    images: UInt8[np.ndarray, "n 90 360"] | None = None
+    """... 8-bit images of the power angular spectrum, or ..."""
+    power_db: Float[np.ndarray, "n"] | None = None
+    """... received power relative to the transmitted power, dB. Exactly one of the three is not None."""
+    vertices: Float[np.ndarray, "vertices 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    """The scene's surfaces in the world frame, metres, float32; empty where no mesh is known."""
+    faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     """int32 triangles; empty where only points are known."""
+    face_part: Int[np.ndarray, "faces"] | None = None
+    """int32: the part, an object of the scene, that every triangle belongs to; None where parts are not known."""
     materials: Materials | None = None
-    """What the triangles are made of, as far as it is known."""
-    element_pattern: str = ""
-    """Of the receiver's elements, such as "tr38901" or "iso"; empty where it is not known."""
+    """What the triangles are made of; None where it is not known. Parts of one material share it."""
+
+    def __post_init__(self) -> None:
+        observed = [values for values in (self.snapshots, self.images, self.power_db) if values is not None]
+        if len(observed) != 1:
+            raise ValueError(f"{self.name} has {len(observed)} kinds of observations; give one: snapshots, images or power_db")
+        columns = (self.tx_positions, self.receiver_index, self.tx_index, *observed)
+        if any(len(column) != len(self) for column in columns):
+            raise ValueError(f"{self.name}: arrays of links have lengths {[*map(len, columns)]}; all must be {len(self)}")
+        if len(self) and not 0 <= self.receiver_index.min() <= self.receiver_index.max() < self.n_receivers:
+            raise ValueError(f"{self.name}: receiver_index must lie between 0 and {self.n_receivers - 1}")
 
     def __len__(self) -> int:
         return len(self.frequencies_hz)
 
+    @property
+    def kind(self) -> Kind:
+        """What is observed on a link."""
+        if self.snapshots is not None:
+            return "snapshot"
+        return "pas" if self.images is not None else "power"
+
+    @property
+    def n_receivers(self) -> int:
+        """Number of receivers."""
+        return len(self.receivers.position)
+
+    def receiver(self, i: int = 0) -> Receiver:
+        """Returns one of the receivers, without the leading axis.
+
+        Raises:
+            UserError: there is no such receiver.
+        """
+        if not 0 <= i < self.n_receivers:
+            raise UserError(f"{self.name} has no receiver {i}; choose 0 to {self.n_receivers - 1}")
+        return jax.tree.map(lambda leaf: leaf[i], self.receivers)
+
     def query(self, index: Int[np.ndarray, "b"]) -> Query:
-        """The float32 queries of some spectra."""
+        """Returns the float32 queries of some links."""
         return Query(jnp.asarray(self.tx_positions[index], jnp.float32), jnp.asarray(self.frequencies_hz[index], jnp.float32))
 
+    def links(self, index: Int[np.ndarray, "b"]) -> Links:
+        """Returns some links as float32 and int32 arrays on the device."""
+        receiver, tx = (jnp.asarray(which[index], jnp.int32) for which in (self.receiver_index, self.tx_index))
+        return Links(self.query(index), receiver, tx)
+
     def pas(self, index: Int[np.ndarray, "b"]) -> Float[Array, "b 90 360"]:
-        """The observed power angular spectra (float32, maximum 1) of some spectra."""
+        """Returns the observed power angular spectra (float32, maximum 1) of some links.
+
+        Raises:
+            UserError: powers alone are known.
+        """
         if self.images is not None:
             return jnp.asarray(self.images[index], jnp.float32) / 255
-        assert self.snapshots is not None
-        return snapshot_to_pas(jnp.asarray(self.snapshots[index]), self.receiver.element_positions)
+        if self.snapshots is None:
+            raise UserError(f"{self.name} holds received powers, which have no angular spectrum; give a scene that has one")
+        snapshots = self.snapshots[index]
+        arrays, which = self._arrays(index)
+        if len(arrays) == 1:
+            return snapshot_to_pas(jnp.asarray(snapshots), arrays[0])
+        spectra = np.zeros((len(snapshots), *PAS_SHAPE), np.float32)
+        for number, element_positions in enumerate(arrays):
+            chosen = which == number
+            spectra[chosen] = snapshot_to_pas(jnp.asarray(snapshots[chosen]), element_positions)
+        return jnp.asarray(spectra)
+
+    def _arrays(self, index: Int[np.ndarray, "b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, "b"]]:
+        """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""
+        own = jax.tree.map(lambda leaf: leaf[self.receiver_index[index]], self.receivers)
+        positions = own.element_wavelengths(jnp.asarray(self.frequencies_hz[index], jnp.float32))
+        _, first, which = np.unique(np.asarray(positions), axis=0, return_index=True, return_inverse=True)
+        return positions[first], which.reshape(-1)

@@ -5,15 +5,17 @@
     gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]
     freq.txt                     optional: one frequency (GHz) a spectrum
     train_index.txt, test_index.txt   optional: image names without .png, zero-padded or not
+    validation_index.txt         optional, beside the two others
     point_cloud.ply              optional: the surface
 
 Frames: transmitters and receiver share the world frame. The mesh is z-up while that frame is y-up: a mesh point (x, y, z)
-lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed.
+lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed, of unknown element pattern.
 
     python -m wbgs_jax.data.layout SCENE.npz FOLDER      writes a scene file as such a folder
 """
 
 import contextlib
+import itertools
 import os
 import shutil
 import sys
@@ -29,20 +31,21 @@ import yaml
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.data import scene_dataset
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import scene_dataset
 from wbgs_jax.data.ply import read_ply, write_ply
-from wbgs_jax.data.schema import SceneFile, load_scene
+from wbgs_jax.data.scene_file import SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
-from wbgs_jax.errors import UserError, run_command
-from wbgs_jax.types import Receiver, make_receiver
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.types import Receiver, make_receiver, stack_receivers
 
 NOMINAL_FREQUENCY_HZ = 1e9
 """Stands for the frequency of a folder that names none: a model of one frequency only needs some constant."""
 
 SPECTRA, POSITIONS, GATEWAY, FREQUENCIES, MESH = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt", "point_cloud.ply"
-TRAIN_INDEX, TEST_INDEX = "train_index.txt", "test_index.txt"
+INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
 
 
 def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2) -> Dataset:
@@ -64,19 +67,21 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
     vertices, faces = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
     if (folder / MESH).exists():
         vertices, faces = read_ply(folder / MESH)
-    if (folder / TRAIN_INDEX).exists() or (folder / TEST_INDEX).exists():
-        train, test = _read_split(folder, tx_index)
+    if any((folder / name).exists() for name in INDEX.values()):
+        split = _read_split(folder, tx_index)
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
+        split = {"train": train, "validation": train[:0], "test": test}
     return Dataset(
         name=name or folder.resolve().name,
-        receiver=receiver,
+        receivers=stack_receivers([receiver]),
         tx_positions=positions,
         frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz),
+        receiver_index=np.zeros(len(images), int),
         tx_index=tx_index,
-        train=train,
-        test=test,
-        snapshots=None,
+        train=split["train"],
+        validation=split["validation"],
+        test=split["test"],
         images=images,
         vertices=mesh_to_world(vertices),
         faces=faces,
@@ -89,10 +94,13 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
     Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and array are not kept.
 
     Raises:
-        UserError: `folder` exists and is not empty, or cannot be written; or the scene lacks training or test spectra, for
-            which the layout has no form.
+        UserError: `folder` exists and is not empty, or cannot be written; or the scene has several receivers, powers alone, or
+            no training or no test spectra, for which the layout has no form.
     """
     dataset = scene_dataset(scene)
+    if dataset.n_receivers > 1 or dataset.kind == "power":
+        what = "received powers alone" if dataset.kind == "power" else f"{dataset.n_receivers} receivers"
+        raise UserError(f"scene {scene.name} has {what}, which the layout has no form for; keep the scene file")
     if len(dataset.train) == 0 or len(dataset.test) == 0:
         raise UserError(f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; give its split both")
     with _new_folder(Path(folder)) as target:
@@ -104,23 +112,24 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
         rows = (",".join(map(repr, row)) for row in dataset.tx_positions.tolist())
         (target / POSITIONS).write_text("\n".join(["x,y,z", *rows]) + "\n")
         (target / FREQUENCIES).write_text("".join(f"{_hz_to_ghz(f)}\n" for f in dataset.frequencies_hz))
-        for name, index in ((TRAIN_INDEX, dataset.train), (TEST_INDEX, dataset.test)):
-            (target / name).write_text("".join(f"{number:05d}\n" for number in index + 1))
-        w, x, y, z = scene.rx_orientation.tolist()
-        gateway = {"position": scene.rx_position.tolist(), "orientation": [x, y, z, w]}
+        for part, name in INDEX.items():
+            if len(index := getattr(dataset, part)):
+                (target / name).write_text("".join(f"{number:05d}\n" for number in index + 1))
+        w, x, y, z = scene.rx_orientation[0].tolist()
+        gateway = {"position": scene.rx_position[0].tolist(), "orientation": [x, y, z, w]}
         (target / GATEWAY).write_text(yaml.safe_dump({"dataset_name": scene.name, "gateway1": gateway}, sort_keys=False))
         if len(scene.vertices):
             write_ply(target / MESH, world_to_mesh(scene.vertices), scene.faces)
 
 
 def mesh_to_world(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Points of the layout's z-up mesh in the y-up world of its transmitters: (x, y, z) -> (x, z, -y)."""
+    """Returns points of the layout's z-up mesh in the y-up world of its transmitters: (x, y, z) -> (x, z, -y)."""
     x, y, z = points.T
     return np.stack([x, z, -y], -1)
 
 
 def world_to_mesh(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The inverse of `mesh_to_world`: (x, y, z) -> (x, -z, y)."""
+    """Returns the inverse of `mesh_to_world`: (x, y, z) -> (x, -z, y)."""
     x, y, z = points.T
     return np.stack([x, -z, y], -1)
 
@@ -170,20 +179,24 @@ def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: f
 
 
 def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
-    """The data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
+    """Returns the data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
     try:
         content = yaml.safe_load(_read_text(path))
     except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date
         raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); mend it") from error
-    gateways = [v for v in content.values() if isinstance(v, dict) and "position" in v] if isinstance(content, dict) else []
+    entries = content if isinstance(content, dict) else {}
+    gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
     if not gateways:
         raise UserError(f"{path} names no gateway; write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]")
-    position = _vector(gateways[0].get("position"), 3, f"{path}: position")
-    x, y, z, w = _vector(gateways[0].get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
+    first, gateway = next(iter(gateways.items()))
+    if len(gateways) > 1:
+        warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)
+    position = _vector(gateway.get("position"), 3, f"{path}: position")
+    x, y, z, w = _vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
     if x == y == z == w == 0:
         raise UserError(f"{path}: orientation is all zeros; write the quaternion [0, 0, 0, 1] for no rotation")
-    frequency = content.get("frequency", gateways[0].get("frequency"))
-    name = content.get("dataset_name")
+    frequency = entries.get("frequency", gateway.get("frequency"))
+    name = entries.get("dataset_name")
     return (
         None if name is None else str(name),
         make_receiver(position, (w, x, y, z)),
@@ -201,24 +214,28 @@ def _vector(value: Any, length: int, what: str) -> list[float]:
     return vector
 
 
-def _read_split(folder: Path, tx_index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    train, test = (_read_index(folder / name, len(tx_index)) for name in (TRAIN_INDEX, TEST_INDEX))
-    both = np.intersect1d(train, test)
-    if len(both):
-        raise UserError(f"image {both[0] + 1:05d} is in both {folder / TRAIN_INDEX} and {TEST_INDEX}; keep it in one of them")
-    if shared := len(np.intersect1d(tx_index[train], tx_index[test])):
-        warnings.warn(f"{folder}: {shared} TX positions are both in training and in test; scores will flatter", stacklevel=3)
-    return train, test
+def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the indices of every part of the split; one of them alone, the validation, may be missing."""
+    optional = [] if (folder / INDEX["validation"]).exists() else ["validation"]
+    split = {p: np.zeros(0, int) if p in optional else _read_index(folder / INDEX[p], len(tx_index)) for p in INDEX}
+    for first, second in itertools.combinations(INDEX, 2):
+        both = np.intersect1d(split[first], split[second])
+        if len(both):
+            raise UserError(f"image {both[0] + 1:05d} is in both {folder / INDEX[first]} and {INDEX[second]}; keep it in one")
+        if shared := len(np.intersect1d(tx_index[split[first]], tx_index[split[second]])):
+            text = f"{folder}: {shared} TX positions are both in {first} and in {second}; scores will flatter"
+            warnings.warn(text, stacklevel=3)
+    return split
 
 
 def _read_index(path: Path, n: int) -> np.ndarray:
-    """Indices of the spectra that an index file names; at least one, none twice."""
+    """Returns the indices of the spectra that an index file names; at least one, none twice."""
     numbers = [_image_number(word.removesuffix(".png"), path) for word in _read_text(path).split()]
     absent = [number for number in numbers if not 1 <= number <= n]
     if absent:
         raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ holds images 1 to {n}; mend the index")
     if not numbers or len(set(numbers)) < len(numbers):
-        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; mend it, or delete both index files")
+        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; mend it, or delete all index files")
     return np.array(numbers) - 1
 
 

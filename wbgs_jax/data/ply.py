@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from wbgs_jax.errors import UserError
-from wbgs_jax.files import atomic_write
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
 
 
 def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:

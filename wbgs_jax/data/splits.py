@@ -1,17 +1,19 @@
-"""Which spectra train and which test. A split never cuts through a transmitter: its other frequencies would give it away."""
+"""Which links train, which decide between settings, which test. A split never cuts through a transmitter: its other receivers
+and frequencies would give it away."""
 
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.errors import UserError
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Transmitter number (0, 1, ... by first appearance) of every spectrum; positions (metres) agree to a micrometre."""
+    """Returns the transmitter (0, 1, ... by first appearance) of every link; positions (metres) agree to a micrometre."""
     _, first, group = np.unique(np.round(positions, 6), axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[group.reshape(-1)]
 
@@ -19,37 +21,51 @@ def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "
 def tx_disjoint_split(
     tx_index: Int[np.ndarray, "n"], test_fraction: float = 0.2, seed: int = 0
 ) -> tuple[Int[np.ndarray, "n_train"], Int[np.ndarray, "n_test"]]:
-    """Ascending indices of training and test spectra with `test_fraction` of the transmitters, drawn by `seed`, in the test.
+    """Returns ascending indices of training and test links with `test_fraction` of the transmitters, drawn by `seed`, in the
+    test.
 
     Raises:
         UserError: the fraction is not between 0 and 1, or there are fewer than two transmitters.
     """
-    if not 0 < test_fraction < 1:
-        raise UserError(f"the test fraction is {test_fraction}; choose a number between 0 and 1, 0.2 for example")
-    transmitters = np.unique(tx_index)
-    if len(transmitters) < 2:
+    if len(np.unique(tx_index)) < 2:
         raise UserError("a split needs spectra of at least two TX positions; give train_index.txt and test_index.txt instead")
-    n_test = int(np.clip(round(test_fraction * len(transmitters)), 1, len(transmitters) - 1))
-    test_transmitters = np.random.default_rng(seed).permutation(transmitters)[:n_test]
-    in_test = np.isin(tx_index, test_transmitters)
+    in_test = _draw(tx_index, test_fraction, np.random.default_rng(seed), "test")
     return np.flatnonzero(~in_test), np.flatnonzero(in_test)
+
+
+def hold_out_validation(dataset: Dataset, fraction: float = 0.1, seed: int = 0) -> Dataset:
+    """Returns the data set with `fraction` of its training transmitters, drawn by `seed`, moved to the validation part.
+
+    Raises:
+        UserError: the fraction is not between 0 and 1, or there are fewer than two training transmitters.
+    """
+    tx_index = dataset.tx_index[dataset.train]
+    if len(np.unique(tx_index)) < 2:
+        raise UserError(f"{dataset.name} has fewer than two training transmitters; a validation part needs one of its own")
+    moved = _draw(tx_index, fraction, np.random.default_rng([seed, 5]), "validation")
+    validation = np.sort(np.concatenate([dataset.validation, dataset.train[moved]]))
+    return dataclasses.replace(dataset, train=dataset.train[~moved], validation=validation)
 
 
 def select_frequencies(
     dataset: Dataset, train_ghz: Sequence[float] | None = None, test_ghz: Sequence[float] | None = None
 ) -> Dataset:
-    """The same spectra with training and test restricted to some frequencies (GHz); None keeps all of them.
+    """Returns the same links with training, validation and test restricted to some frequencies (GHz); None keeps all of them.
+
+    The validation keeps the training frequencies: settings must not be chosen by what is to be predicted.
 
     Raises:
-        UserError: a frequency does not occur in the data set, or a selection leaves no spectrum.
+        UserError: a frequency does not occur in the data set, or a selection leaves no link.
     """
     train = _keep(dataset, dataset.train, train_ghz, "training")
+    validation = _keep(dataset, dataset.validation, train_ghz, "validation") if len(dataset.validation) else dataset.validation
     test = _keep(dataset, dataset.test, test_ghz, "test")
-    return dataclasses.replace(dataset, train=train, test=test)
+    return dataclasses.replace(dataset, train=train, validation=validation, test=test)
 
 
 def unseen_frequencies(dataset: Dataset, train_ghz: Sequence[float]) -> Dataset:
-    """Training at some frequencies (GHz) alone, tests at all others and at held-out transmitters; the name says so."""
+    """Returns a data set with training at some frequencies (GHz) alone, tests at all others and at held-out transmitters; the
+    name says so."""
     known = np.unique(dataset.frequencies_hz) / 1e9
     others = [float(f) for f in known if not np.isclose(f, train_ghz, rtol=1e-6, atol=0).any()]
     name = f"{dataset.name}_f" + "-".join(f"{f:g}" for f in train_ghz)
@@ -57,7 +73,7 @@ def unseen_frequencies(dataset: Dataset, train_ghz: Sequence[float]) -> Dataset:
 
 
 def fewer_transmitters(dataset: Dataset, count: int, seed: int) -> Dataset:
-    """Training with `count` of the training transmitters; larger counts contain the smaller ones. The name says so.
+    """Returns a data set with `count` of the training transmitters; larger counts contain the smaller ones. The name says so.
 
     Raises:
         UserError: there are not so many.
@@ -68,6 +84,54 @@ def fewer_transmitters(dataset: Dataset, count: int, seed: int) -> Dataset:
     chosen = np.random.default_rng([seed, 4]).permutation(known)[:count]
     train = dataset.train[np.isin(dataset.tx_index[dataset.train], chosen)]
     return dataclasses.replace(dataset, train=train, name=f"{dataset.name}_tx{count}")
+
+
+def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
+    """Returns a data set of the links of some receivers, which are numbered 0, 1, ... in the order given. The name says so.
+
+    Transmitters that none of them hears are gone, and the others numbered anew.
+
+    Raises:
+        UserError: there is no such receiver, one is named twice, or none is.
+    """
+    if not which or len(set(which)) < len(which) or not all(0 <= i < dataset.n_receivers for i in which):
+        raise UserError(f"{dataset.name} has receivers 0 to {dataset.n_receivers - 1}; choose each once, not {list(which)}")
+    number = np.full(dataset.n_receivers, -1)
+    number[list(which)] = np.arange(len(which))
+    kept = np.flatnonzero(number[dataset.receiver_index] >= 0)
+    place = np.full(len(dataset), -1)  # of every link among those that stay
+    place[kept] = np.arange(len(kept))
+
+    def rows(values: np.ndarray | None) -> np.ndarray | None:
+        return None if values is None else values[kept]
+
+    def remaining(index: np.ndarray) -> np.ndarray:
+        return place[index][place[index] >= 0]
+
+    return dataclasses.replace(
+        dataset,
+        name=f"{dataset.name}_rx" + "-".join(map(str, which)),
+        receivers=jax.tree.map(lambda leaf: leaf[np.array(which)], dataset.receivers),
+        tx_positions=dataset.tx_positions[kept],
+        frequencies_hz=dataset.frequencies_hz[kept],
+        receiver_index=number[dataset.receiver_index[kept]],
+        tx_index=np.unique(dataset.tx_index[kept], return_inverse=True)[1],
+        train=remaining(dataset.train),
+        validation=remaining(dataset.validation),
+        test=remaining(dataset.test),
+        snapshots=rows(dataset.snapshots),
+        images=rows(dataset.images),
+        power_db=rows(dataset.power_db),
+    )
+
+
+def _draw(tx_index: Int[np.ndarray, "n"], fraction: float, rng: np.random.Generator, role: str) -> Bool[np.ndarray, "n"]:
+    """Returns which links belong to a random part of the transmitters: at least one of them, and never all."""
+    if not 0 < fraction < 1:
+        raise UserError(f"the {role} fraction is {fraction}; choose a number between 0 and 1, 0.2 for example")
+    transmitters = np.unique(tx_index)
+    count = int(np.clip(round(fraction * len(transmitters)), 1, len(transmitters) - 1))
+    return np.isin(tx_index, rng.permutation(transmitters)[:count])
 
 
 def _keep(dataset: Dataset, index: np.ndarray, wanted_ghz: Sequence[float] | None, role: str) -> np.ndarray:

@@ -8,37 +8,72 @@ That is their equation of tracing rays with the phase left out, as everything he
 directions, the same ones for all spectra of a batch: whatever does not depend on the query is then evaluated once.
 """
 
-from functools import partial
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
-from wbgs_jax.checks import check_query, check_receiver
-from wbgs_jax.config import Nerf2Config
-from wbgs_jax.encoding import frequency_encoding, positional_encoding
-from wbgs_jax.fields.observation import Observation
-from wbgs_jax.geometry import rotation_matrix, smooth_length, to_local
-from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, signal_activation
-from wbgs_jax.pytree import pytree, static
-from wbgs_jax.types import Query, Receiver
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.config import PRESETS, check_positive
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, register, with_field
+from wbgs_jax.fields.encoding import check_octaves, frequency_encoding, positional_encoding
+from wbgs_jax.fields.losses import pixel_loss
+from wbgs_jax.fields.networks import AttenuationNetwork, RadianceNetwork, signal_activation
+from wbgs_jax.radio.array import EXACT, PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
+from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
+from wbgs_jax.types import Batch, Query, Receiver, Scene, check_query, check_receiver
 
-STARTS_FROM = "box"
 PIXELS = PAS_HEIGHT * PAS_WIDTH
 MIN_LENGTH = 1e-3
 """Metres: shorter rays are taken to be this long."""
 
 
-@pytree
-class Nerf2Params:
-    """All parameters of the field; `config` is static."""
+@dataclass(frozen=True)
+class Nerf2Config:
+    """Settings of the NeRF2-style volume."""
 
-    networks: dict[str, Any]
-    box: Float[Array, "2 3"]
-    """Smallest and largest coordinates of the scene, metres: rays end there. Never trained."""
-    config: Nerf2Config = static()
+    samples: int = 24
+    """Samples of a ray between the receiver and the end of the scene's box."""
+    directions: int = 192
+    """Directions (pixels) of every spectrum that a training step looks at."""
+    width: int = 64
+    """Units of the attenuation network's layers (authors: 256)."""
+    depth: int = 4
+    """Layers of the attenuation network (authors: 8); the frequency enters the last one."""
+    skip: int = 2
+    """The layer at which the place enters again (authors: 4)."""
+    radiance_widths: tuple[int, ...] = (64, 32)
+    """Units of the radiance network's layers."""
+    point_octaves: int = 6
+    """Octaves of P(x) (authors: 10)."""
+    direction_octaves: int = 2
+    """Octaves of P(w)."""
+    tx_octaves: int = 4
+    """Octaves of P(TX) (authors: 10)."""
+    frequency_octaves: int = 0
+    """Octaves of the frequency encoding, beyond its logarithm itself."""
+    relative: bool = True
+    """Also encode the TX relative to the place, the direction and the receiver array, as the wideband field does."""
+    pixel_loss: Literal["l1", "l2"] = "l1"
+    """Mean absolute or squared error of the sampled pixels, which make no image and have no SSIM."""
+    network_lr: float = 4e-3
+    """Learning rate of the networks (authors: 5e-4)."""
+    network_weight_decay: float = 0.0
+    """Decoupled weight decay of the networks."""
+
+
+CONFIGS = {
+    "smoke": Nerf2Config(samples=8, directions=64, width=32, depth=3, radiance_widths=(32,)),
+    "cpu": Nerf2Config(),
+    "gpu": Nerf2Config(
+        samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128), network_lr=8e-4
+    ),
+}
+Weights = dict[str, Any]
+"""What is trained: the two networks."""
 
 
 @pytree
@@ -55,168 +90,194 @@ class Rays:
 
 @pytree
 class Nerf2Plan:
-    """What is independent of the query: the rays of all pixels, row by row."""
+    """What is independent of the query: the rays of all pixels, row by row. No parameter is frozen in it."""
 
     rays: Rays
     receiver: Receiver
+    box: Float[Array, "2 3"]
+    config: Nerf2Config = static()
 
 
-@partial(jax.jit, static_argnames=("config", "capacity"))
-def init(key: Key[Array, ""], box: Float[Array, "2 3"], config: Nerf2Config, capacity: None = None) -> Nerf2Params:
-    """Networks of random weights; the space they fill is `box`, metres."""
-    untrained = Nerf2Params({}, jnp.asarray(box, jnp.float32), config)
-    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)))
-    rays = make_rays(untrained.box, receiver, jnp.array([[0.0, 0.0, 1.0]]))
+@register
+@pytree
+class Nerf2Field(Field):
+    """The volume that is filled by the networks."""
+
+    box: Float[Array, "2 3"]
+    """Smallest and largest coordinates of the scene, metres: rays end there."""
+    config: Nerf2Config = static()
+
+    name: ClassVar[str] = "nerf2"
+    presets: ClassVar = with_field(PRESETS, CONFIGS)
+
+    @classmethod
+    def check(cls, config: Nerf2Config) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        counts = {name: getattr(config, name) for name in ("samples", "directions", "width", "depth")}
+        check_positive({f"{cls.name}.{name}": n for name, n in counts.items()})
+        check_positive({f"{cls.name}.radiance-widths": min(config.radiance_widths, default=0)})
+        if config.directions > PIXELS:
+            raise UserError(f"--{cls.name}.directions is {config.directions}; a spectrum has {PIXELS} pixels")
+        check_octaves(cls.name, config, ("point", "direction", "tx", "frequency"))
+
+    @classmethod
+    def make(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
+        """Returns the field that fills the box of a scene."""
+        return cls(jnp.asarray(scene.box, jnp.float32), config)
+
+    def init(self, key: Key[Array, ""]) -> Weights:
+        """Returns networks of random weights."""
+        return _init(self, key)
+
+    def plan(self, params: Weights, receiver: Receiver, limits: None = None, cache: None = None) -> Nerf2Plan:
+        """Returns the rays of all pixels."""
+        check_receiver(receiver)
+        local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)
+        return self._plan(receiver, local)
+
+    def _plan(self, receiver: Receiver, local: Float[Array, "r 3"]) -> Nerf2Plan:
+        box = jax.lax.stop_gradient(self.box)
+        return Nerf2Plan(make_rays(box, receiver, local), receiver, box, self.config)
+
+    def render(self, params: Weights, plan: Nerf2Plan, query: Query) -> Observation:
+        """Returns the spectra of B queries."""
+        return Observation(render(params, plan, query))
+
+    def loss(
+        self, params: Weights, cache: None, batch: Batch, limits: None = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the loss of some pixels of a batch, drawn with the step's key, the same ones in all of its spectra."""
+        assert batch.pas is not None, "spectra are what it is trained on"
+        pixels = choose_pixels(batch.key, self.config.directions)
+        local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)[pixels]
+        truth = batch.pas.reshape(batch.pas.shape[0], -1)[:, pixels]
+        plan = self._plan(batch.receiver, local)
+        predicted = march(params, plan, plan.rays, batch.links.query).T
+        return pixel_loss(predicted, truth, self.config.pixel_loss), Aux({"batch_ssim": jnp.full((), jnp.nan)})
+
+    @classmethod
+    def groups(cls, config: Nerf2Config) -> dict[str, Group]:
+        """Returns one group, the networks."""
+        return {"all": Group(config.network_lr, config.network_weight_decay, eps=1e-8)}
+
+
+@jax.jit
+def _init(field: Nerf2Field, key: Key[Array, ""]) -> Weights:
+    """Returns initial weights; the inputs matter by their shapes only."""
+    box = field.box
+    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), jnp.zeros(()))
+    rays = make_rays(box, receiver, jnp.array([[0.0, 0.0, 1.0]]))
+    plan = Nerf2Plan(rays, receiver, box, field.config)
     query = Query(box[1:], jnp.full((1,), 1e9))
     key_attenuation, key_radiance = jax.random.split(key)
-    attenuation, radiance = _networks(config)
+    attenuation, radiance = _networks(field.config)
     outputs: Any
-    outputs, weights = attenuation.init_with_output(key_attenuation, *_place_inputs(untrained, receiver, rays, query))
-    inputs = [outputs[0], *_source_inputs(untrained, receiver, rays, query)]
-    return Nerf2Params({"attenuation": weights, "radiance": radiance.init(key_radiance, inputs)}, untrained.box, config)
+    outputs, weights = attenuation.init_with_output(key_attenuation, *_place_inputs(plan, rays, query))
+    inputs = [outputs[0], *_source_inputs(plan, rays, query)]
+    return {"attenuation": weights, "radiance": radiance.init(key_radiance, inputs)}
 
 
 def make_rays(box: Float[Array, "2 3"], receiver: Receiver, local: Float[Array, "r 3"]) -> Rays:
-    """Rays in unit directions of the receiver's frame, as long as they stay in the box (metres)."""
-    world = local @ rotation_matrix(receiver.orientation).T
+    """Returns rays in unit directions of the receiver's frame, as long as they stay in the box (metres)."""
+    world = jnp.matmul(local, rotation_matrix(receiver.orientation).T, precision=EXACT)
     ahead = jnp.where(world > 0, box[1], box[0]) - receiver.position
     parallel = jnp.abs(world) < 1e-9
     exits = jnp.where(parallel, jnp.inf, ahead / jnp.where(parallel, 1.0, world))
     return Rays(local, world, jnp.maximum(exits.min(-1), MIN_LENGTH))
 
 
-def plan(params: Nerf2Params, receiver: Receiver, capacity: None = None, means2d_offset: Any = None) -> Nerf2Plan:
-    """The rays of all pixels."""
-    check_receiver(receiver)
-    local = jnp.asarray(pas_directions().reshape(-1, 3), params.box.dtype)
-    return Nerf2Plan(make_rays(params.box, receiver, local), receiver)
-
-
-def render(params: Nerf2Params, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90 360"]:
-    """Power angular spectra of B queries, a row of the image at a time: in a gradient, too, one row is held in memory."""
+def render(params: Weights, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90 360"]:
+    """Returns the power angular spectra of B queries, a row of the image at a time: in a gradient, too, one row is held in
+    memory."""
     check_query(query)
     rows = jax.tree.map(lambda a: a.reshape(PAS_HEIGHT, PAS_WIDTH, *a.shape[1:]), plan.rays)
-    image = jax.lax.map(jax.checkpoint(lambda rays: march(params, plan.receiver, rays, query)), rows)
+    image = jax.lax.map(jax.checkpoint(lambda rays: march(params, plan, rays, query)), rows)
     return jnp.moveaxis(image, -1, 0).reshape(-1, *PAS_SHAPE)
 
 
-def remember(params: Nerf2Params, receiver: Receiver, tx_positions: Float[Array, "tx 3"]) -> None:
-    """Nothing: directions change in every step."""
-
-
-def choose_pixels(params: Nerf2Params, key: Key[Array, ""]) -> Int[Array, "r"]:
-    """The directions of a training step: a random pixel out of each of R equal stretches of the image, row by row."""
-    count = params.config.directions
+def choose_pixels(key: Key[Array, ""], count: int) -> Int[Array, "r"]:
+    """Returns flat indices of random pixels, one out of each of `count` equal stretches of the image, row by row."""
     places = (jnp.arange(count) + jax.random.uniform(key, (count,))) * (PIXELS / count)
     return jnp.minimum(places.astype(jnp.int32), PIXELS - 1)
 
 
-def observe_pixels(params: Nerf2Params, receiver: Receiver, query: Query, pixels: Int[Array, "r"]) -> Float[Array, "b r"]:
-    """Some pixels of the spectra of a training batch."""
-    local = jnp.asarray(pas_directions().reshape(-1, 3), params.box.dtype)[pixels]
-    return march(params, receiver, make_rays(params.box, receiver, local), query).T
-
-
-def observe(
-    params: Nerf2Params,
-    memory: None,
-    receiver: Receiver,
-    query: Query,
-    tx_index: Int[Array, "b"],
-    capacity: None,
-    means2d_offset: Any,
-) -> Observation:
-    """Whole spectra."""
-    return Observation(render(params, plan(params, receiver), query))
-
-
-def sizes(params: Nerf2Params) -> dict[str, int]:
-    """Nothing but the configuration decides the shapes."""
-    return {}
-
-
-def skeleton(config: Nerf2Config, sizes: dict[str, int]) -> Nerf2Params:
-    """The shapes of parameters."""
-    shaped: Any = jax.eval_shape(lambda: init(jax.random.key(0), jnp.zeros((2, 3)), config))
-    return shaped
-
-
-def march(params: Nerf2Params, receiver: Receiver, rays: Rays, query: Query) -> Float[Array, "r b"]:
-    """What arrives along every ray for every query."""
-    attenuation, radiance = _networks(params.config)
-    outputs: Any = attenuation.apply(params.networks["attenuation"], *_place_inputs(params, receiver, rays, query))
+def march(params: Weights, plan: Nerf2Plan, rays: Rays, query: Query) -> Float[Array, "r b"]:
+    """Returns what arrives along every ray for every query."""
+    attenuation, radiance = _networks(plan.config)
+    outputs: Any = attenuation.apply(params["attenuation"], *_place_inputs(plan, rays, query))
     hidden, sigma = outputs
-    logits: Any = radiance.apply(params.networks["radiance"], [hidden, *_source_inputs(params, receiver, rays, query)])
-    step = rays.length / params.config.samples / _half_extent(params.box)
+    logits: Any = radiance.apply(params["radiance"], [hidden, *_source_inputs(plan, rays, query)])
+    step = rays.length / plan.config.samples / _half_extent(plan.box)
     depth = jax.nn.softplus(sigma) * step[:, None, None]
     return accumulate(depth, signal_activation(logits))
 
 
 def accumulate(depth: Float[Array, "r s b"], signal: Float[Array, "r s b"]) -> Float[Array, "r b"]:
-    """sum_s T_s alpha_s Sig_s, front to back, with optical depths sigma_s d of the samples."""
+    """Returns sum_s T_s alpha_s Sig_s, front to back, with optical depths sigma_s d of the samples."""
     behind = jnp.cumsum(depth, 1)
     weight = jnp.exp(depth - behind) * -jnp.expm1(-depth)
     return jnp.sum(weight * signal, 1)
 
 
 def _networks(config: Nerf2Config) -> tuple[AttenuationNetwork, RadianceNetwork]:
-    """The frequency enters the last layer of the attenuation network: those before it are evaluated once for all queries."""
+    """Returns both networks. The frequency enters the last layer of the attenuation network: those before it are evaluated once
+    for all queries."""
     attenuation = AttenuationNetwork(config.width, config.depth, config.skip, fusion=config.depth - 1)
     return attenuation, RadianceNetwork(config.radiance_widths)
 
 
 def _half_extent(box: Float[Array, "2 3"]) -> Float[Array, ""]:
-    """The length (metres) that the networks' inputs count in."""
+    """Returns the length (metres) that the networks' inputs count in."""
     return jnp.max(box[1] - box[0]) / 2
 
 
-def _scaled(params: Nerf2Params, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """World positions as network inputs of about -1..1."""
-    box = jax.lax.stop_gradient(params.box)
-    return (points - box.mean(0)) / _half_extent(box)
+def _scaled(plan: Nerf2Plan, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Returns world positions as network inputs of about -1..1."""
+    return (points - plan.box.mean(0)) / _half_extent(plan.box)
 
 
-def _points(receiver: Receiver, rays: Rays, samples: int) -> Float[Array, "r s 3"]:
-    """The middles of equal stretches of every ray, world frame, metres."""
+def _points(plan: Nerf2Plan, rays: Rays) -> Float[Array, "r s 3"]:
+    """Returns the middles of equal stretches of every ray, world frame, metres."""
+    samples = plan.config.samples
     distances = (jnp.arange(samples) + 0.5) / samples * rays.length[:, None]
-    return receiver.position + rays.world[:, None] * distances[..., None]
+    return plan.receiver.position + rays.world[:, None] * distances[..., None]
 
 
-def _frequency(params: Nerf2Params, query: Query) -> Float[Array, "1 1 b _"]:
-    return frequency_encoding(query.frequency_hz, params.config.frequency_octaves)[None, None]
+def _frequency(plan: Nerf2Plan, query: Query) -> Float[Array, "1 1 b _"]:
+    return frequency_encoding(query.frequency_hz, plan.config.frequency_octaves)[None, None]
 
 
 def _place_inputs(
-    params: Nerf2Params, receiver: Receiver, rays: Rays, query: Query
+    plan: Nerf2Plan, rays: Rays, query: Query
 ) -> tuple[list[Float[Array, "r s 1 _"]], list[Float[Array, "1 1 b _"]]]:
-    """Inputs of the attenuation network: of the place, and the frequency."""
-    points = _points(receiver, rays, params.config.samples)
-    encoded = positional_encoding(_scaled(params, points), params.config.point_octaves)
-    return [encoded[:, :, None]], [_frequency(params, query)]
+    """Returns the inputs of the attenuation network: those of the place, and the frequency."""
+    encoded = positional_encoding(_scaled(plan, _points(plan, rays)), plan.config.point_octaves)
+    return [encoded[:, :, None]], [_frequency(plan, query)]
 
 
-def _source_inputs(params: Nerf2Params, receiver: Receiver, rays: Rays, query: Query) -> list[Float[Array, "_ _ b_or_1 _"]]:
-    """Inputs of the radiance network besides h: direction, transmitter, frequency and, if asked for, how they lie."""
-    config = params.config
+def _source_inputs(plan: Nerf2Plan, rays: Rays, query: Query) -> list[Float[Array, "_ _ b_or_1 _"]]:
+    """Returns the inputs of the radiance network besides h: direction, transmitter, frequency and, if asked for, how they
+    lie."""
+    config = plan.config
     direction = positional_encoding(rays.world, config.direction_octaves)[:, None, None]
-    tx = positional_encoding(_scaled(params, query.tx_position), config.tx_octaves)[None, None]
-    inputs = [direction, tx, _frequency(params, query)]
-    return inputs + _relative_inputs(params, receiver, rays, query) if config.relative else inputs
+    tx = positional_encoding(_scaled(plan, query.tx_position), config.tx_octaves)[None, None]
+    inputs = [direction, tx, _frequency(plan, query)]
+    return inputs + _relative_inputs(plan, rays, query) if config.relative else inputs
 
 
-def _relative_inputs(params: Nerf2Params, receiver: Receiver, rays: Rays, query: Query) -> list[Float[Array, "_ _ b _"]]:
-    """What the wideband field knows of transmitter, place and receiver too (`WidebandConfig.relative`).
+def _relative_inputs(plan: Nerf2Plan, rays: Rays, query: Query) -> list[Float[Array, "_ _ b _"]]:
+    """Returns what the wideband field knows of transmitter, place and receiver too (`WidebandConfig.relative`).
 
     Of a direction: its angle to the TX and the array's response to the TX there. Of a place: the cosine of the bounce, and
     distance and direction to the TX.
     """
+    receiver = plan.receiver
     to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
     to_tx = to_tx / smooth_length(to_tx)
-    response = array_response(receiver.element_positions, rays.local, to_tx)
-    of_ray = jnp.stack([rays.local @ to_tx.T, response], -1)[:, None]
-    points = _points(receiver, rays, params.config.samples)
-    leg = query.tx_position - points[:, :, None]
+    response = array_response(receiver.element_wavelengths(query.frequency_hz), rays.local, to_tx)
+    of_ray = jnp.stack([jnp.matmul(rays.local, to_tx.T, precision=EXACT), response], -1)[:, None]
+    leg = query.tx_position - _points(plan, rays)[:, :, None]
     distance = smooth_length(leg)
     direction = leg / distance
     bounce = -jnp.sum(direction * rays.world[:, None, None], -1, keepdims=True)
-    return [of_ray, jnp.concatenate([bounce, distance / _half_extent(params.box), direction], -1)]
+    return [of_ray, jnp.concatenate([bounce, distance / _half_extent(plan.box), direction], -1)]

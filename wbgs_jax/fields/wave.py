@@ -2,46 +2,42 @@
 
     y = sum over paths  a(direction) g(direction) E(f) exp(-j k d) / d        PAS = |a^H y| / max
 
-The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (wave/). What a
-path carries follows from the slabs it is reflected by and passes through, and those are learned: permittivity, conductivity
-and (where it is not known) thickness of every material, and a small residual of every facet. Phase-blind models cannot follow
-interference; this one does, and it yields the channel itself.
+The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (propagation/).
+What arrives over a path follows from the slabs it is reflected by and passes through, and those are learned: permittivity,
+conductivity and (where it is not known) thickness of every material, and a small correction of every facet. Phase-blind models
+cannot follow interference; this one does, and it yields the channel itself.
 """
 
-import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax.array import normalise, pas_directions, snapshot_to_pas, steering_vector
-from wbgs_jax.checks import check_query, check_receiver
-from wbgs_jax.config import WaveConfig
-from wbgs_jax.errors import UserError
-from wbgs_jax.fields.observation import Observation
-from wbgs_jax.losses import squared_magnitude
-from wbgs_jax.pytree import pytree, static
-from wbgs_jax.types import Mesh, Query, Receiver
-from wbgs_jax.wave.edges import Edges, edges_of_facets
-from wbgs_jax.wave.facets import Facets, facets_from_mesh, outline_of
-from wbgs_jax.wave.images import diffracted_chains, receiver_chains
-from wbgs_jax.wave.paths import (
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree, static, with_leaves
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, single_receiver
+from wbgs_jax.fields.losses import snapshot_losses
+from wbgs_jax.fields.wave_settings import PRESETS, WaveConfig
+from wbgs_jax.propagation.edges import Edges, edges_of_facets
+from wbgs_jax.propagation.facets import Facets, facets_from_mesh
+from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.paths import (
     DIFFRACTED,
     MAX_FACETS,
     REFLECTED,
     TRANSMITTED,
-    Outline,
     Paths,
-    Search,
-    diffracted_paths,
-    reflected_paths,
+    TracedPaths,
+    trace_paths,
 )
-from wbgs_jax.wave.slab import complex_permittivity
-from wbgs_jax.wave.transfer import Arrivals, Slabs, arrivals, snapshot
+from wbgs_jax.propagation.slab import complex_permittivity
+from wbgs_jax.propagation.transport import Slabs, arrivals, snapshots_from_paths
+from wbgs_jax.radio.array import EXACT, normalise, pas_directions, snapshot_to_pas, squared_magnitude, steering_vector
+from wbgs_jax.radio.channel import Arrivals, received_power_db
+from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
 
-STARTS_FROM = "mesh"
 TRACED_AT_ONCE = 16
 """Transmitters."""
 FAINTEST = 1e-30
@@ -62,254 +58,262 @@ class Materials:
     """d."""
     log_thickness: Float[Array, "m"]
     """log of metres, where the scene does not say."""
-    known_thickness: Float[Array, "m"]
-    """Metres, not trained; 0 where it is not known."""
-
-    def thickness(self) -> Float[Array, "m"]:
-        """Metres."""
-        return jnp.where(self.known_thickness > 0, self.known_thickness, jnp.exp(self.log_thickness))
 
 
 @pytree
 class WaveParams:
-    """All parameters of the field; geometry is not trained."""
+    """What is trained."""
 
     materials: Materials
-    residual: Float[Array, "f 2"]
+    facet_correction: Float[Array, "f 2"]
     """Logarithm of amplitude and phase (radians) by which a facet's reflection differs from its material's."""
-    log_survival: Float[Array, "2 3"]
-    """Logarithm of the amplitude that a meeting leaves beyond its slab or wedge, of (plain, diffracted) paths at (transmission,
-    reflection, diffraction)."""
-    directivity: Float[Array, ""]
-    """Exponent of the receiver elements' gain: 1 for the element of 3GPP TR 38.901, 0 for isotropic ones."""
+    excess_loss: Float[Array, "2 3"]
+    """Loss per interaction beyond its slab or wedge (nepers), of (specular, diffracted) paths at (transmission, reflection,
+    diffraction)."""
     log_gain: Float[Array, ""]
-    """Of the transmitter and whatever else scales all snapshots."""
-    facets: Facets
-    edges: Edges
-    config: WaveConfig = static()
+    """Logarithm of the gain of the transmitter and whatever else scales all snapshots."""
 
 
 @pytree
 class WavePlan:
-    """What is independent of the query."""
+    """What is independent of the query: geometry alone. No parameter is frozen in it."""
 
     search: Search
     receiver: Receiver
+    known_thickness: Float[Array, "m"]
+    config: WaveConfig = static()
 
 
 @pytree
-class Traced:
-    """The paths of some transmitters."""
+class PreparedPaths:
+    """A receiver's mirror images, and the paths of some transmitters."""
 
-    plain: Paths
-    diffracted: Paths
-
-
-def init(key: Key[Array, ""], mesh: Mesh, config: WaveConfig, capacity: int | None = None) -> WaveParams:
-    """Facets and edges of a mesh (on the host), all materials alike but for thicknesses that are known.
-
-    Raises:
-        UserError: more facets are asked for than the search for paths can number.
-    """
-    if config.max_facets > MAX_FACETS:
-        raise UserError(f"--wave.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
-    facets = facets_from_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.cluster), config.max_facets)
-    m = mesh.thickness.shape[0]
-    materials = Materials(
-        log_susceptibility=jnp.full(m, np.log(config.permittivity - 1), jnp.float32),
-        log_conductivity=jnp.full(m, np.log(config.conductivity), jnp.float32),
-        slope=jnp.full(m, config.slope, jnp.float32),
-        log_thickness=jnp.full(m, np.log(config.thickness), jnp.float32),
-        known_thickness=jnp.asarray(mesh.thickness, jnp.float32),
-    )
-    return WaveParams(
-        materials=materials,
-        residual=jnp.zeros((len(facets.part), 2)),
-        log_survival=jnp.log(jnp.array([[1.0, 1.0, 1.0], [config.survival, config.survival, 1.0]])),
-        directivity=jnp.asarray(mesh.directivity, jnp.float32),
-        log_gain=jnp.zeros(()),
-        facets=_floats(facets),
-        edges=_floats(edges_of_facets(facets)),
-        config=config,
-    )
+    search: Search
+    paths: TracedPaths
+    """Leading axis: transmitters."""
+    tx_index: Int[Array, "tx"]
+    """Numbers of the transmitters, ascending."""
 
 
-def _floats(tree: Any) -> Any:
-    """All arrays as float32, indices too, so that `jax.grad` takes them."""
-    return jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), tree)
+@register
+@pytree
+class WaveField(Field):
+    """Facets and edges of the scene, and the thicknesses that are known."""
 
+    facets: Facets
+    edges: Edges
+    known_thickness: Float[Array, "m"]
+    """Thickness of every material, metres; 0 where it is not known, and learned."""
+    config: WaveConfig = static()
 
-def plan(params: WaveParams, receiver: Receiver, *_: Any) -> WavePlan:
-    """All mirror images of a receiver; on the host, so not under jit."""
-    check_receiver(receiver)
-    config, rx = params.config, np.asarray(receiver.position, np.float64)
-    facets, edges = _on_host(params.facets), _on_host(params.edges)
-    outline: Any = outline_of(facets)
-    search = Search(
-        receiver.position,
-        facets,
-        Outline(*outline),
-        edges,
-        receiver_chains(facets, rx, config.mirror_areas),
-        diffracted_chains(facets, edges, rx, config.mirror_area_after_edge, config.mirror_area_before_edge),
-    )
-    return WavePlan(jax.tree.map(_to_device, search), receiver)
+    name: ClassVar[str] = "wave"
+    presets: ClassVar = PRESETS
+    gives: ClassVar = ("pas", "snapshots", "power", "paths")
+    controls: ClassVar = ("search",)
 
+    @classmethod
+    def check(cls, config: WaveConfig) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        if config.max_facets > MAX_FACETS:
+            raise UserError(f"--{cls.name}.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
 
-def _on_host(tree: Any) -> Any:
-    """float64 positions, int32 indices."""
-    arrays = {f.name: np.asarray(getattr(tree, f.name), np.float64) for f in dataclasses.fields(tree)}
-    return type(tree)(**arrays | {name: arrays[name].astype(np.int32) for name in ("part", "facet") if name in arrays})
+    @classmethod
+    def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
+        """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
+        cls.check(config)
+        return make_field(scene.mesh(), config)
 
-
-def _to_device(leaf: Any) -> Array:
-    return jnp.asarray(leaf, jnp.float32 if np.issubdtype(np.asarray(leaf).dtype, np.floating) else jnp.int32)
-
-
-def trace(params: WaveParams, plan: WavePlan, tx_position: Float[Array, "b 3"]) -> Traced:
-    """The paths of B transmitters; independent of frequency and materials."""
-    config = params.config
-
-    def one(tx):
-        plain = reflected_paths(tx, plan.search, config.plain_tried, config.plain_kept)
-        return Traced(plain, diffracted_paths(tx, plan.search, config.diffracted_tried, config.diffracted_kept))
-
-    return jax.lax.map(one, tx_position)
-
-
-def remember(params: WaveParams, receiver: Receiver, tx_positions: Float[Array, "tx 3"]) -> tuple[WavePlan, Traced]:
-    """The receiver's mirror images and the paths of all transmitters: geometry is not trained."""
-    planned = plan(params, receiver)
-    tracing, n = jax.jit(trace), tx_positions.shape[0]
-    parts = []
-    for start in range(0, n, TRACED_AT_ONCE):
-        index = np.minimum(np.arange(start, start + TRACED_AT_ONCE), n - 1)  # blocks of one shape: one compilation
-        parts.append(jax.tree.map(np.asarray, tracing(params, planned, tx_positions[index])))
-    return planned, jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:n]), *parts)
-
-
-def observe(
-    params: WaveParams,
-    memory: tuple[WavePlan, Traced],
-    receiver: Receiver,
-    query: Query,
-    tx_index: Int[Array, "b"],
-    capacity: Any = None,
-    means2d_offset: Any = None,
-) -> Observation:
-    """Snapshots and spectra of a training batch."""
-    planned, traced = memory
-    chosen = jax.tree.map(lambda leaf: leaf[tx_index], traced)
-    penalty = params.config.residual_weight * jnp.sum(jnp.mean(params.residual**2, 0))
-    if not params.config.coherent:
-        return Observation(phase_blind_pas(params, planned, chosen, query.frequency_hz), penalty=penalty)
-    y = carry(params, planned, chosen, query.frequency_hz)
-    return Observation(to_pas(y, receiver), y, penalty)
-
-
-def sizes(params: WaveParams) -> dict[str, int]:
-    """What decides the shapes of the parameters, besides the configuration."""
-    m, f, e = params.materials.slope, params.facets.offset, params.edges.length
-    return {"materials": m.shape[0], "facets": f.shape[0], "edges": e.shape[0]}
-
-
-def skeleton(config: WaveConfig, sizes: dict[str, int]) -> WaveParams:
-    """The shapes of parameters."""
-    m, f, e = (sizes[name] for name in ("materials", "facets", "edges"))
-
-    def build() -> WaveParams:
-        def zeros(*shape: int) -> Array:
-            return jnp.zeros(shape, jnp.float32)
-
-        return WaveParams(
-            materials=Materials(*[zeros(m)] * 5),
-            residual=zeros(f, 2),
-            log_survival=zeros(2, 3),
-            directivity=zeros(),
-            log_gain=zeros(),
-            facets=_floats(Facets(zeros(f, 4, 3), zeros(f, 3), zeros(f), jnp.zeros(f, int))),
-            edges=_floats(Edges(zeros(e, 3), zeros(e, 3), zeros(e), zeros(e, 3), zeros(e, 3), jnp.zeros(e, int))),
-            config=config,
+    def init(self, key: Key[Array, ""]) -> WaveParams:
+        """Returns parameters in which all materials are alike; nothing is random."""
+        config, m = self.config, self.known_thickness.shape[0]
+        materials = Materials(
+            log_susceptibility=jnp.full(m, np.log(config.permittivity - 1), jnp.float32),
+            log_conductivity=jnp.full(m, np.log(config.conductivity), jnp.float32),
+            slope=jnp.full(m, config.slope, jnp.float32),
+            log_thickness=jnp.full(m, np.log(config.thickness), jnp.float32),
         )
+        amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
+        return WaveParams(materials, jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(()))
 
-    shaped: Any = jax.eval_shape(build)
-    return shaped
+    def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
+        """Returns all mirror images of a receiver (host, unless they are prepared)."""
+        check_receiver(receiver)
+        search = self._search(receiver) if cache is None else cache.search
+        return WavePlan(search, receiver, self.known_thickness, self.config)
+
+    def _search(self, receiver: Receiver) -> Search:
+        config = self.config
+        areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
+        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
+
+    def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
+        """Returns the paths of all transmitters of some links (host): geometry is not trained."""
+        receiver = single_receiver(receivers, self.name)
+        numbers, first = np.unique(np.asarray(links.tx_index), return_index=True)
+        positions, n = np.asarray(links.query.tx_position)[first], len(first)
+        planned, parts = self.plan(None, receiver), []
+        for start in range(0, n, TRACED_AT_ONCE):
+            index = np.minimum(np.arange(start, start + TRACED_AT_ONCE), n - 1)  # blocks of one shape: one compilation
+            parts.append(jax.tree.map(np.asarray, _trace(planned, jnp.asarray(positions[index]))))
+        paths = jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:n]), *parts)
+        return PreparedPaths(planned.search, paths, jnp.asarray(numbers, jnp.int32))
+
+    def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
+        """Returns spectra, snapshots and received power of B queries."""
+        check_query(query)
+        return _observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+
+    def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
+        """Returns the same of links whose transmitters' paths are prepared."""
+        place = jnp.searchsorted(cache.tx_index, links.tx_index)
+        paths = jax.tree.map(lambda leaf: leaf[place], cache.paths)
+        return _observe(params, plan, paths, links.query.frequency_hz)
+
+    def loss(
+        self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
+        facet corrections."""
+        config = self.config
+        seen = self.render_links(params, self.plan(params, batch.receiver, cache=cache), cache, batch.links)
+        loss, aux = compare(seen, batch, config.ssim_weight)
+        if seen.snapshots is not None and batch.snapshots is not None:
+            correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
+            loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
+        return loss + config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0)), aux
+
+    def arrivals(self, params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
+        """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
+        return channels(params, plan, query)
+
+    def sizes(self, params: WaveParams) -> dict[str, int]:
+        """Returns the numbers of materials, facets and edges."""
+        counts = self.known_thickness.shape[0], self.facets.offset.shape[0], self.edges.length.shape[0]
+        return dict(zip(("materials", "facets", "edges"), counts, strict=True))
+
+    @classmethod
+    def groups(cls, config: WaveConfig) -> dict[str, Group]:
+        """Returns groups for materials, thicknesses and corrections."""
+        return {
+            "materials": Group(config.materials_lr),
+            "thickness": Group(config.thickness_lr),
+            "corrections": Group(config.corrections_lr),
+        }
+
+    @classmethod
+    def labels(cls, params: WaveParams) -> Any:
+        """Returns the group of every parameter."""
+        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3)
+
+
+def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
+    """Returns the field of a mesh: its facets and edges are found on the host."""
+    config = config or WaveConfig()
+    facets = facets_from_mesh(mesh, config.max_facets)
+    edges = edges_of_facets(facets)
+    return WaveField(_to_device(facets), _to_device(edges), jnp.asarray(mesh.thickness, jnp.float32), config)
+
+
+def _to_device(tree: Any) -> Any:
+    """Returns positions as float32 and indices as int32."""
+
+    def leaf(a: Any) -> Array:
+        return jnp.asarray(a, jnp.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else jnp.int32)
+
+    return jax.tree.map(leaf, tree)
+
+
+def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
+    """Returns the paths of B transmitters; independent of frequency and materials."""
+    config = plan.config
+    sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
+    return jax.lax.map(lambda tx: trace_paths(plan.search, tx, *sizes), tx_position)
+
+
+_trace = jax.jit(trace)
 
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
-    """Power angular spectra of B queries."""
-    if not params.config.coherent:
-        return phase_blind_pas(params, plan, trace(params, plan, query.tx_position), query.frequency_hz)
-    return to_pas(snapshots(params, plan, query), plan.receiver)
+    """Returns the power angular spectra of B queries."""
+    check_query(query)
+    return _observe(params, plan, trace(plan, query.tx_position), query.frequency_hz).pas
 
 
 def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array, "b elements"]:
-    """Complex array snapshots (channel state) of B queries."""
+    """Returns the complex array snapshots (channel state) of B queries."""
     check_query(query)
-    return carry(params, plan, trace(params, plan, query.tx_position), query.frequency_hz)
+    return path_snapshots(params, plan, trace(plan, query.tx_position), query.frequency_hz)
 
 
 def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
-    """Every path of B queries, leading axis B: amplitudes, directions, lengths."""
+    """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
     check_query(query)
-    traced = trace(params, plan, query.tx_position)
-    found: Any = jax.vmap(lambda traced, f: arrivals_at(params, plan, traced, f))(traced, query.frequency_hz)
+    paths = trace(plan, query.tx_position)
+    found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, query.frequency_hz)
     return found
 
 
-def carry(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Float[Array, "b"]) -> Complex[Array, "b elements"]:
-    """Snapshots of B transmitters whose paths are known."""
-    return jax.vmap(lambda traced, f: snapshot(arrivals_at(params, plan, traced, f), plan.receiver))(traced, frequency_hz)
+def path_snapshots(
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
+) -> Complex[Array, "b elements"]:
+    """Returns the snapshots of B transmitters whose paths are known."""
+    return jax.vmap(lambda paths, f: snapshots_from_paths(arrivals_at(params, plan, paths, f), plan.receiver, f))(
+        paths, frequency_hz
+    )
 
 
-def to_pas(y: Complex[Array, "b elements"], receiver: Receiver) -> Float[Array, "b 90 360"]:
-    """Spectra of snapshots of any scale."""
-    y = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + 1e-30)
-    return snapshot_to_pas(y, receiver.element_positions)
+def _observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Observation:
+    if not plan.config.coherent:
+        return Observation(phase_blind_pas(params, plan, paths, frequency_hz))
+    y = path_snapshots(params, plan, paths, frequency_hz)
+    unit = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + 1e-30)
+    return Observation(snapshot_to_pas(unit, plan.receiver.element_wavelengths(frequency_hz)), y, received_power_db(y))
 
 
 def phase_blind_pas(
-    params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Float[Array, "b"]
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
 ) -> Float[Array, "b 90 360"]:
-    """Spectra with the powers of all paths added: what is left of this model without its phases."""
+    """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
 
-    def covariance(traced, f):
-        found = arrivals_at(params, plan, traced, f)
-        steering = steering_vector(plan.receiver.element_positions, found.direction)
+    def one(paths, f):
+        elements = plan.receiver.element_wavelengths(f)
+        found = arrivals_at(params, plan, paths, f)
+        steering = steering_vector(elements, found.direction)
         strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(found.amplitude)))
         power = squared_magnitude(found.amplitude / jnp.maximum(strongest, FAINTEST))
         weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
-        return steering.T @ weighted.conj()  # sum of power times a a^H
+        covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)  # sum of power times a a^H
+        grid = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
+        return jnp.einsum("hwe,ef,hwf->hw", grid.conj(), covariance, grid, precision=EXACT)
 
-    grid = steering_vector(plan.receiver.element_positions, jnp.asarray(pas_directions(), jnp.float32))
-    beams = jnp.einsum("hwe,bef,hwf->bhw", grid.conj(), jax.vmap(covariance)(traced, frequency_hz), grid)
+    beams = jax.vmap(one)(paths, frequency_hz)
     return normalise(jnp.sqrt(jnp.maximum(beams.real, 1e-12)))
 
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
-    """What every facet is made of."""
-    m, cluster = params.materials, plan.search.facets.part
+    """Returns what every facet is made of at one frequency."""
+    m, material = params.materials, plan.search.facets.material
     sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
-    return Slabs(permittivity[cluster], m.thickness()[cluster])
+    thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
+    return Slabs(permittivity[material], thickness[material])
 
 
-def arrivals_at(params: WaveParams, plan: WavePlan, traced: Traced, frequency_hz: Float[Array, ""]) -> Arrivals:
-    """What one transmitter sends over all of its paths."""
-    slabs, search = slabs_at(params, plan, frequency_hz), plan.search
-    found = []
-    for row, paths in enumerate((traced.plain, traced.diffracted)):
-        one = arrivals(
-            paths, search.facets, search.edges, slabs, frequency_hz, plan.receiver, params.directivity, diffracted=row == 1
-        )
-        gain = jnp.exp(params.log_gain) * _corrections(params, paths, row)
+def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
+    """Returns what one transmitter sends over all of its paths."""
+    slabs, found = slabs_at(params, plan, frequency_hz), []
+    for row, some in enumerate((paths.specular, paths.diffracted)):
+        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, diffracted=row == 1)
+        gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         found.append(one._replace(amplitude=one.amplitude * gain))
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "k"]:
-    """What the path loses or turns beyond its slabs."""
-    counts = jnp.stack([jnp.sum(paths.kind == kind, -1) for kind in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
-    reflects = paths.kind == REFLECTED
-    residual = jnp.where(reflects[..., None], params.residual[jnp.where(reflects, paths.met, 0)], 0).sum(-2)
-    return jnp.exp(counts @ params.log_survival[row] + residual[:, 0] + 1j * residual[:, 1])
+    """Returns the factor by which paths differ from their slabs and wedges."""
+    kind = paths.interaction_type
+    counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
+    reflects = kind == REFLECTED
+    correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
+    total = jnp.where(reflects[..., None], correction, 0).sum(-2)
+    return jnp.exp(total[:, 0] - counts @ params.excess_loss[row] + 1j * total[:, 1])

@@ -3,31 +3,104 @@
     delta, Sig = F(P(G), P(TX), f)      the EM feature networks (networks.py), one pair a Gaussian and query
     PAS(p)     = sum_i T_i delta_i G_i(p) Sig_i    the splatting of splat/
 
-The geometry does not depend on the query: it is planned once and shared by a batch.
+Neither the geometry nor what the networks make of a Gaussian alone depends on the query: both are planned once.
 """
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax.array import array_response
-from wbgs_jax.checks import check_query, check_receiver, check_surface
-from wbgs_jax.config import WidebandConfig
-from wbgs_jax.encoding import frequency_encoding, positional_encoding
-from wbgs_jax.fields.observation import Observation
-from wbgs_jax.geometry import smooth_length, to_local
-from wbgs_jax.networks import AttenuationNetwork, RadianceNetwork, attenuation_activation, signal_activation
-from wbgs_jax.pytree import pytree, static
-from wbgs_jax.splat import Capacity, GeometryPlan, geometry_plan, render_splats
-from wbgs_jax.types import Gaussians, Query, Receiver, Surface
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree, static, with_leaves
+from wbgs_jax.config import PRESETS, DensityConfig, check_positive, check_share
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, with_field
+from wbgs_jax.fields.encoding import FrequencyScale, check_octaves, frequency_encoding, positional_encoding
+from wbgs_jax.fields.networks import (
+    AttenuationNetwork,
+    GaussianSums,
+    RadianceNetwork,
+    attenuation_activation,
+    signal_activation,
+)
+from wbgs_jax.radio.array import EXACT, array_response, steering_vector
+from wbgs_jax.radio.geometry import Projection, smooth_length, to_local
+from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
+from wbgs_jax.types import Batch, Gaussians, Query, Receiver, Scene, Surface, SurfaceSampling, check_query, check_receiver, check_surface
 
-STARTS_FROM = "points"
 MAX_ATTENUATION = 0.99
 INITIAL_ATTENUATION = 0.3
+TILE_SLACK = 1.4
+"""Room in the tile lists for footprints that grow during training."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WidebandConfig:
+    """Settings of the paper's field."""
+
+    gaussians: int = 2000
+    """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
+    sampling: SurfaceSampling = "solid_angle"
+    """Spread them evenly over the receiver's directions, or over the area of the surface."""
+    width: int = 64
+    """Units of the attenuation network's layers (authors: 128)."""
+    depth: int = 4
+    """Layers of the attenuation network (authors: 8)."""
+    skip: int = 2
+    """The layer at which the inputs enter again (authors: 4)."""
+    fusion: int = 1
+    """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
+    all queries. 0: the paper's form."""
+    radiance_widths: tuple[int, ...] = (64, 32)
+    """Units of the radiance network's layers (authors: 128, 64)."""
+    gaussian_octaves: int = 6
+    """Octaves of P(G) (authors: 10)."""
+    tx_octaves: int = 4
+    """Octaves of P(TX) (authors: 10)."""
+    frequency_octaves: int = 0
+    """Octaves of the frequency encoding, beyond the scaled frequency itself (authors: 10; more than none fail between the
+    frequencies that were trained)."""
+    frequency_scale: FrequencyScale = "log"
+    """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
+    relative: bool = True
+    """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
+    attenuation_frequency: bool = True
+    """Frequency embedding of the attenuation network (paper, Table 3)."""
+    radiance_frequency: bool = True
+    """Frequency embedding of the radiance network (paper, Table 3)."""
+    projection: Projection = "hemisphere"
+    """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
+    ssim_weight: float = 0.2
+    """lambda of the paper's equation 5."""
+    network_lr: float = 4e-3
+    """Learning rate of the networks (authors: 8e-4)."""
+    network_weight_decay: float = 0.0
+    """Decoupled weight decay of the networks."""
+    means_lr: float = 1e-3
+    """Learning rate of the centres: metres a step, about. (Authors: 0 in effect; their spatial scale multiplies it away.)"""
+    log_scales_lr: float = 5e-3
+    """Learning rate of the logarithms of the standard deviations."""
+    quats_lr: float = 1e-3
+    """Learning rate of the rotations."""
+    opacity_lr: float = 2.5e-2
+    """Learning rate of delta_o."""
+
+
+CONFIGS = {
+    "smoke": WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
+    "cpu": WidebandConfig(),
+    # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
+    "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64), network_lr=8e-4),
+}
+DENSITY = {
+    "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
+    "cpu": DensityConfig(),
+    "gpu": DensityConfig(max_gaussians=100_000, reset_every=3000),
+}
 
 
 @pytree
@@ -40,161 +113,269 @@ class Frame:
 
 @pytree
 class WidebandParams:
-    """All parameters of the field; `config` is static."""
+    """What is trained."""
 
     gaussians: Gaussians
     networks: dict[str, Any]
-    frame: Frame
-    config: WidebandConfig = static()
+
+
+@pytree
+class GaussianFeatures:
+    """What the networks' inputs need of every Gaussian, whatever is asked."""
+
+    sums: GaussianSums
+    """What the attenuation network's layers make of P(G)."""
+    direction: Float[Array, "n 3"]
+    """Unit vectors from the receiver to the Gaussians, receiver's frame."""
+    back: Float[Array, "n 3"]
+    """Unit vectors from the Gaussians to the receiver, world frame."""
+    steering: Complex[Array, "n elements"] | None
+    """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
 
 
 @pytree
 class WidebandPlan:
-    """What is independent of the query."""
+    """What is independent of the query: gradients reach parameters through it only where it is made under `jax.grad`."""
 
     geometry: GeometryPlan
+    features: GaussianFeatures | None
+    """None in a file: computed in every call."""
+    frame: Frame
     receiver: Receiver
+    config: WidebandConfig = static()
 
 
-@partial(jax.jit, static_argnames=("config", "capacity"))
-def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity: int | None = None) -> WidebandParams:
-    """Isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest neighbours.
+@register
+@pytree
+class WidebandField(Field):
+    """Where the Gaussians start, and the frame of the networks' inputs."""
 
-    `capacity` >= n pads the Gaussians so that density control has room to grow.
-    """
+    surface: Surface
+    frame: Frame
+    config: WidebandConfig = static()
+
+    name: ClassVar[str] = "wideband"
+    presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY)
+    controls: ClassVar = ("density",)
+
+    @classmethod
+    def check(cls, config: WidebandConfig) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        widths = min(config.radiance_widths, default=0)
+        name = cls.name
+        check_positive({f"{name}.width": config.width, f"{name}.depth": config.depth, f"{name}.radiance-widths": widths})
+        check_share(f"{name}.ssim-weight", config.ssim_weight)
+        if 0 < config.gaussians < 4 or config.gaussians < 0:
+            raise UserError(f"--{name}.gaussians is {config.gaussians}; give at least 4, or 0 for the size of the mesh")
+        if not 0 <= config.fusion < config.depth:
+            raise UserError(f"--{name}.fusion is {config.fusion}; it is the number of a layer, 0 to {config.depth - 1}")
+        check_octaves(name, config, ("gaussian", "tx", "frequency"))
+
+    @classmethod
+    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+        """Returns the field whose Gaussians start on the surfaces of a scene."""
+        return make_field(scene.surface(config.gaussians, seed, config.sampling), config, cls)
+
+    def init(self, key: Key[Array, ""]) -> WidebandParams:
+        """Returns isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest
+        neighbours, in slots that leave density control some room, and random networks."""
+        return _init(self, key)
+
+    def plan(self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None) -> WidebandPlan:
+        """Returns the projected and sorted Gaussians, and what the networks make of them alone.
+
+        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
+        are needed under jit (`splat.geometry_plan`).
+        """
+        return self._plan(params, receiver, limits, None)
+
+    def _plan(
+        self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None, offset: Float[Array, "n 2"] | None
+    ) -> WidebandPlan:
+        check_receiver(receiver)
+        geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
+        frame = jax.lax.stop_gradient(self.frame)
+        return WidebandPlan(geometry, gaussian_features(params, frame, receiver, self.config), frame, receiver, self.config)
+
+    def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
+        """Returns the spectra of B queries."""
+        return Observation(render(params, plan, query))
+
+    def probe(self, params: WidebandParams) -> Float[Array, "n 2"]:
+        """Returns zero offsets (pixels) of the projected centres: density control watches their gradient."""
+        return jnp.zeros((params.gaussians.means.shape[0], 2))
+
+    def loss(
+        self, params: WidebandParams, cache: None, batch: Batch, limits: TileLimits | None = None, probe: Any = None
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the image loss of a batch (paper, equation 5)."""
+        planned = self._plan(params, batch.receiver, limits, probe)
+        loss, aux = compare(self.render(params, planned, batch.links.query), batch, self.config.ssim_weight)
+        jobs = planned.geometry.jobs
+        required = jnp.stack([jobs.required_entries, jobs.required_jobs])
+        return loss, aux._replace(required=required, overflow=jobs.overflow)
+
+    def limits(self, params: WidebandParams, receivers: Receiver) -> TileLimits:
+        """Returns tile limits that all of the receivers' plans keep, with room for footprints that grow."""
+        required = np.zeros(2, int)
+        for i in range(receivers.position.shape[0]):
+            receiver = jax.tree.map(lambda leaf, i=i: leaf[i], receivers)
+            jobs = geometry_plan(params.gaussians, receiver, None, self.config.projection).jobs
+            required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
+        return fit_limits(*required.tolist(), TILE_SLACK)
+
+    def grow(self, limits: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
+        """Returns limits that hold the required entries and jobs, and no less than before."""
+        grown = fit_limits(*(int(n) for n in required), TILE_SLACK)
+        return TileLimits(max(grown.entries, limits.entries), max(grown.jobs, limits.jobs))
+
+    def portable(self, plan: WidebandPlan) -> WidebandPlan:
+        """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
+        return dataclasses.replace(plan, features=None)
+
+    def sizes(self, params: WidebandParams) -> dict[str, int]:
+        """Returns the number of Gaussians."""
+        return {"gaussians": int(np.asarray(params.gaussians.alive).sum())}
+
+    @classmethod
+    def groups(cls, config: WidebandConfig) -> dict[str, Group]:
+        """Returns a group for the networks and one for every kind of parameter of the Gaussians."""
+        return {
+            "means": Group(config.means_lr),
+            "log_scales": Group(config.log_scales_lr),
+            "quats": Group(config.quats_lr),
+            "opacity_logits": Group(config.opacity_lr),
+            "networks": Group(config.network_lr, config.network_weight_decay, eps=1e-8),
+        }
+
+    @classmethod
+    def labels(cls, params: WidebandParams) -> Any:
+        """Returns the group of every parameter."""
+        networks = ["networks"] * len(jax.tree.leaves(params.networks))
+        return with_leaves(params, "means", "log_scales", "quats", "opacity_logits", *networks)
+
+
+def make_field(surface: Surface, config: WidebandConfig | None = None, cls: type[WidebandField] = WidebandField) -> WidebandField:
+    """Returns the field whose Gaussians start on surface points; raises for points of another shape."""
     check_surface(surface)
     low, high = surface.points.min(0), surface.points.max(0)
     frame = Frame(centre=(low + high) / 2, half_extent=jnp.max(high - low) / 2)
-    untrained = WidebandParams(_initial_gaussians(surface, capacity), {}, frame, config)
-    return dataclasses.replace(untrained, networks=_initial_networks(key, untrained))
+    return cls(surface, frame, config or WidebandConfig())
 
 
-def _initial_gaussians(surface: Surface, capacity: int | None) -> Gaussians:
+@jax.jit
+def _init(field: WidebandField, key: Key[Array, ""]) -> WidebandParams:
+    return WidebandParams(_initial_gaussians(field.surface), _initial_networks(key, field))
+
+
+def _initial_gaussians(surface: Surface) -> Gaussians:
     points = surface.points
     n = points.shape[0]
-    pad = (capacity or n) - n
-    if pad < 0:
-        raise ValueError(f"capacity {capacity} is smaller than the {n} points")
+    slots = slots_for(n)
+    pad = slots - n
     log_scales = jnp.broadcast_to(jnp.log(jnp.maximum(surface.spacing, 1e-3))[:, None], (n, 3))
     logit = jnp.log(INITIAL_ATTENUATION / (MAX_ATTENUATION - INITIAL_ATTENUATION))
     return Gaussians(
         means=jnp.pad(points, ((0, pad), (0, 0))),
         log_scales=jnp.pad(log_scales, ((0, pad), (0, 0))),
-        quats=jnp.zeros((n + pad, 4), points.dtype).at[:, 0].set(1),
-        opacity_logits=jnp.full((n + pad,), logit, points.dtype),
-        alive=(jnp.arange(n + pad) < n).astype(points.dtype),
+        quats=jnp.zeros((slots, 4), points.dtype).at[:, 0].set(1),
+        opacity_logits=jnp.where(jnp.arange(slots) < n, logit, -jnp.inf).astype(points.dtype),
     )
 
 
-def _initial_networks(key: Key[Array, ""], untrained: WidebandParams) -> dict[str, Any]:
-    """Initial weights; the inputs matter by their shapes only."""
-    centre = untrained.frame.centre
-    receiver = Receiver(centre, jnp.array([1.0, 0, 0, 0], centre.dtype), jnp.zeros((1, 3), centre.dtype))
-    gaussian, both, frequency = _inputs(untrained, receiver, Query(centre[None], jnp.full((1,), 1e9, centre.dtype)))
+def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, Any]:
+    """Returns initial weights; the inputs matter by their shapes only."""
+    config, points = field.config, field.surface.points
+    attenuation, radiance = make_networks(config)
+    gaussian = [positional_encoding(points, config.gaussian_octaves)[:, None, :]]
+    tx = [positional_encoding(points[:1], config.tx_octaves)[None]]
+    frequency = frequency_encoding(jnp.full((1,), 1e9, points.dtype), config.frequency_octaves, config.frequency_scale)[None]
+    relative = [jnp.zeros((len(points), 1, RELATIVE_FEATURES), points.dtype)] if config.relative else []
+    query = tx + relative + ([frequency] if config.attenuation_frequency else [])
     key_attenuation, key_radiance = jax.random.split(key)
-    attenuation_network, radiance_network = _networks(untrained.config)
     outputs: Any
-    outputs, attenuation = attenuation_network.init_with_output(key_attenuation, gaussian, both)
-    return {"attenuation": attenuation, "radiance": radiance_network.init(key_radiance, [outputs[0], *frequency])}
-
-
-def plan(
-    params: WidebandParams,
-    receiver: Receiver,
-    capacity: Capacity | None = None,
-    means2d_offset: Float[Array, "n 2"] | None = None,
-) -> WidebandPlan:
-    """Project and sort the Gaussians once for all queries (see `splat.geometry_plan` about `capacity`)."""
-    check_receiver(receiver)
-    return WidebandPlan(geometry_plan(params.gaussians, receiver, capacity, params.config.projection, means2d_offset), receiver)
+    outputs, weights = attenuation.init_with_output(key_attenuation, gaussian, query)
+    inputs = [outputs[0], *([frequency] if config.radiance_frequency else [])]
+    return {"attenuation": weights, "radiance": radiance.init(key_radiance, inputs)}
 
 
 def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Array, "b 90 360"]:
-    """Power angular spectra of B queries."""
+    """Returns the power angular spectra of B queries.
+
+    What the plan holds is a constant to gradients of this function: with `jax.grad` over parameters use `fields.pas`, which
+    plans inside.
+    """
     check_query(query)
-    attenuation, signal = em_features(params, plan.receiver, query)
+    attenuation, signal = em_features(params, plan, query)
     return render_splats(plan.geometry, attenuation, signal)
 
 
-def remember(params: WidebandParams, receiver: Receiver, tx_positions: Float[Array, "tx 3"]) -> None:
-    """Nothing: Gaussians move in every step."""
-
-
-def observe(
-    params: WidebandParams,
-    memory: None,
-    receiver: Receiver,
-    query: Query,
-    tx_index: Int[Array, "b"],
-    capacity: Capacity | None,
-    means2d_offset: Float[Array, "n 2"] | None,
-) -> Observation:
-    """The spectra of a training batch."""
-    planned = plan(params, receiver, capacity, means2d_offset)
-    return Observation(render(params, planned, query), jobs=planned.geometry.jobs)
-
-
-def sizes(params: WidebandParams) -> dict[str, int]:
-    """What decides the shapes of the parameters, besides the configuration."""
-    return {"gaussians": params.gaussians.means.shape[0]}
-
-
-def skeleton(config: WidebandConfig, sizes: dict[str, int]) -> WidebandParams:
-    """The shapes of parameters."""
-    n = sizes["gaussians"]
-    shaped: Any = jax.eval_shape(lambda: init(jax.random.key(0), Surface(jnp.zeros((n, 3)), jnp.zeros(n)), config, n))
-    return shaped
-
-
-def em_features(params: WidebandParams, receiver: Receiver, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
-    """Final attenuation delta and signal Sig of every Gaussian and query (paper, equations 1-3 and section 4.5)."""
-    attenuation_network, radiance_network = _networks(params.config)
-    gaussian, both, frequency = _inputs(params, receiver, query)
-    outputs: Any = attenuation_network.apply(params.networks["attenuation"], gaussian, both)
+def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
+    """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
+    4.5)."""
+    attenuation, radiance = make_networks(plan.config)
+    features = plan.features or gaussian_features(params, plan.frame, plan.receiver, plan.config)
+    both, frequency = _query_inputs(params.gaussians.means, features, plan, query)
+    outputs: Any = attenuation.apply(params.networks["attenuation"], features.sums, both, method="of_queries")
     hidden, delta_f = outputs
-    signal: Any = radiance_network.apply(params.networks["radiance"], [hidden, *frequency])
+    signal: Any = radiance.apply(params.networks["radiance"], [hidden, *frequency])
     delta = attenuation_activation(params.gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
     return delta, signal_activation(signal)
 
 
-def _networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
+def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
+    """Returns the EM feature networks."""
     attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion)
     return attenuation, RadianceNetwork(config.radiance_widths)
 
 
-def _inputs(
-    params: WidebandParams, receiver: Receiver, query: Query
-) -> tuple[list[Float[Array, "n 1 _"]], list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
-    """Encoded inputs: what depends on the Gaussian alone and the rest, for the attenuation network, and the frequency, for the
-    radiance network (empty if switched off)."""
-    config, frame = params.config, jax.lax.stop_gradient(params.frame)
+def gaussian_features(params: WidebandParams, frame: Frame, receiver: Receiver, config: WidebandConfig) -> GaussianFeatures:
+    """Returns what the networks' inputs need of every Gaussian, whatever is asked."""
     means = params.gaussians.means
-    scaled_means = (means - frame.centre) / frame.half_extent
+    encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)[:, None, :]
+    sums: Any = make_networks(config)[0].apply(params.networks["attenuation"], [encoded], method="gaussian_sums")
+    direction = to_local(means - receiver.position, receiver.orientation)
+    direction = direction / smooth_length(direction)
+    back = receiver.position - means
+    fixed = receiver.unit == "wavelengths"
+    steering = steering_vector(receiver.element_positions, direction) if fixed else None
+    return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
+
+
+def _query_inputs(
+    means: Float[Array, "n 3"], features: GaussianFeatures, plan: WidebandPlan, query: Query
+) -> tuple[list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
+    """Returns the encoded inputs that depend on the query: those of the attenuation network, and the frequency for the radiance
+    network (nothing if it is switched off)."""
+    config, frame = plan.config, plan.frame
     scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
-    gaussian = [positional_encoding(scaled_means, config.gaussian_octaves)[:, None, :]]
     both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
     if config.relative:
-        both.append(_relative_features(means, receiver, query, frame.half_extent))
+        both.append(_relative_features(means, features, plan.receiver, query, frame.half_extent))
     encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
     if config.attenuation_frequency:
         both.append(encoded)
-    return gaussian, both, [encoded] if config.radiance_frequency else []
+    return both, [encoded] if config.radiance_frequency else []
+
+
+RELATIVE_FEATURES = 7
 
 
 def _relative_features(
-    means: Float[Array, "n 3"], receiver: Receiver, query: Query, size: Float[Array, ""]
+    means: Float[Array, "n 3"], features: GaussianFeatures, receiver: Receiver, query: Query, size: Float[Array, ""]
 ) -> Float[Array, "n b 7"]:
-    """Functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
+    """Returns functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
 
     The angle between Gaussian and TX as the receiver sees it, the array's response to the TX in the Gaussian's direction (the
     line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
     """
-    to_g, to_tx = (to_local(p - receiver.position, receiver.orientation) for p in (means, query.tx_position))
-    to_g, to_tx = to_g / smooth_length(to_g), to_tx / smooth_length(to_tx)
-    response = array_response(receiver.element_positions, to_g, to_tx)
-    leg, back = query.tx_position[None] - means[:, None], receiver.position - means
+    to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
+    to_tx = to_tx / smooth_length(to_tx)
+    elements = receiver.element_wavelengths(query.frequency_hz)
+    response = array_response(elements, features.direction, to_tx, features.steering)
+    leg = query.tx_position[None] - means[:, None]
     distance = smooth_length(leg)
     direction = leg / distance
-    bounce = jnp.sum(direction * (back / smooth_length(back))[:, None], -1)
-    scalars = jnp.stack([to_g @ to_tx.T, response, bounce], -1)
+    bounce = jnp.sum(direction * features.back[:, None], -1)
+    scalars = jnp.stack([jnp.matmul(features.direction, to_tx.T, precision=EXACT), response, bounce], -1)
     return jnp.concatenate([scalars, distance / size, direction], -1)

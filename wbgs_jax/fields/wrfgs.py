@@ -6,21 +6,38 @@ It answers every frequency alike, so one model is trained a frequency. Everythin
 comparison is about the frequency and nothing else; docs/baselines.md says where that departs from the authors' system.
 """
 
-from jaxtyping import Array, Key
+import dataclasses
+from typing import ClassVar
 
-from wbgs_jax.config import WidebandConfig, without_frequency
-from wbgs_jax.fields import wideband
-from wbgs_jax.fields.wideband import STARTS_FROM, WidebandParams, observe, plan, remember, render, sizes
-from wbgs_jax.types import Surface
-
-__all__ = ["STARTS_FROM", "init", "observe", "plan", "remember", "render", "sizes", "skeleton"]
-
-
-def init(key: Key[Array, ""], surface: Surface, config: WidebandConfig, capacity: int | None = None) -> WidebandParams:
-    """Gaussians on the surface points, as the wideband field's, and networks that never see a frequency."""
-    return wideband.init(key, surface, without_frequency(config), capacity)
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.config import PRESETS
+from wbgs_jax.fields.base import register, with_field
+from wbgs_jax.fields.wideband import CONFIGS, DENSITY, WidebandConfig, WidebandField
+from wbgs_jax.types import Scene
 
 
-def skeleton(config: WidebandConfig, sizes: dict[str, int]) -> WidebandParams:
-    """The shapes of parameters."""
-    return wideband.skeleton(without_frequency(config), sizes)
+def without_frequency(config: WidebandConfig) -> WidebandConfig:
+    """Returns the same settings with both frequency embeddings switched off."""
+    return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False)
+
+
+@register
+@pytree
+class WrfgsField(WidebandField):
+    """The wideband field without a frequency."""
+
+    name: ClassVar[str] = "wrfgs"
+    presets: ClassVar = with_field(PRESETS, {name: without_frequency(c) for name, c in CONFIGS.items()}, density=DENSITY)
+
+    @classmethod
+    def check(cls, config: WidebandConfig) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        super().check(config)
+        if config != without_frequency(config):
+            raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
+
+    @classmethod
+    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+        """Returns the field of a scene; its networks never see a frequency."""
+        return super().make(without_frequency(config), scene, seed)

@@ -5,17 +5,18 @@
 
 from wbgs_jax.splat.project import Splats, project
 from wbgs_jax.splat.reference import render_dense
-from wbgs_jax.splat.render import GeometryPlan, geometry_plan, measure_capacity, render_splats
-from wbgs_jax.splat.tiles import Capacity, fit_capacity
+from wbgs_jax.splat.render import GeometryPlan, geometry_plan, measure_limits, render_splats
+from wbgs_jax.splat.tiles import TileLimits, fit_limits, slots_for
 
 __all__ = [
-    "Capacity",
     "GeometryPlan",
     "Splats",
-    "fit_capacity",
+    "TileLimits",
+    "fit_limits",
     "geometry_plan",
-    "measure_capacity",
+    "measure_limits",
     "project",
     "render_dense",
     "render_splats",
+    "slots_for",
 ]

@@ -18,8 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Shaped
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.geometry import AZIMUTH_PERIOD
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.footprint import footprint, mahalanobis2, windowed_exponential
 from wbgs_jax.splat.tiles import CHUNK, N_TILES, TILE_COLUMNS, TILE_HEIGHT, TILE_ROWS, TILE_WIDTH, TileJobs
 
@@ -29,7 +29,7 @@ TILE_GROUP = 25
 small step between threads, which costs more than it gains. Divides `N_TILES`."""
 JOB_GROUPS = 8
 """Elsewhere all jobs go in this many groups: large ones fill the device, one alone would need the memory of all footprints.
-Divides every capacity."""
+Divides the jobs of all limits."""
 
 
 def composite(
@@ -39,12 +39,23 @@ def composite(
     signal: Float[Array, "n b"],
     jobs: TileJobs,
 ) -> Float[Array, "b 90 360"]:
-    """Blend N splats for B queries. `attenuation` (delta) must lie in [0, 1); `jobs` must not have overflowed.
+    """Returns N splats blended for B queries. `attenuation` (delta) must lie in [0, 1); `jobs` must not have overflowed.
 
     Differentiable once, in reverse mode, with respect to the four float arguments.
+
+    Raises:
+        TypeError: forward-mode differentiation, which the hand-written backward pass does not allow.
     """
     geometry = jnp.concatenate([means2d, conics], -1)
-    tiles = lax.platform_dependent(geometry, attenuation, signal, jobs, cpu=_by_tiles, default=_by_jobs)
+    try:
+        tiles = lax.platform_dependent(geometry, attenuation, signal, jobs, cpu=_by_tiles, default=_by_jobs)
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise TypeError(
+            "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, "
+            "jax.jacfwd or jax.linearize, and no second derivatives"
+        ) from error
     grid = tiles.reshape(TILE_ROWS, TILE_COLUMNS, -1, TILE_HEIGHT, TILE_WIDTH)
     return grid.transpose(2, 0, 3, 1, 4).reshape(-1, PAS_HEIGHT, PAS_WIDTH)
 

@@ -9,7 +9,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wbgs_jax.geometry import AZIMUTH_PERIOD
+from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.project import SUPPORT
 
 CUT = SUPPORT**2

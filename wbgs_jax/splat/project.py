@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wbgs_jax.geometry import (
+from wbgs_jax.radio.array import EXACT
+from wbgs_jax.radio.geometry import (
     AZIMUTH_PERIOD,
     Projection,
     angles_to_pixel,
@@ -24,7 +25,7 @@ from wbgs_jax.geometry import (
     pixels_per_radian,
     to_local,
 )
-from wbgs_jax.pytree import pytree
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.types import Gaussians, Receiver
 
 SUPPORT = 3.0
@@ -44,11 +45,11 @@ class Splats:
     means2d: Float[Array, "n 2"]
     """Pixel coordinates (x: column in 0..359, y: row; y > 89 lies below the horizon)."""
     conics: Float[Array, "n 3"]
-    """Inverse 2D covariance (xx, xy, yy), 1 / px^2. A dead Gaussian has zeros."""
+    """Inverse 2D covariance (xx, xy, yy), 1 / px^2. An empty slot has zeros."""
     depths: Float[Array, "n"]
-    """Distance to the receiver, metres; infinite for a dead Gaussian."""
+    """Distance to the receiver, metres; infinite for an empty slot."""
     radii: Float[Array, "n 2"]
-    """Half extents (x, y) of the footprint's bounding box, pixels, without gradient; negative for a dead Gaussian."""
+    """Half extents (x, y) of the footprint's bounding box, pixels, without gradient; negative for an empty slot."""
 
 
 def jacobian(local: Float[Array, "n 3"], projection: Projection) -> Float[Array, "n 2 3"]:
@@ -69,21 +70,21 @@ def project(
     projection: Projection = "hemisphere",
     means2d_offset: Float[Array, "n 2"] | None = None,
 ) -> Splats:
-    """Project Gaussians onto the PAS of a receiver.
+    """Returns Gaussians projected onto the PAS of a receiver.
 
     `means2d_offset` (pixels, normally zeros) is added to the centres: its gradient is the positional gradient that density
-    control needs (DESIGN: a probe, not a side effect).
+    control needs.
     """
     local = to_local(gaussians.means - receiver.position, receiver.orientation)
-    # Dead entries are moved to a harmless place so that neither values nor gradients of theirs can be NaN.
-    alive = gaussians.alive[:, None] > 0
+    # Empty slots are moved to a harmless place so that neither values nor gradients of theirs can be NaN.
+    alive = gaussians.alive[:, None]
     local = _off_axis(jnp.where(alive, local, jnp.ones_like(local)))
     factor = covariance_factor(jnp.where(alive, gaussians.log_scales, 0), jnp.where(alive, gaussians.quats, 1))
     factor = to_local_matrix(factor, receiver.orientation)
     means2d = angles_to_pixel(*direction_to_angles(local), projection)
     if means2d_offset is not None:
         means2d = means2d + means2d_offset
-    spread = jnp.einsum("nij,njk->nik", jacobian(local, projection), factor)
+    spread = jnp.einsum("nij,njk->nik", jacobian(local, projection), factor, precision=EXACT)
     spread = _cap_azimuth(spread)
     xx, xy, yy, determinant = _covariance2d(spread)
     conics = jnp.stack([yy, -xy, xx], -1) / determinant[:, None]
@@ -97,7 +98,7 @@ def project(
 
 
 def to_local_matrix(factor: Float[Array, "n 3 3"], orientation: Float[Array, "4"]) -> Float[Array, "n 3 3"]:
-    """Rotate the columns of world-frame matrices into the local frame."""
+    """Returns world-frame matrices with their columns rotated into the local frame."""
     return jnp.swapaxes(to_local(jnp.swapaxes(factor, -1, -2), orientation), -1, -2)
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.splat.footprint import footprint, mahalanobis2, wrap_azimuth
 from wbgs_jax.splat.project import Splats
 

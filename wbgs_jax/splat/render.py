@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wbgs_jax.checks import check_array
-from wbgs_jax.geometry import Projection
-from wbgs_jax.pytree import pytree
+from wbgs_jax._util.checks import check_array
+from wbgs_jax.radio.geometry import Projection
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.splat.composite import composite
 from wbgs_jax.splat.project import Splats, project
-from wbgs_jax.splat.tiles import Capacity, TileJobs, build_tile_jobs, fit_capacity
+from wbgs_jax.splat.tiles import TileJobs, TileLimits, build_tile_jobs, fit_limits
 from wbgs_jax.types import Gaussians, Receiver
 
 
@@ -28,38 +28,39 @@ class GeometryPlan:
 def geometry_plan(
     gaussians: Gaussians,
     receiver: Receiver,
-    capacity: Capacity | None = None,
+    limits: TileLimits | None = None,
     projection: Projection = "hemisphere",
     means2d_offset: Float[Array, "n 2"] | None = None,
 ) -> GeometryPlan:
-    """Project and sort the Gaussians.
+    """Returns the projected and sorted Gaussians.
 
-    Without `capacity` the tile lists are sized on the host (not under jit). With it the call is pure and jittable, and the
+    Gradients reach the Gaussians through a plan only where it is made inside the differentiated function; order and tile lists
+    carry none. Without `limits` the tile lists are sized on the host (not under jit). With it the call is pure and jittable, and the
     caller must look at `plan.jobs.overflow`.
     """
     splats = project(gaussians, receiver, projection, means2d_offset)
-    if capacity is None:
-        capacity = measure_capacity(splats)
-    return GeometryPlan(splats, build_tile_jobs(splats, capacity))
+    if limits is None:
+        limits = measure_limits(splats)
+    return GeometryPlan(splats, build_tile_jobs(splats, limits))
 
 
-def measure_capacity(splats: Splats, slack: float = 1.25) -> Capacity:
-    """The capacity that splats need, found on the host by building the lists until they fit."""
+def measure_limits(splats: Splats, slack: float = 1.25) -> TileLimits:
+    """Returns the limits that splats need, found on the host by building the lists until they fit."""
     if isinstance(splats.depths, jax.core.Tracer):
-        raise ValueError("the tile lists cannot be sized under jit: pass capacity=..., found outside with measure_capacity")
-    capacity = fit_capacity(0, 0)
+        raise ValueError("the tile lists cannot be sized under jit: pass limits=..., found outside with measure_limits")
+    limits = fit_limits(0, 0)
     while True:
-        jobs = build_tile_jobs(splats, capacity)
-        fitted = fit_capacity(int(jobs.required_entries), int(jobs.required_jobs), slack)
+        jobs = build_tile_jobs(splats, limits)
+        fitted = fit_limits(int(jobs.required_entries), int(jobs.required_jobs), slack)
         if not jobs.overflow:
             return fitted
-        capacity = Capacity(max(capacity.entries, fitted.entries), max(capacity.jobs, fitted.jobs))
+        limits = TileLimits(max(limits.entries, fitted.entries), max(limits.jobs, fitted.jobs))
 
 
 def render_splats(
     plan: GeometryPlan, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]
 ) -> Float[Array, "b 90 360"]:
-    """Blend the plan's Gaussians for B queries: attenuation (delta, [0, 1)) and signal (Sig) per Gaussian and query.
+    """Returns the plan's Gaussians blended for B queries: attenuation (delta, [0, 1)) and signal (Sig) per Gaussian and query.
 
     An overflowed plan renders NaN, never a wrong image.
     """

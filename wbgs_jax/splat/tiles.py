@@ -1,9 +1,10 @@
 """Which Gaussians touch which tile, near to far: one sort of (tile, depth rank) keys, cut into jobs of equal length.
 
-Capacities are static so that the step compiles once. What does not fit is never dropped silently: `TileJobs` carries the
-required counts and an overflow flag, the caller throws the result away and repeats with a larger `Capacity`.
+The limits are static so that the step compiles once. What does not fit is never dropped silently: `TileJobs` carries the
+required counts and an overflow flag, the caller throws the result away and repeats with larger `TileLimits`.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -12,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.geometry import AZIMUTH_PERIOD
-from wbgs_jax.pytree import pytree
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.splat.footprint import CUT
 from wbgs_jax.splat.project import Splats
 
@@ -27,8 +28,8 @@ NO_ENTRY = jnp.uint32(0xFFFFFFFF)
 
 
 @dataclass(frozen=True)
-class Capacity:
-    """Static sizes of the tile lists."""
+class TileLimits:
+    """Static sizes of the tile lists: what a plan may require of them."""
 
     entries: int
     """(Gaussian, tile) pairs before culling."""
@@ -68,9 +69,9 @@ class _Boxes:
     alias_columns: Int[Array, "n"]
 
 
-@partial(jax.jit, static_argnames="capacity")
-def build_tile_jobs(splats: Splats, capacity: Capacity) -> TileJobs:
-    """Sort splats into tiles. Works under jit; carries no gradient."""
+@partial(jax.jit, static_argnames="limits")
+def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
+    """Returns splats sorted into tiles. Works under jit; carries no gradient."""
     n = splats.depths.shape[0]
     if n * N_TILES >= 2**32 - 1:
         raise ValueError(f"{n} Gaussians are too many for a 32-bit (tile, depth) key; the most is {(2**32 - 2) // N_TILES}")
@@ -78,10 +79,10 @@ def build_tile_jobs(splats: Splats, capacity: Capacity) -> TileJobs:
     order = jnp.argsort(splats.depths).astype(jnp.int32)
     means, conics, radii = splats.means2d[order], splats.conics[order], splats.radii[order]
     boxes = _tile_boxes(means, radii)
-    keys, required_entries = _sorted_keys(means, conics, boxes, capacity.entries)
+    keys, required_entries = _sorted_keys(means, conics, boxes, limits.entries)
     starts = jnp.searchsorted(keys, jnp.arange(N_TILES + 1, dtype=jnp.uint32) * jnp.uint32(n)).astype(jnp.int32)
     ranked = order[jnp.minimum(keys % jnp.uint32(n), n - 1).astype(jnp.int32)]
-    return _cut_into_jobs(ranked, starts, required_entries, capacity)
+    return _cut_into_jobs(ranked, starts, required_entries, limits)
 
 
 def _tile_range(
@@ -104,15 +105,15 @@ def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"]) -> _Boxe
 
 
 def _sorted_keys(
-    means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, capacity: int
+    means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, entries: int
 ) -> tuple[UInt32[Array, "entries"], Int[Array, ""]]:
     """Sorted keys tile * n + depth rank of all (splat, tile) pairs whose footprints overlap; `NO_ENTRY` in the rest."""
     n = means.shape[0]
     width = boxes.columns + boxes.alias_columns
     count = width * boxes.rows
     end = jnp.cumsum(count)
-    entry = jnp.arange(capacity, dtype=jnp.int32)
-    rank = jnp.repeat(jnp.arange(n, dtype=jnp.int32), count, total_repeat_length=capacity)
+    entry = jnp.arange(entries, dtype=jnp.int32)
+    rank = jnp.repeat(jnp.arange(n, dtype=jnp.int32), count, total_repeat_length=entries)
     local = entry - (end - count)[rank]
     row = boxes.row0[rank] + local // jnp.maximum(width[rank], 1)
     step = local % jnp.maximum(width[rank], 1)
@@ -145,25 +146,31 @@ def _nearest_mahalanobis2(left: Float[Array, "e"], top: Float[Array, "e"], conic
 
 
 def _cut_into_jobs(
-    ranked: Int[Array, "entries"], starts: Int[Array, "tiles_1"], required_entries: Int[Array, ""], capacity: Capacity
+    ranked: Int[Array, "entries"], starts: Int[Array, "tiles_1"], required_entries: Int[Array, ""], limits: TileLimits
 ) -> TileJobs:
     count = -(-(starts[1:] - starts[:-1]) // CHUNK)
     end = jnp.cumsum(count)
-    job = jnp.arange(capacity.jobs, dtype=jnp.int32)
-    tile = jnp.repeat(jnp.arange(N_TILES, dtype=jnp.int32), count, total_repeat_length=capacity.jobs)
+    job = jnp.arange(limits.jobs, dtype=jnp.int32)
+    tile = jnp.repeat(jnp.arange(N_TILES, dtype=jnp.int32), count, total_repeat_length=limits.jobs)
     index_in_tile = job - (end - count)[tile]
     entry = starts[tile][:, None] + index_in_tile[:, None] * CHUNK + jnp.arange(CHUNK)
     live = (job < end[-1])[:, None] & (entry < starts[tile + 1][:, None])
     gaussian = jnp.where(live, ranked[jnp.minimum(entry, ranked.shape[0] - 1)], -1)
-    overflow = (required_entries > capacity.entries) | (end[-1] > capacity.jobs)
+    overflow = (required_entries > limits.entries) | (end[-1] > limits.jobs)
     return TileJobs(gaussian, tile, end - count, count, required_entries, end[-1], overflow)
 
 
-def fit_capacity(required_entries: int, required_jobs: int, slack: float = 1.25) -> Capacity:
-    """A capacity from geometric buckets that holds the counts with some slack, so that small changes do not recompile."""
+def fit_limits(required_entries: int, required_jobs: int, slack: float = 1.25) -> TileLimits:
+    """Returns limits from geometric buckets that hold the counts with some slack, so that small changes do not recompile."""
 
     def bucket(count: int, smallest: int) -> int:
         steps = math.ceil(math.log2(max(count * slack, smallest) / smallest) * 2)
         return -(-int(smallest * 2 ** (steps / 2)) // 256) * 256
 
-    return Capacity(entries=bucket(required_entries, 4096), jobs=bucket(required_jobs, 1024))
+    return TileLimits(entries=bucket(required_entries, 4096), jobs=bucket(required_jobs, 1024))
+
+
+def slots_for(gaussians: int) -> int:
+    """Returns the number of slots that hold so many Gaussians; it grows by 2^(1/4) from 64, so that few changes recompile."""
+    sizes = (-(-int(64 * 2 ** (step / 4)) // 16) * 16 for step in itertools.count())
+    return next(size for size in sizes if size >= gaussians)

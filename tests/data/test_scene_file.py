@@ -1,0 +1,332 @@
+"""The scene file: what goes in comes out, in every format, and nothing that is not a scene is believed."""
+
+import dataclasses
+import hashlib
+import json
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic import tiny_scene
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data import load_dataset, released_scenes, scene_dataset
+from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
+from wbgs_jax.radio.array import planar_array
+
+CARD = Path(__file__).parents[2] / "docs" / "dataset.md"
+
+
+@pytest.fixture
+def scene(rng):
+    n_tx, n_freq = 5, 3
+    return SceneFile(
+        name="den",
+        snapshots=rng.normal(size=(n_tx, 1, n_freq, 32)).view(complex).astype(np.complex64),
+        tx_positions=rng.normal(size=(n_tx, 3)),
+        frequencies_hz=np.array([1e9, 2.4e9, 94e9]),
+        rx_position=np.array([[2.0, 1.0, 0.5]]),
+        rx_orientation=np.array([[0.5, -0.5, 0.5, 0.5]]),
+        element_positions=planar_array()[None],
+        element_pattern="tr38901",
+        vertices=rng.normal(size=(6, 3)).astype(np.float32),
+        faces=rng.integers(0, 6, (4, 3)).astype(np.int32),
+        face_part=np.array([0, 0, 1, 1], np.int32),
+        split=np.array([0, 1, 0, 2, 1], np.int8),
+        meta={"seed": 7, "parts": [{"name": "floor", "material": "wood"}, {"name": "wall", "material": "brick"}]},
+    )
+
+
+@pytest.fixture(scope="module", params=["snapshot", "pas", "power"])
+def three(request):
+    """Three receivers with arrays of fixed size and patterns of their own, observed in every kind."""
+    scene = tiny_scene(4, n_rx=3, kind=request.param, unit="metres")
+    return dataclasses.replace(scene, element_pattern=("tr38901", "iso", ""), split=np.array([0, 0, 2, 1], np.int8))
+
+
+ARRAYS = [f.name for f in dataclasses.fields(SceneFile) if f.name not in ("name", "meta")]
+
+
+def assert_same(again, scene):
+    for key in ARRAYS:
+        found, expected = getattr(again, key), getattr(scene, key)
+        if isinstance(expected, np.ndarray):
+            np.testing.assert_array_equal(found, expected)
+            assert found.dtype == expected.dtype
+        else:
+            assert found == expected
+    assert again.name == scene.name
+    assert scene.meta.items() <= again.meta.items()
+
+
+def test_round_trip(tmp_path, scene):
+    save_scene(tmp_path / "s.npz", scene)
+    assert_same(load_scene(tmp_path / "s.npz"), scene)
+
+
+def test_round_trip_of_several_receivers(tmp_path, three):
+    save_scene(tmp_path / "s.npz", three)
+    assert_same(load_scene(tmp_path / "s.npz"), three)
+    dataset = load_dataset(tmp_path / "s.npz")
+    assert (dataset.n_receivers, len(dataset), dataset.receivers.unit) == (3, 4 * 3 * 3, "metres")
+    assert dataset.receivers.pattern_exponent.tolist() == [1, 0, 0]
+
+
+def test_a_renamed_scene_keeps_its_new_name(tmp_path, scene):
+    save_scene(tmp_path / "s.npz", scene)
+    save_scene(tmp_path / "t.npz", dataclasses.replace(load_scene(tmp_path / "s.npz"), name="loft"))
+    assert load_scene(tmp_path / "t.npz").name == "loft"
+
+
+def test_equal_scenes_give_equal_bytes(tmp_path, scene):
+    for name in ("a.npz", "b.npz"):
+        save_scene(tmp_path / name, scene)
+    save_scene(tmp_path / "c.npz", load_scene(tmp_path / "a.npz"))
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes() == (tmp_path / "c.npz").read_bytes()
+
+
+def test_a_scene_needs_no_mesh(tmp_path, scene):
+    bare = dataclasses.replace(
+        scene, vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32), face_part=np.zeros(0, np.int32)
+    )
+    save_scene(tmp_path / "s.npz", bare)
+    assert load_scene(tmp_path / "s.npz").faces.shape == (0, 3)
+
+
+def test_links_are_transmitter_major(scene):
+    dataset = scene_dataset(scene)
+    assert len(dataset) == 15 and dataset.n_receivers == 1
+    for i in range(15):
+        tx, freq = divmod(i, 3)
+        np.testing.assert_array_equal(dataset.snapshots[i], scene.snapshots[tx, 0, freq])
+        np.testing.assert_array_equal(dataset.tx_positions[i], scene.tx_positions[tx])
+        assert dataset.frequencies_hz[i] == scene.frequencies_hz[freq]
+        assert dataset.tx_index[i] == tx
+    assert dataset.train.tolist() == [0, 1, 2, 6, 7, 8]
+    assert dataset.validation.tolist() == [9, 10, 11]
+    assert dataset.test.tolist() == [3, 4, 5, 12, 13, 14]
+    np.testing.assert_array_equal(dataset.receivers.orientation, scene.rx_orientation)
+    np.testing.assert_array_equal(dataset.face_part, scene.face_part)
+    assert dataset.materials.names == ("brick 0", "wood 0") and dataset.materials.material.tolist() == [1, 1, 0, 0]
+
+
+def test_links_of_several_receivers_go_transmitter_receiver_frequency(three):
+    dataset = scene_dataset(three)
+    observed = next(v for v in (dataset.snapshots, dataset.images, dataset.power_db) if v is not None)
+    for i in range(len(dataset)):
+        tx, rx, freq = np.unravel_index(i, (4, 3, 3))
+        np.testing.assert_array_equal(observed[i], three.observations[tx, rx, freq])
+        np.testing.assert_array_equal(dataset.tx_positions[i], three.tx_positions[tx])
+        assert (dataset.receiver_index[i], dataset.tx_index[i]) == (rx, tx)
+        assert dataset.frequencies_hz[i] == three.frequencies_hz[freq]
+    for part, transmitters in (("train", [0, 1]), ("validation", [2]), ("test", [3])):
+        np.testing.assert_array_equal(getattr(dataset, part), np.flatnonzero(np.isin(dataset.tx_index, transmitters)))
+    for i, orientation in enumerate(three.rx_orientation):
+        np.testing.assert_allclose(dataset.receiver(i).orientation, orientation, atol=1e-7)
+        np.testing.assert_array_equal(dataset.receiver(i).element_positions, np.float32(three.element_positions[i]))
+
+
+def test_what_a_receiver_does_not_hear_is_no_link(tmp_path):
+    scene = tiny_scene(4, n_rx=3, kind="power")
+    scene.power_db[1], scene.power_db[0, 2, 1] = np.nan, np.nan
+    save_scene(tmp_path / "s.npz", scene)
+    dataset = load_dataset(tmp_path / "s.npz")
+    assert len(dataset) == 3 * 3 * 3 - 1 and np.isfinite(dataset.power_db).all()
+    assert set(dataset.tx_index) == {0, 1, 2}
+    np.testing.assert_array_equal(dataset.tx_positions[dataset.tx_index == 1][0], scene.tx_positions[2])
+    assert dataset.receiver_index[dataset.tx_index == 0].tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
+
+
+def test_scenes_are_found_by_number_and_by_path(tmp_path, scene, monkeypatch):
+    monkeypatch.setenv("WBGS_DATA", str(tmp_path))
+    for number in (1, 2, 10):
+        save_scene(tmp_path / f"scene{number}.npz", dataclasses.replace(scene, name=f"number {number}"))
+    assert load_dataset("2").name == load_dataset(2).name == load_dataset(tmp_path / "scene2.npz").name == "number 2"
+    for unknown in ("3", 3, "den", "no/such/folder"):
+        with pytest.raises(UserError, match=r"1, 2, 10") as error:
+            load_dataset(unknown)
+        assert str(unknown) in str(error.value)
+
+
+def test_without_any_scene_the_message_says_how_to_get_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("WBGS_DATA", str(tmp_path))
+    with pytest.raises(UserError, match="make data"):
+        load_dataset("1")
+
+
+def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
+    monkeypatch.delenv("WBGS_DATA", raising=False)
+    with pytest.raises(UserError, match="scene 'nowhere'"):
+        load_dataset("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains NaN"),
+        ("snapshots", np.full((5, 1, 3, 16), 1e300), "snapshots contains NaN or infinity"),
+        ("snapshots", np.zeros((5, 3, 16), np.complex64), "snapshots must be a 4-D complex64"),
+        ("snapshots", np.zeros((5, 1, 3, 16), "U1"), "snapshots must be a 4-D complex64"),
+        ("snapshots", None, "it holds none of snapshots, pas, power_db"),
+        ("power_db", np.zeros((5, 1, 3), np.float32), "it holds snapshots and power_db"),
+        ("tx_positions", np.full((5, 3), 1j), "tx_positions must be a 2-D float64"),
+        ("tx_positions", np.full((5, 3), np.inf), "tx_positions contains NaN"),
+        ("tx_positions", np.zeros((4, 3)), "tx_positions has shape"),
+        ("frequencies_hz", np.array([1e9, 2e9]), "frequencies_hz has shape"),
+        ("frequencies_hz", np.array([1e9, 0, 2e9]), "positive"),
+        ("rx_orientation", np.array([[1.0, 1, 0, 0]]), "unit quaternion"),
+        ("rx_position", np.zeros((2, 3)), "rx_position has shape"),
+        ("element_positions", np.zeros((1, 15, 3)), "element_positions has shape"),
+        ("element_unit", "cm", "element_unit must be wavelengths or metres"),
+        ("element_pattern", ("iso", "iso"), "element_pattern must be a name, or one a receiver"),
+        ("element_pattern", 3, "element_pattern must be a name, or one a receiver"),
+        ("faces", np.array([[0, 1, 6]] * 4, np.int32), "do not exist"),
+        ("faces", np.array([[0, 1, -1]] * 4, np.int32), "do not exist"),
+        ("face_part", np.zeros(3, np.int32), "face_part has shape"),
+        ("split", np.array([0, 1, 3, 0, 0], np.int8), "split must hold"),
+        ("split", np.array([0, 1, 256, 0, 0]), "split must hold"),
+    ],
+)
+def test_a_scene_that_is_none_is_not_written(tmp_path, scene, key, value, message):
+    # Past the type checker, which the shapes would not pass: users run without it.
+    broken = dataclasses.replace(scene)
+    object.__setattr__(broken, key, value)
+    with pytest.raises(UserError, match=message) as error:
+        save_scene(tmp_path / "s.npz", broken)
+    assert "s.npz" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert ";" in str(error.value), "says what to do after the semicolon"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "message"),
+    [
+        ("pas", np.ones((4, 1, 3, 90, 360), np.float32), "pas must be a 5-D uint8"),
+        ("pas", np.ones((4, 1, 3, 360, 90), np.uint8), "pas has shape"),
+        ("pas", np.ones((4, 2, 3, 90, 360), np.uint8), "element_positions has shape"),
+        ("power_db", np.full((4, 1, 3), -np.inf, np.float32), "power_db contains infinity"),
+        ("power_db", np.full((4, 1, 3), np.nan, np.float32), "or NaN alone"),
+        ("power_db", np.zeros((4, 0, 3), np.float32), "element_positions has shape"),
+    ],
+)
+def test_spectra_and_powers_that_are_none_are_not_written(tmp_path, kind, value, message):
+    scene = tiny_scene(4, kind="power")
+    object.__setattr__(scene, "power_db", None)
+    object.__setattr__(scene, kind, value)
+    with pytest.raises(UserError, match=message):
+        save_scene(tmp_path / "s.npz", scene)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(UserError, match=r"scene9\.npz.*No such file"):
+        load_scene(tmp_path / "scene9.npz")
+
+
+def test_truncated_anywhere(tmp_path, scene, rng):
+    save_scene(tmp_path / "s.npz", scene)
+    content = (tmp_path / "s.npz").read_bytes()
+    for length in [0, *rng.integers(0, len(content), 30)]:
+        (tmp_path / "cut.npz").write_bytes(content[:length])
+        with pytest.raises(UserError, match=r"cut\.npz"):
+            load_scene(tmp_path / "cut.npz")
+
+
+def save_format_1(path, scene):
+    """Writes a scene of one receiver as the first version of this package did."""
+    (array,) = (getattr(scene, key)[0] for key in ("element_positions",))
+    arrays = {
+        "snapshots": scene.snapshots[:, 0], "tx_positions": scene.tx_positions, "frequencies_hz": scene.frequencies_hz,
+        "rx_position": scene.rx_position[0], "rx_orientation": scene.rx_orientation[0], "element_positions": array,
+        "vertices": scene.vertices, "faces": scene.faces, "face_part": scene.face_part, "split": scene.split,
+    }  # fmt: skip
+    meta = scene.meta | {"format": 1, "name": scene.name, "rx_array": {"rows": 4, "pattern": scene.element_pattern}}
+    np.savez_compressed(path, **arrays, meta=np.array(json.dumps(meta)))
+
+
+def test_format_1_is_read(tmp_path, scene):
+    save_format_1(tmp_path / "one.npz", scene)
+    again = load_scene(tmp_path / "one.npz")
+    assert_same(again, scene)
+    assert again.meta["format"] == 1
+    save_scene(tmp_path / "two.npz", again)
+    assert_same(load_scene(tmp_path / "two.npz"), scene)
+    assert load_scene(tmp_path / "two.npz").meta["format"] == 2
+
+
+@pytest.mark.parametrize("array", [{}, None, 3, {"rows": 4}])
+def test_format_1_need_not_know_its_element_pattern(tmp_path, scene, array):
+    save_format_1(tmp_path / "s.npz", dataclasses.replace(scene, element_pattern=""))
+    with np.load(tmp_path / "s.npz") as archive:
+        arrays = dict(archive)
+    meta = json.loads(str(arrays["meta"]))
+    del meta["rx_array"]
+    arrays["meta"] = np.array(json.dumps(meta | ({} if array is None else {"rx_array": array})))
+    np.savez(tmp_path / "s.npz", **arrays)
+    assert load_scene(tmp_path / "s.npz").element_pattern == ""
+    assert load_dataset(tmp_path / "s.npz").receivers.pattern_exponent.tolist() == [0]
+
+
+def test_format_1_has_snapshots_only(tmp_path, scene):
+    save_format_1(tmp_path / "s.npz", scene)
+    with np.load(tmp_path / "s.npz") as archive:
+        arrays = dict(archive)
+    for key, value in (("snapshots", np.float64(1)), ("rx_position", np.zeros((1, 3))), ("split", np.zeros(3, np.int8))):
+        np.savez(tmp_path / "bad.npz", **arrays | {key: value})
+        with pytest.raises(UserError, match=rf"bad\.npz: {key}"):
+            load_scene(tmp_path / "bad.npz")
+
+
+def test_released_files_are_those_of_the_dataset_card(monkeypatch):
+    monkeypatch.delenv("WBGS_DATA", raising=False)
+    card = dict(re.findall(r"\| (scene\w+)\.npz \|.*`([0-9a-f]{16})` \|", CARD.read_text()))
+    files = released_scenes()
+    assert {f"scene{number}" for number in files} == set(card)
+    for number, file in files.items():
+        assert hashlib.sha256(file.read_bytes()).hexdigest()[:16] == card[f"scene{number}"]
+        scene = load_scene(file)
+        assert scene.snapshots.shape[1:] == (1, len(scene.frequencies_hz), 16) and scene.meta["format"] == 1
+        assert (scene.element_unit, scene.element_pattern) == ("wavelengths", "tr38901")
+
+
+@pytest.mark.parametrize("save", [save_scene, save_format_1])
+def test_damaged_anywhere(tmp_path, scene, rng, save):
+    """A flipped byte is either noticed or harmless: never a traceback."""
+    save(tmp_path / "s.npz", scene)
+    content = (tmp_path / "s.npz").read_bytes()
+    for place in rng.integers(0, len(content), 200):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        (tmp_path / "bad.npz").write_bytes(damaged)
+        try:
+            again = load_scene(tmp_path / "bad.npz")
+        except UserError as error:
+            assert "bad.npz" in str(error)
+        else:
+            assert_same(again, scene)
+
+
+def test_other_files_are_not_scenes(tmp_path, scene):
+    (tmp_path / "text.npz").write_text("hello")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    np.savez(tmp_path / "pickle.npz", snapshots=np.array([{}], object))
+    for name in ("text.npz", "array.npz", "other.npz", "pickle.npz"):
+        with pytest.raises(UserError, match=name):
+            load_scene(tmp_path / name)
+
+
+@pytest.mark.parametrize("meta", ["{", "[]", "{}", json.dumps({"format": 99})])
+def test_a_wrong_format(tmp_path, scene, meta):
+    save_scene(tmp_path / "s.npz", scene)
+    with zipfile.ZipFile(tmp_path / "s.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    np.save(tmp_path / "meta.npy", np.array(meta))
+    with zipfile.ZipFile(tmp_path / "s.npz", "w") as archive:
+        for name, content in (members | {"meta.npy": (tmp_path / "meta.npy").read_bytes()}).items():
+            archive.writestr(name, content)
+    with pytest.raises(UserError, match=r"s\.npz"):
+        load_scene(tmp_path / "s.npz")

@@ -1,0 +1,165 @@
+"""The NeRF2-style volume: closed forms of the accumulation, rays in a box, sampled directions, training and checkpoints."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_dataset, tiny_scene, tiny_settings
+
+from wbgs_jax import train as train_command
+from wbgs_jax.radio.array import PAS_SHAPE, pas_directions
+from wbgs_jax.config import Nerf2Config, Settings, check
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.fields import SampledField, get_field, nerf2, wideband
+from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.step import loss_and_gradients, training_data
+from wbgs_jax.training.loop import Run, train
+from wbgs_jax.types import Query, make_query, make_receiver
+
+BOX = np.array([[-3.0, -2, 0], [3, 2.5, 2.8]], np.float32)
+RECEIVER = make_receiver([0.3, -0.2, 1.0], [0.9, 0.1, -0.3, 0.2])
+CONFIG = {"samples": 6, "directions": 40, "width": 8, "depth": 3, "skip": 1, "radiance_widths": (8,)}
+SETTINGS = tiny_settings(nerf2=CONFIG, optim={"steps": 60, "network_lr": 1e-2}, loop={"epoch_steps": 20, "evaluate_every": 60})
+QUERY = make_query([[1.0, 2, 1.5], [-1, 0.5, 2]], [2.4e9, 60e9])
+
+pytestmark = pytest.mark.usefixtures("compile_once")
+
+
+def make_params(rng, **changes):
+    """Every weight drawn anew: nothing is zero by its initialiser."""
+    params = nerf2.init(jax.random.key(0), jnp.asarray(BOX), dataclasses.replace(SETTINGS.nerf2, **changes))
+    networks = jax.tree.map(lambda a: jnp.asarray(rng.normal(0, 0.4, a.shape), jnp.float32), params.networks)
+    return dataclasses.replace(params, networks=networks)
+
+
+def test_a_single_opaque_shell_returns_its_radiance(rng, x64):
+    signal = rng.random((5, 7, 3))
+    shell = rng.integers(0, 7, 5)
+    depth = np.where(np.arange(7) == shell[:, None], 100.0, 0.0)[..., None] * np.ones(3)
+    seen = nerf2.accumulate(jnp.asarray(depth), jnp.asarray(signal))
+    np.testing.assert_allclose(seen, signal[np.arange(5), shell], rtol=1e-12)
+
+
+def test_accumulation_is_the_front_to_back_sum(rng, x64):
+    depth, signal = rng.gamma(1, 0.7, (4, 9, 2)), rng.random((4, 9, 2))
+    alpha, transmittance, total = 1 - np.exp(-depth), np.ones((4, 2)), np.zeros((4, 2))
+    for s in range(9):
+        total += transmittance * alpha[:, s] * signal[:, s]
+        transmittance *= 1 - alpha[:, s]
+    np.testing.assert_allclose(nerf2.accumulate(jnp.asarray(depth), jnp.asarray(signal)), total, rtol=1e-12)
+
+
+def test_rays_end_on_the_box():
+    local = jnp.asarray(pas_directions().reshape(-1, 3), jnp.float32)
+    rays = nerf2.make_rays(jnp.asarray(BOX), RECEIVER, local)
+    ends = np.asarray(RECEIVER.position + rays.world * rays.length[:, None])
+    np.testing.assert_allclose(np.linalg.norm(rays.world, axis=-1), 1, rtol=1e-5)
+    assert (ends > BOX[0] - 1e-4).all() and (ends < BOX[1] + 1e-4).all()
+    assert np.abs(ends[:, None] - BOX).min((1, 2)).max() < 1e-4  # one coordinate lies on a face
+
+
+def test_rays_along_the_axes_reach_the_faces_opposite():
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rays = nerf2.make_rays(jnp.asarray(BOX), make_receiver([0.3, -0.2, 1.0]), jnp.asarray(axes, jnp.float32))
+    np.testing.assert_allclose(rays.length, [2.7, 2.7, 1.8, 3.3, 1.8, 1.0], rtol=1e-5)
+
+
+def test_sampled_pixels_are_those_of_the_whole_image(rng):
+    params = make_params(rng)
+    whole = jax.jit(nerf2.render)(params, nerf2.plan(params, RECEIVER), QUERY)
+    assert whole.shape == (2, *PAS_SHAPE) and float(whole.std()) > 1e-3
+    pixels = nerf2.choose_pixels(params, jax.random.key(int(rng.integers(1000))))
+    seen = jax.jit(nerf2.observe_pixels)(params, RECEIVER, QUERY, pixels)
+    np.testing.assert_allclose(seen, whole.reshape(2, -1)[:, pixels], rtol=1e-4, atol=1e-5)
+
+
+def test_a_query_does_not_depend_on_its_neighbours_in_the_batch(rng):
+    params = make_params(rng)
+    plan, render = nerf2.plan(params, RECEIVER), jax.jit(nerf2.render)
+    both = render(params, plan, QUERY)
+    for i in range(2):
+        one = render(params, plan, jax.tree.map(lambda a, i=i: a[i : i + 1], QUERY))
+        np.testing.assert_allclose(one[0], both[i], rtol=1e-4, atol=1e-5)
+    assert float(jnp.abs(both[0] - both[1]).max()) > 1e-3
+
+
+@pytest.mark.parametrize("count", [40, 7, 32_400])
+def test_pixels_are_one_of_each_stretch_and_a_function_of_the_key(rng, count):
+    params = dataclasses.replace(make_params(rng), config=Nerf2Config(directions=count))
+    first, again, other = (np.asarray(nerf2.choose_pixels(params, jax.random.key(k))) for k in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    edges = np.arange(count + 1) * 32_400 / count
+    assert (first >= np.floor(edges[:-1])).all() and (first <= edges[1:]).all() and first.max() < 32_400
+    assert (first != other).any() or count == 32_400
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_frequency_transmitter_and_all_weights_matter_with_finite_gradients(rng, relative):
+    params = make_params(rng, relative=relative)
+    pixels = nerf2.choose_pixels(params, jax.random.key(0))
+
+    def total(networks, query):
+        changed = dataclasses.replace(params, networks=networks)
+        return jnp.sum(nerf2.observe_pixels(changed, RECEIVER, query, pixels) ** 2)
+
+    # A transmitter at the receiver is where lengths have no derivative.
+    query = Query(jnp.stack([QUERY.tx_position[0], RECEIVER.position]), QUERY.frequency_hz)
+    networks, asked = jax.jit(jax.grad(total, argnums=(0, 1)))(params.networks, query)
+    for path, leaf in jax.tree_util.tree_leaves_with_path((networks, asked)):
+        assert bool(jnp.isfinite(leaf).all()), jax.tree_util.keystr(path)
+    assert float(jnp.abs(asked.frequency_hz).max()) > 0 and float(jnp.abs(asked.tx_position[0]).max()) > 0
+
+
+def test_the_step_decides_the_directions():
+    dataset = tiny_dataset()
+    params, data = nerf2.init(jax.random.key(0), jnp.asarray(BOX), SETTINGS.nerf2), training_data(dataset)
+    losses = jax.jit(lambda step: loss_and_gradients(nerf2, params, data, jnp.arange(3), None, SETTINGS.optim, step)[0][0])
+    first, again, other = (float(losses(jnp.asarray(step))) for step in (0, 0, 1))
+    assert first == again != other
+
+
+def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
+    dataset = tiny_dataset()
+    whole = train(dataset, "nerf2", SETTINGS, 0, tmp_path / "whole")
+    curve = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    assert curve[-1]["loss"] < 0.8 * curve[0]["loss"]
+    assert 0 < curve[-1]["held_out_ssim"] < 1
+
+    part = Run(dataset, "nerf2", SETTINGS, 0, tmp_path / "parts")
+    part.epoch()
+    part.save()
+    resumed = train(dataset, "nerf2", SETTINGS, 0, tmp_path / "parts", resume=True)
+    for a, b in zip(jax.tree.leaves(whole.params), jax.tree.leaves(resumed.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path, monkeypatch):
+    save_scene(tmp_path / "box.npz", tiny_scene())
+    tiny = "--nerf2.samples 4 --nerf2.width 8 --nerf2.directions 30 --optim.steps 20 --loop.evaluate-spectra 2"
+    command = f"train --scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run {tiny}"
+    monkeypatch.setattr("sys.argv", command.split())
+    train_command.main()
+    trained = load_trained(tmp_path / "run")
+    assert trained.step == 20 and trained.config.settings.nerf2.samples == 4
+    dataset = trained.config.dataset()
+    predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test[:2])
+    assert predicted.shape == (2, *PAS_SHAPE) and np.isfinite(predicted).all()
+
+
+def test_it_is_trained_on_some_directions_and_no_other_field_is():
+    assert isinstance(get_field("nerf2"), SampledField)
+    assert not isinstance(wideband, SampledField)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("samples", 0), ("directions", 0), ("directions", 40_000), ("width", 0), ("radiance_widths", ()), ("tx_octaves", -1)],
+)
+def test_settings_that_cannot_work_are_refused(name, value):
+    with pytest.raises(UserError, match=name.replace("_", "-")):
+        check(dataclasses.replace(Settings(), nerf2=Nerf2Config(**{name: value})))

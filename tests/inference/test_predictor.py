@@ -1,0 +1,194 @@
+"""A trained field as a function: the same answers as the field itself, any leading axes, gradients, blocks, maps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene
+from untrained import make_trained
+
+from wbgs_jax.inference import predictor as inference
+from wbgs_jax.inference.predictor import fold, map_queries, predict_blocks, predict_many, predict_map, predictor
+from wbgs_jax.types import Query, make_query, make_receiver
+
+TX = np.array([[1.0, 0.5, 1.5], [-1.0, 1.0, 1.2]])
+HZ = np.array([28e9, 5e9])
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return make_trained(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def predict(trained):
+    return predictor(trained)
+
+
+@pytest.fixture(scope="module")
+def expected(trained):
+    """By the field's own functions."""
+    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
+    return np.asarray(jax.jit(trained.field.render)(trained.params, plan, make_query(TX, HZ)))
+
+
+def test_the_predictor_is_the_field(predict, expected):
+    pas = predict(TX, HZ)
+    assert (pas.shape, pas.dtype) == ((2, 90, 360), jnp.float32)
+    np.testing.assert_allclose(pas, expected, atol=1e-6)
+    assert np.abs(expected[0] - expected[1]).max() > 1e-3  # the two queries differ at all
+
+
+def test_leading_axes_broadcast(predict, expected):
+    np.testing.assert_allclose(predict(TX[0], HZ)[0], expected[0], atol=1e-6)
+    np.testing.assert_allclose(predict(TX[:, None], HZ[None, :1])[:, 0], predict(TX, HZ[0]), atol=1e-6)
+    one = predict([1, 0.5, 1.5], 28e9)
+    assert one.shape == (90, 360)
+    np.testing.assert_allclose(one, expected[0], atol=1e-6)
+    assert predict(np.zeros((0, 3)), HZ[0]).shape == (0, 90, 360)
+
+
+def test_vmap_and_jit(predict, expected):
+    np.testing.assert_allclose(jax.jit(jax.vmap(predict))(jnp.asarray(TX), jnp.asarray(HZ)), expected, atol=1e-6)
+
+
+def test_gradients_are_those_of_the_field(trained, predict, rng):
+    """tests/test_wideband.py compares the field's own with finite differences."""
+    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
+    weight = jnp.asarray(rng.normal(size=(2, 90, 360)), jnp.float32)
+
+    def own(tx, ghz):
+        return jnp.sum(weight * predict(tx, 1e9 * ghz))
+
+    def direct(tx, ghz):
+        return jnp.sum(weight * trained.field.render(trained.params, plan, Query(tx, 1e9 * ghz)))
+
+    args = jnp.asarray(TX, jnp.float32), jnp.asarray(HZ / 1e9, jnp.float32)
+    for gradient, expected in zip(*(jax.jit(jax.grad(f, argnums=(0, 1)))(*args) for f in (own, direct)), strict=True):
+        size = np.abs(expected).max()
+        assert size > 0
+        np.testing.assert_allclose(gradient, expected, atol=1e-4 * size)
+
+
+def test_another_receiver(trained, predict):
+    """Where the array stands and how it is turned is part of the function."""
+    scene = tiny_scene()
+    same = predictor(trained, make_receiver(scene.rx_position, scene.rx_orientation, scene.element_positions))
+    moved = predictor(trained, make_receiver(RX + np.array([0, 0.5, 0])))
+    before = predict(TX, HZ)
+    np.testing.assert_allclose(same(TX, HZ), before, atol=1e-6)
+    assert np.abs(moved(TX, HZ) - before).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("tx", "frequency", "named"),
+    [
+        ([1.0, 2.0], 28e9, r"\(2,\)"),
+        ([[1.0], [2.0]], 28e9, r"\(2, 1\)"),
+        ([1.0, 2.0, 1.5], 28.0, "hertz"),
+        ([1.0, 2.0, np.nan], 28e9, "metres"),
+        ([[1.0, 2.0, 1.5]] * 2, [28e9] * 3, "[Ii]ncompatible"),
+    ],
+)
+def test_wrong_shapes_and_units(predict, tx, frequency, named):
+    with pytest.raises(ValueError, match=named):
+        predict(tx, frequency)
+
+
+def operations(function, *args):
+    """Names of the operations that a call carries out."""
+    (call,) = jax.make_jaxpr(jax.jit(function))(*args).eqns
+    return [equation.primitive.name for equation in call.params["jaxpr"].jaxpr.eqns]
+
+
+def test_folding_leaves_what_depends_on_the_arguments():
+    table = jnp.arange(12.0).reshape(4, 3)
+
+    def function(x, y):
+        fixed = jnp.cos(table) @ jnp.ones((3, 2))
+        return {"sum": jnp.sin(x) + fixed.sum(), "fixed": fixed, "same": y}
+
+    args = jnp.ones(5), jnp.zeros(2)
+    assert "cos" in operations(function, *args)
+    assert set(operations(fold(function), *args)) == {"sin", "add"}
+    for compiled in (fold(function), jax.jit(fold(function))):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), compiled(*args), function(*args))
+
+
+def test_folding_where_there_is_nothing_to_fold():
+    assert float(fold(lambda x: 2 * x)(3.0)) == 6
+    assert float(fold(lambda x: 7.0)(3.0)) == 7
+    assert float(fold(lambda x: x)(3.0)) == 3
+
+
+def test_a_query_costs_less_than_the_field(trained, predict):
+    """Encodings of the Gaussians and the layers behind them are not computed again for a query."""
+    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
+    query = make_query(TX, HZ)
+    plain = operations(lambda q: trained.field.render(trained.params, plan, q), query)
+    folded = operations(fold(lambda q: trained.field.render(trained.params, plan, q)), query)
+    assert folded.count("sin") < plain.count("sin") and folded.count("dot_general") < plain.count("dot_general")
+
+
+class Recorder:
+    """A predictor of images that hold the query's x, y, z and gigahertz, and the shapes it was asked for."""
+
+    def __init__(self):
+        self.shapes = []
+
+    def __call__(self, tx_position, frequency_hz):
+        self.shapes.append(frequency_hz.shape)
+        image = np.zeros((len(frequency_hz), 90, 360), np.float32)
+        image[:, 0, :3], image[:, 0, 3] = tx_position, frequency_hz / 1e9
+        return image
+
+
+@pytest.mark.parametrize(("n", "sizes"), [(0, []), (1, [1]), (4, [4]), (9, [4, 4, 1])])
+def test_blocks_have_one_shape(n, sizes, rng):
+    record = Recorder()
+    tx = rng.normal(size=(n, 3)).astype(np.float32)
+    blocks = list(predict_blocks(record, tx, 2e9, block=4))
+    assert [len(block) for block in blocks] == sizes
+    assert set(record.shapes) <= {(4,)}
+    images = predict_many(record, tx, np.full(n, 2e9), block=4)
+    assert (images.shape, images.dtype) == ((n, 90, 360), np.float32)
+    np.testing.assert_array_equal(images[:, 0, :3], tx)
+    assert n == 0 or np.array_equal(np.concatenate(blocks), images)
+
+
+def test_blocks_are_computed_when_they_are_asked_for():
+    record = Recorder()
+    blocks = predict_blocks(record, np.zeros((100, 3)), 2e9, block=4)
+    next(blocks), next(blocks)
+    assert len(record.shapes) == 2
+
+
+def test_blocks_refuse_positions_that_are_none():
+    with pytest.raises(ValueError):
+        predict_blocks(Recorder(), np.zeros((4, 3)), np.full(3, 2e9))
+
+
+def test_a_map_runs_over_x_then_y_then_frequency():
+    xs, ys, ghz = np.arange(3.0), np.arange(10.0, 12), np.array([1.0, 60.0])
+    images = predict_map(Recorder(), xs, ys, 1.5, ghz * 1e9, block=4)
+    grid = images[:, 0, :4].reshape(2, 2, 3, 4)
+    for i, j, k in np.ndindex(2, 2, 3):
+        np.testing.assert_allclose(grid[i, j, k], [xs[k], ys[j], 1.5, ghz[i]], rtol=1e-6)
+    positions, frequencies = map_queries(0.0, 1.0, 2.0, 5e9)
+    np.testing.assert_array_equal(positions, [[0, 1, 2]])
+    np.testing.assert_array_equal(frequencies, [5e9])
+
+
+def test_spectra_of_a_dataset_are_those_of_its_queries(trained, monkeypatch):
+    monkeypatch.setattr(inference, "BLOCK", 2)
+    dataset, index = tiny_dataset(), np.array([7, 2, 11])
+    images = inference.predict_spectra(trained.field, trained.params, dataset, index)
+    expected = predict_many(predictor(trained), dataset.tx_positions[index], dataset.frequencies_hz[index], block=2)
+    np.testing.assert_allclose(images, expected, atol=1e-6)
+
+
+def test_what_is_known_about_the_training():
+    dataset = tiny_dataset()
+    box = inference.scene_box(dataset)
+    np.testing.assert_allclose(box, [dataset.vertices.min(0), dataset.vertices.max(0)], rtol=1e-6)
+    assert inference.trained_band(dataset) == (FREQUENCIES_HZ.min(), FREQUENCIES_HZ.max())

@@ -1,0 +1,160 @@
+"""Meshes become facets, bodies and edges: nothing is lost, nothing is doubled."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from rooms import box, edges_of, facets_of, mesh_of, rectangle, room
+
+from wbgs_jax.propagation.edges import edges_of_facets
+from wbgs_jax.propagation.facets import areas, facets_from_mesh, outline_of
+
+
+def segments(edges):
+    """Both ends of every edge, as a sorted list of rounded numbers."""
+    ends = np.stack([edges.start, edges.start + edges.direction * edges.length[:, None]], 1).round(6) + 0.0
+    return sorted(sorted(map(tuple, pair)) for pair in ends)
+
+
+def test_a_box_has_six_facets_and_twelve_edges():
+    facets = facets_of(box((0, 0, 0), (1, 2, 3)))
+    edges = edges_of_facets(facets)
+    assert sorted(areas(facets).round(6)) == [2, 2, 3, 3, 6, 6]
+    assert sorted(edges.length.round(6)) == [1] * 4 + [2] * 4 + [3] * 4
+    centre = np.array([0.5, 1, 1.5])
+    assert (np.sum(facets.normal * centre, -1) < facets.offset).all()  # normals point outwards
+    for start, direction, length, normal in zip(edges.start, edges.direction, edges.length, edges.normal_0, strict=True):
+        tangent = np.cross(normal, direction)
+        assert tangent @ (centre - start - direction * length / 2) > 0  # into the 0-face
+
+
+def test_a_fine_mesh_is_merged_and_its_area_kept(rng):
+    fine = box((0, 0, 0), (1, 2, 3)).subdivide().subdivide()
+    facets = facets_of(fine)
+    assert len(facets.body) < len(fine.faces) / 4
+    np.testing.assert_allclose(areas(facets).sum(), fine.area, rtol=1e-6)
+
+
+def test_facets_cover_every_point_of_a_plane_once(rng):
+    """A wall with a door: the windows of its facets are a partition of unity."""
+    wall = trimesh.util.concatenate(
+        [
+            rectangle((0, 0, 0), (0, 2, 0), (0, 0, 3)),
+            rectangle((0, 3, 0), (0, 2, 0), (0, 0, 3)),
+            rectangle((0, 2, 2), (0, 1, 0), (0, 0, 1)),
+        ]
+    )
+    facets = facets_of(wall)
+    outline = outline_of(facets)
+    points = np.stack([np.zeros(500), rng.uniform(0, 5, 500), rng.uniform(0, 3, 500)], -1)
+    depth = np.einsum("fed,nd->nfe", outline.inward, points) - outline.offset
+    inside = (depth > 0).all(-1).sum(-1)
+    door = (points[:, 1] > 2) & (points[:, 1] < 3) & (points[:, 2] < 2)
+    np.testing.assert_array_equal(inside, np.where(door, 0, 1))
+
+
+def test_triangles_and_slopes_stay_what_they_are():
+    gable = trimesh.Trimesh(
+        [[0, 0, 0], [4, 0, 0], [4, 0, 2], [2, 0, 3], [0, 0, 2]], [[0, 1, 2], [0, 2, 4], [4, 2, 3]], process=False
+    )
+    facets = facets_of(gable)
+    assert len(facets.body) == 2  # a rectangle and a triangle
+    np.testing.assert_allclose(np.sort(areas(facets)), [2, 8])
+
+
+def test_sheets_and_inner_corners_have_no_edges():
+    assert edges_of(*room()).length.size == 0
+    inside_out = box((0, 0, 0), (1, 1, 1))
+    inside_out.invert()
+    assert edges_of(inside_out).length.size == 0
+
+
+@pytest.mark.parametrize("material", [None, [0, 0]])
+def test_joined_bodies_diffract_at_free_edges_only(material):
+    """A leg under a table top, two millimetres apart: its upper edges are no edges, of whatever material."""
+    leg, top = box((0, 0, 0), (0.1, 0.1, 0.7)), box((-0.5, -0.5, 0.702), (0.5, 0.5, 0.74))
+    edges = edges_of(leg, top, material=material)
+    leg_edges = np.abs(edges.start[:, 0] - 0.05) < 0.06
+    assert leg_edges.sum() == 12 - 4 and (~leg_edges).sum() == 12
+
+
+BESIDE = [box((0, 0, 0), (1, 1, 1)), box((1, 0, 0), (2, 1, 1))]
+"""They touch with a whole side: four pairs of their faces lie in one plane and share corners."""
+
+
+@pytest.mark.parametrize("other", [BESIDE[1], box((1, 0, 0), (3, 1, 2)), box((1, 1, 0), (2, 2, 1)), box((0, 0, 1), (1, 1, 2))])
+def test_touching_objects_of_one_material_stay_two_bodies(other):
+    """Each has the facets and edges that it has alone, and shares none with the other."""
+    facets = facets_of(BESIDE[0], other, material=[0, 0])
+    edges = edges_of_facets(facets)
+    assert set(facets.material.tolist()) == {0} and edges.length.size == 24
+    found, expected = [], []
+    for body in set(facets.body.tolist()):
+        own = jax.tree.map(lambda leaf, body=body: leaf[facets.body[edges.facet] == body], edges)
+        found.append((sorted(areas(facets)[facets.body == body].round(6)), segments(own)))
+    for part in (BESIDE[0], other):
+        found_alone = facets_of(part)
+        expected.append((sorted(areas(found_alone).round(6)), segments(edges_of_facets(found_alone))))
+    assert sorted(found) == sorted(expected)
+
+
+def test_blocks_of_one_object_that_touch_along_an_edge_are_closed():
+    """The side that they share belongs to four triangles; a wall of their material is no part of their body."""
+    blocks = trimesh.util.concatenate([box((0, 0, 0), (1, 1, 1)), box((1, 1, 0), (2, 2, 1))])
+    wall = rectangle((0, 0, 0), (-3, 0, 0), (0, 0, 1))
+    assert np.unique(facets_of(blocks, wall, material=[0, 0]).body, return_counts=True)[1].tolist() == [12, 1]
+
+
+@pytest.mark.parametrize("height", [3.0, 2.0])
+@pytest.mark.parametrize("material", [[0, 0], [0, 1]])
+def test_walls_of_one_material_that_meet_are_one_body(material, height):
+    """An L of two sheets, seen from outside: its corner is an edge, as high as the lower wall."""
+    walls = [rectangle((0, 0, 0), (4, 0, 0), (0, 0, 3)), rectangle((4, 0, 0), (0, 3, 0), (0, 0, height))]
+    facets = facets_of(*walls, material=material)
+    edges = edges_of_facets(facets)
+    if material == [0, 1]:
+        assert len(set(facets.body.tolist())) == 2 and edges.length.size == 0
+    else:
+        assert len(set(facets.body.tolist())) == 1
+        assert segments(edges) == [[(4, 0, 0), (4, 0, height)]]
+
+
+def test_a_room_of_six_sheets_is_a_box():
+    """Its walls look outwards; of one material they are one body with a box's edges."""
+    facets = facets_of(*room(), material=[0] * 6)
+    assert set(facets.body.tolist()) == {0}
+    assert segments(edges_of_facets(facets)) == segments(edges_of(box((0, 0, 0), (6, 4, 3))))
+
+
+def test_walls_apart_and_bodies_at_a_wall_stay_what_they_are():
+    """Three walls in a row, one apart, and a cabinet of the same material that touches one of them in its corners."""
+    row = [rectangle((x, 0, 0), (2, 0, 0), (0, 0, 3)) for x in (0, 2, 4, 8)]
+    facets = facets_of(*row, box((2, 0, 0), (4, 1, 3)), material=[0] * 5)
+    assert sorted(np.unique(facets.body, return_counts=True)[1]) == [1, 1, 6]  # the row is one facet
+    assert edges_of_facets(facets).length.size == 12
+
+
+def test_one_object_of_two_materials_is_two_bodies():
+    mesh = mesh_of(box((0, 0, 0), (1, 1, 1)))
+    top = (np.asarray(mesh.vertices)[np.asarray(mesh.faces)][..., 2] == 1).all(-1)
+    facets = facets_from_mesh(dataclasses.replace(mesh, material=jnp.asarray(top, jnp.int32)))
+    assert len(set(zip(facets.body.tolist(), facets.material.tolist(), strict=True))) == 2
+    assert edges_of_facets(facets).length.size == 8  # the four around the lid are gone
+
+
+def test_the_largest_facets_are_kept():
+    facets = facets_of(box((0, 0, 0), (1, 2, 3)), most=2)
+    np.testing.assert_allclose(areas(facets), [6, 6])
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-7])
+def test_corners_that_hardly_differ_are_one(shift):
+    first, second = rectangle((0, 0, 0), (1, 0, 0), (0, 1, 0)), rectangle((1 + shift, 0, 0), (1, 0, 0), (0, 1, 0))
+    joined = trimesh.Trimesh(
+        np.concatenate([first.vertices, second.vertices]), np.concatenate([first.faces, second.faces + 4]), process=False
+    )
+    facets = facets_of(joined)
+    assert len(facets.body) == 1 and jnp.isclose(areas(facets)[0], 2)

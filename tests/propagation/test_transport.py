@@ -1,0 +1,223 @@
+"""The wave on paths, against closed forms."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import (
+    METAL,
+    SPEED_OF_LIGHT,
+    arrivals_of,
+    as_float64,
+    box,
+    rectangle,
+    room,
+    search_of,
+    slabs_of,
+    snapshot_of,
+    trace,
+)
+
+from wbgs_jax.propagation.slab import Slabs, complex_permittivity, slab_coefficients
+from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
+from wbgs_jax.radio import channel
+from wbgs_jax.radio.array import planar_array, snapshot_to_pas
+from wbgs_jax.radio.patterns import element_gain
+from wbgs_jax.types import make_receiver
+
+FREQUENCIES = [1e9, 10e9, 94e9]
+BELOW = np.array([1, 1, -1])
+
+
+def free_space(tx, rx, frequency, pattern="iso"):
+    """Closed form for isotropic (or TR 38.901) vertical antennas."""
+    offset = np.asarray(tx) - np.asarray(rx)
+    distance, wavelength = np.linalg.norm(offset), SPEED_OF_LIGHT / frequency
+    amplitude = wavelength / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / wavelength)
+    if pattern == "tr38901":
+        amplitude = amplitude * float(element_gain(jnp.asarray(offset / distance, jnp.float32)))
+    return amplitude * np.exp(2j * np.pi * planar_array() @ (offset / distance))
+
+
+def assert_waves_equal(found, expected, amplitude=0.01, degrees=5.0):
+    """The largest errors relative to the largest element: amplitude, and phase."""
+    scale = np.abs(expected).max()
+    assert np.abs(np.abs(found) - np.abs(expected)).max() < amplitude * scale
+    strong = np.abs(expected) > 0.2 * scale
+    assert np.abs(np.angle(found[strong] / expected[strong], deg=True)).max() < degrees
+
+
+@pytest.mark.parametrize("pattern", ["iso", "tr38901"])
+@pytest.mark.parametrize("frequency", FREQUENCIES)
+def test_free_space(frequency, pattern, rng):
+    rx, tx = rng.uniform(-1, 1, 3), rng.uniform(2, 4, 3)
+    far = rectangle((100, 100, 100), (1, 0, 0), (0, 1, 0))  # a mesh needs a surface
+    search, receiver = search_of([far], rx, mirror_areas=()), make_receiver(rx, pattern=pattern)
+    assert_waves_equal(snapshot_of(search, tx, frequency, receiver), free_space(tx, rx, frequency, pattern), 1e-4, 2)
+
+
+@pytest.mark.parametrize("frequency", FREQUENCIES)
+@pytest.mark.parametrize("tiles", [1, 5])
+def test_a_plate_of_tiles_is_a_mirror(frequency, tiles, rng):
+    """Metal tiles reproduce the mirrored source in amplitude (<= 1 %) and phase (<= 5 degrees), wherever the seams are."""
+    step = 40.0 / tiles
+    corners = [(-20 + i * step, -20 + j * step, 0) for i in range(tiles) for j in range(tiles)]
+    plate = [rectangle(corner, (step, 0, 0), (0, step, 0)) for corner in corners]
+    rx, tx = (centre + rng.uniform(-1, 1, 3) for centre in np.array([[0, 0, 2], [3, 0, 2]]))
+    search, receiver = search_of(plate, rx, mirror_areas=(0.0,)), make_receiver(rx)
+    slabs = slabs_of(search, frequency, conductivity=METAL)
+    found = arrivals_of(search, trace(search, tx), slabs, receiver, jnp.float32(frequency))
+    mirrored = free_space(tx * BELOW, rx, frequency)
+    # TM at a horizontal mirror with r = 1: theta-hat keeps its sense along the ray.
+    (k,) = np.flatnonzero((np.abs(found.amplitude) > 0) & (np.asarray(found.length) > np.linalg.norm(tx - rx) * (1 + 1e-4)))
+    only = jax.tree.map(lambda leaf: leaf[k : k + 1], found)
+    assert_waves_equal(np.asarray(snapshots_from_paths(only, receiver, jnp.float32(frequency))), mirrored)
+
+
+@pytest.mark.parametrize("frequency", FREQUENCIES)
+def test_through_a_wall(frequency):
+    wall = rectangle((1, -9, -9), (0, 18, 0), (0, 0, 18))
+    search = search_of([wall], (0, 0, 0), mirror_areas=())
+    tx = np.array([3.0, 0.0, 0.0])  # normal incidence
+    eps = complex_permittivity(jnp.array(2.73), jnp.array(0.03), jnp.array(frequency))
+    through = slab_coefficients(jnp.array(1.0), eps, jnp.array(0.1), jnp.array(frequency)).transmit_te
+    found = snapshot_of(search, tx, frequency, permittivity=2.73, conductivity=0.03)
+    assert_waves_equal(found, complex(through) * free_space(tx, np.zeros(3), frequency))
+
+
+def test_two_rays_over_ground_follow_the_frequency():
+    """The interference of the direct and the ground ray over the band: Fresnel for vertical polarisation."""
+    ground = rectangle((-50, -50, 0), (100, 0, 0), (0, 100, 0))
+    rx, tx = np.array([0, 0, 1.5]), np.array([4.0, 0.0, 1.0])
+    search = search_of([ground], rx, mirror_areas=(0.0,))
+    for frequency in np.geomspace(1e9, 6e9, 7):
+        cosine = 2.5 / np.linalg.norm(tx * BELOW - rx)
+        eps = complex(complex_permittivity(jnp.array(5.0), jnp.array(1.0), jnp.array(frequency)))
+        inner = np.sqrt(eps - 1 + cosine**2)
+        r = (eps * cosine - inner) / (eps * cosine + inner)
+        expected = free_space(tx, rx, frequency) + r * free_space(tx * BELOW, rx, frequency)
+        found = snapshot_of(search, tx, frequency, permittivity=5.0, conductivity=1.0, thickness=1.0)
+        assert_waves_equal(found, expected)
+
+
+def specular_only(search, tx, frequency, receiver=None, specular=(512, 128), **slab):
+    """The snapshot without diffraction."""
+    receiver, f = make_receiver(search.receiver_position) if receiver is None else receiver, jnp.float32(frequency)
+    paths = trace(search, tx, specular, (1, 1)).specular
+    arrived = arrivals(paths, search, slabs_of(search, frequency, **slab), f, receiver, diffracted=False)
+    return np.asarray(snapshots_from_paths(arrived, receiver, f))
+
+
+def test_the_field_is_continuous_where_the_shadow_of_metal_begins():
+    """Direct ray and diffraction together; without diffraction the sum jumps by the whole direct ray."""
+    search = search_of([box((1, -1, -3), (2, 1, 3))], (0, 0, 0), mirror_areas=(0.0, 0.0))
+    # The shadow of the front edge at x = y = 1 ends at y = x.
+    below, above = (np.array([2.5, 2.5 + offset, 0.05]) for offset in (-2e-4, 2e-4))
+    scale = np.abs(free_space(above, np.zeros(3), 5e9)).max()
+    jumps = []
+    for wave_at in (snapshot_of, specular_only):
+        ends = [wave_at(search, tx, 5e9, conductivity=METAL) for tx in (above, below)]
+        jumps.append(np.abs(ends[0] - ends[1]).max())
+    assert jumps[0] < 0.03 * scale and jumps[1] > 0.8 * scale
+
+
+def test_channels_are_reciprocal(rng):
+    """One isotropic element each: both ends exchanged, the same voltage; reflections and walls included."""
+    parts = [*room(), rectangle((3, 0, 0), (0, 2.5, 0), (0, 0, 3)), box((1, 1, 0.5), (2, 2, 1.2))]
+    a, b = rng.uniform([0.3, 2.4, 1.4], [1.5, 3.6, 2.6]), rng.uniform([3.4, 0.4, 0.4], [5.6, 3.6, 2.6])
+    voltages = []
+    for rx, tx in ((a, b), (b, a)):
+        search = search_of(parts, rx, mirror_areas=(0.0, 0.0))
+        receiver = make_receiver(rx, element_positions=np.zeros((1, 3)))
+        voltages.append(specular_only(search, tx, 2.4e9, receiver, specular=(512, 512))[0])
+    np.testing.assert_allclose(voltages[0], voltages[1], rtol=1e-2)
+
+
+def test_an_array_in_metres_is_one_in_wavelengths(rng):
+    """At every frequency, and not the same array at two of them."""
+    search = search_of(room(), (1, 1, 1.2), mirror_areas=(0.0,))
+    elements, tx = planar_array(3, 2, 0.4) + rng.normal(0, 0.05, (6, 3)), rng.uniform([2, 2, 0.5], [5, 3, 2.5])
+    metres = make_receiver((1, 1, 1.2), element_positions=elements * SPEED_OF_LIGHT / 5e9, unit="metres")
+    for frequency in (2.5e9, 5e9, 28e9):
+        wavelengths = make_receiver((1, 1, 1.2), element_positions=elements * frequency / 5e9)
+        found, expected = (snapshot_of(search, tx, frequency, receiver) for receiver in (metres, wavelengths))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+    same_wavelengths = snapshot_of(search, tx, 28e9, make_receiver((1, 1, 1.2), element_positions=elements))
+    assert np.abs(same_wavelengths - expected).max() > 0.1 * np.abs(expected).max()
+
+
+def test_a_transmitter_may_have_no_paths():
+    """Behind six sheets: nothing arrives, and nothing of it is undefined."""
+    search = search_of([rectangle((x, -9, -9), (0, 18, 0), (0, 0, 18)) for x in range(1, 7)], (0, 0, 0), mirror_areas=())
+    assert np.array_equal(snapshot_of(search, (8, 0.1, 0.2), 1e9), np.zeros(16))
+
+
+def test_single_precision_is_enough_at_94_ghz(x64):
+    """Paths of tens of metres are tens of thousands of radians."""
+    search, receiver = search_of(room((12.0, 9.0, 3.0)), (1, 1, 1.2)), make_receiver((1, 1, 1.2))
+    single = snapshot_of(search, (10.5, 7.5, 2.1), 94e9, receiver)
+    tx = np.asarray((10.5, 7.5, 2.1), np.float32)  # what single precision makes of it
+    precise = snapshot_of(as_float64(search), tx, 94e9, as_float64(receiver))
+    assert single.dtype == np.complex64 and precise.dtype == np.complex128
+    assert float(channel.correlation(jnp.asarray(single), jnp.asarray(precise))) > 0.999
+
+
+class Materials(NamedTuple):
+    """What a field may learn of every material."""
+
+    log_susceptibility: jax.Array
+    log_conductivity: jax.Array
+    slope: jax.Array
+    log_thickness: jax.Array
+
+
+FURNISHED = [*room(), box((2, 1, 0.5), (3, 2, 1.2))]
+
+
+def materials_of(search):
+    """Permittivity 4, 0.02 S/m at all frequencies, 0.1 m, of every material."""
+    values = np.log(3.0), np.log(0.02), 0.0, np.log(0.1)
+    return Materials(*(jnp.full(len(FURNISHED), value, search.receiver_position.dtype) for value in values))
+
+
+def voltages(materials, search, traced, receiver, frequency):
+    """The snapshot as a function of the materials."""
+    sigma = jnp.exp(materials.log_conductivity + materials.slope * jnp.log(frequency / 1e9))
+    eps = complex_permittivity(1 + jnp.exp(materials.log_susceptibility), sigma, frequency)
+    slabs = Slabs(eps[search.facets.material], jnp.exp(materials.log_thickness)[search.facets.material])
+    return snapshots_from_paths(arrivals_of(search, traced, slabs, receiver, frequency), receiver, frequency)
+
+
+@pytest.mark.parametrize("frequency", [1e9, 24e9, 100e9])
+@pytest.mark.parametrize("height", [0.002, 0.5, 1.5])
+def test_gradients_are_finite(frequency, height):
+    """Over the band, and for transmitters close to a surface."""
+    search, receiver = search_of(FURNISHED, (1, 1, 1.2)), make_receiver((1, 1, 1.2))
+    traced = trace(search, (4.0, 3.0, height))
+
+    def loss(materials):
+        y = voltages(materials, search, traced, receiver, jnp.float32(frequency))
+        y = y / jnp.sqrt(jnp.sum(channel.squared_magnitude(y)) + 1e-30)
+        return jnp.sum(snapshot_to_pas(y, receiver.element_positions) ** 2)
+
+    gradients = jax.jit(jax.grad(loss))(materials_of(search))
+    assert all(np.isfinite(leaf).all() for leaf in gradients)
+    assert all(np.abs(leaf).max() > 0 for leaf in gradients if frequency != 1e9 or leaf is not gradients.slope)
+
+
+def test_gradients_agree_with_finite_differences(x64):
+    search, receiver = as_float64((search_of(FURNISHED, (1, 1, 1.2)), make_receiver((1, 1, 1.2))))
+    traced, materials = trace(search, (4.0, 3.0, 1.0)), materials_of(search)
+
+    @jax.jit
+    def loss(materials):
+        y = voltages(materials, search, traced, receiver, jnp.asarray(3e9))
+        return 1e6 * jnp.sum(y.real**2 + 0.3 * y.imag * y.real)
+
+    gradient = jax.grad(loss)(materials)
+    for name in materials._fields:
+        value, step = getattr(materials, name), 1e-6
+        ends = [loss(materials._replace(**{name: value.at[0].add(sign * step)})) for sign in (1, -1)]
+        np.testing.assert_allclose(getattr(gradient, name)[0], (ends[0] - ends[1]) / (2 * step), rtol=1e-4, atol=1e-7)

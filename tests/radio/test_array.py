@@ -1,0 +1,115 @@
+"""The array model against closed forms and a plain loop."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wbgs_jax.radio.array import PAS_SHAPE, cbf, lag_basis, normalise, pas_directions, planar_array, snapshot_to_pas, steering_vector
+
+ELEMENTS = jnp.asarray(planar_array(), jnp.float32)
+
+
+def random_snapshots(rng, *shape):
+    return jnp.asarray(rng.normal(size=shape) + 1j * rng.normal(size=shape), jnp.complex64)
+
+
+def test_pas_grid_is_zenith_by_azimuth_with_both_ends():
+    k = pas_directions()
+    assert k.shape == (*PAS_SHAPE, 3)
+    np.testing.assert_allclose(np.linalg.norm(k, axis=-1), 1, atol=1e-12)
+    np.testing.assert_allclose(k[0], np.broadcast_to([0, 0, 1], (360, 3)), atol=1e-12)  # row 0 is the zenith
+    np.testing.assert_allclose(k[89, 0], [-1, 0, 0], atol=1e-12)  # the first column is -180 degrees
+    np.testing.assert_allclose(k[:, 0], k[:, -1], atol=1e-12)
+
+
+def test_elements_lie_half_a_wavelength_apart_around_the_origin():
+    p = planar_array()
+    assert p.shape == (16, 3)
+    np.testing.assert_allclose(p.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(p[:, 0], 0)
+    gaps = np.linalg.norm(p[:, None] - p, axis=-1)
+    assert gaps[gaps > 0].min() == 0.5
+
+
+def test_element_order_is_that_of_the_ray_tracer(shared_data):
+    with np.load(shared_data("box_room") / "snapshots.npz") as archive:
+        np.testing.assert_allclose(planar_array(), archive["element_positions"], atol=1e-6)
+
+
+def test_snapshot_to_pas_equals_the_formula_written_as_a_loop(rng):
+    elements = planar_array()
+    y = random_snapshots(rng, 16)
+    pas = np.asarray(snapshot_to_pas(y, ELEMENTS))
+    expected = np.zeros(PAS_SHAPE)
+    rows, columns = np.linspace(0, np.pi / 2, 90), np.linspace(-np.pi, np.pi, 360)
+    for i, t in enumerate(rows):
+        for j, p in enumerate(columns):
+            k = np.array([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)])
+            a = np.exp(2j * np.pi * (elements @ k))
+            expected[i, j] = abs(np.vdot(a, np.asarray(y, complex)))
+    np.testing.assert_allclose(pas, expected / expected.max(), atol=2e-6)
+
+
+def test_a_plane_wave_peaks_where_it_comes_from(rng):
+    row, column = rng.integers(5, 85), rng.integers(0, 359)
+    k = pas_directions()[row, column]
+    pas = np.asarray(snapshot_to_pas(steering_vector(ELEMENTS, jnp.asarray(k[None], jnp.float32)), ELEMENTS))[0]
+    assert pas[row, column] == pytest.approx(1, abs=1e-5)
+    # Closed form: the product of the array factors of four elements half a wavelength apart along y and along z.
+    u = np.pi / 2 * (pas_directions() - k)[..., 1:]
+    small = np.abs(np.sin(u)) < 1e-9  # the main lobe and its alias
+    factor = np.where(small, 1, np.abs(np.sin(4 * u) / (4 * np.where(small, 1, np.sin(u)))))
+    np.testing.assert_allclose(pas, factor.prod(-1), atol=1e-5)
+
+
+def test_array_cannot_tell_front_from_back(rng):
+    k = rng.normal(size=(5, 3))
+    k /= np.linalg.norm(k, axis=-1, keepdims=True)
+    front, back = (np.asarray(steering_vector(ELEMENTS, jnp.asarray(d, jnp.float32))) for d in (k, k * [-1, 1, 1]))
+    np.testing.assert_allclose(front, back, atol=1e-6)
+
+
+def test_every_squared_pas_lies_in_49_dimensions(rng):
+    basis = lag_basis(planar_array())
+    assert basis.shape == (90 * 360, 49)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(49), atol=1e-9)
+    squared = np.asarray(snapshot_to_pas(random_snapshots(rng, 4, 16), ELEMENTS)).astype(np.float64).reshape(4, -1) ** 2
+    residual = squared - squared @ basis @ basis.T
+    assert np.linalg.norm(residual) < 1e-5 * np.linalg.norm(squared)
+    foreign = rng.random((4, 90 * 360))  # the space is small: an image that is no PAS does not lie in it
+    assert np.linalg.norm(foreign - foreign @ basis @ basis.T) > 0.3 * np.linalg.norm(foreign)
+
+
+def test_published_images_lie_in_that_space_up_to_8_bit_rounding(shared_data):
+    from wbgs_jax.data import load_dataset
+
+    images = load_dataset(shared_data("wideband3dgs_example1")).images[::25].astype(np.float64).reshape(20, -1) / 255
+    basis = lag_basis(planar_array())
+    residual = images**2 - images**2 @ basis @ basis.T
+    assert np.median(np.linalg.norm(residual, axis=1) / np.linalg.norm(images**2, axis=1)) < 0.005
+
+
+def test_scale_and_global_phase_do_not_matter(rng):
+    y = random_snapshots(rng, 3, 16)
+    pas = np.asarray(snapshot_to_pas(y, ELEMENTS))
+    assert pas.dtype == np.float32
+    np.testing.assert_allclose(pas.max((1, 2)), 1, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(snapshot_to_pas(y * jnp.complex64(3e-7 * np.exp(1j)), ELEMENTS)), pas, atol=1e-5)
+
+
+def test_first_and_last_column_are_the_same_direction(rng):
+    pas = np.asarray(snapshot_to_pas(random_snapshots(rng, 2, 16), ELEMENTS))
+    np.testing.assert_allclose(pas[..., 0], pas[..., -1], atol=1e-6)
+
+
+def test_zero_snapshot_gives_zero_pas():
+    pas = np.asarray(snapshot_to_pas(jnp.zeros((2, 16), jnp.complex64), ELEMENTS))
+    assert pas.shape == (2, *PAS_SHAPE)
+    np.testing.assert_array_equal(pas, 0)
+    np.testing.assert_array_equal(np.asarray(normalise(jnp.zeros((1, *PAS_SHAPE)))), 0)
+
+
+def test_cbf_takes_any_batch_shapes(rng):
+    y, a = random_snapshots(rng, 2, 3, 16), random_snapshots(rng, 5, 16)
+    expected = np.abs(np.einsum("bcn,mn->bcm", np.asarray(y), np.asarray(a).conj()))
+    np.testing.assert_allclose(np.asarray(cbf(y, a)), expected, rtol=1e-5)

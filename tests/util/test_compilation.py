@@ -1,0 +1,44 @@
+"""The compilation cache: a second process loads what the first one compiled; it never stops a run."""
+
+import os
+import subprocess
+import sys
+
+from wbgs_jax._util.compilation import VARIABLE, use_compilation_cache
+
+PROGRAM = """
+import logging, jax, jax.numpy as jnp
+from wbgs_jax._util import compilation
+compilation.MIN_SECONDS = 0.0
+print(compilation.use_compilation_cache())
+hits = []
+jax.monitoring.register_event_listener(lambda name, **_: hits.append(name) if name.endswith("cache_hits") else None)
+jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((64, 64))).block_until_ready()
+print(len(hits))
+"""
+
+
+def run(folder, **more):
+    environment = os.environ | {VARIABLE: str(folder), "JAX_PLATFORMS": "cpu"} | more
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    environment |= more
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    where, hits = done.stdout.split()
+    return where, int(hits)
+
+
+def test_a_second_process_loads_what_the_first_compiled(tmp_path):
+    where, hits = run(tmp_path)
+    assert where.startswith(str(tmp_path)) and hits == 0
+    assert run(tmp_path)[1] > 0
+
+
+def test_it_can_be_switched_off_and_jax_has_its_own_say(tmp_path):
+    assert run("")[0] == "None"
+    assert run(tmp_path, JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own"))[0] == str(tmp_path / "own")
+
+
+def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "cache"))
+    assert use_compilation_cache() is None

@@ -1,0 +1,70 @@
+"""Files are whole or absent; JSON is valid or refused."""
+
+import pytest
+
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write, read_json, write_json
+
+
+def test_atomic_write_replaces_the_file(tmp_path):
+    path = tmp_path / "new" / "file.bin"
+    for content in (b"first", b"second"):
+        with atomic_write(path) as stream:
+            stream.write(content)
+        assert path.read_bytes() == content
+    assert [p.name for p in path.parent.iterdir()] == ["file.bin"]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "file.bin"
+    path.write_bytes(b"old")
+    with pytest.raises(KeyboardInterrupt), atomic_write(path) as stream:
+        stream.write(b"half")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file.bin"]
+
+
+def test_files_have_ordinary_permissions(tmp_path):
+    with atomic_write(tmp_path / "ours"):
+        pass
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_folder_that_cannot_be_made_is_a_user_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot write"), atomic_write(tmp_path / "file" / "inside"):
+        pass
+
+
+def test_json_round_trip(tmp_path):
+    value = {"a": [1, 2.5, None], "b": "é"}
+    write_json(tmp_path / "v.json", value)
+    assert read_json(tmp_path / "v.json") == value
+
+
+def test_nan_is_refused_and_leaves_no_file(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "v.json", {"ssim": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [None, b"", b'{"a": 1', b"\xff\xfe"])
+def test_missing_or_broken_json_is_a_user_error(tmp_path, content):
+    path = tmp_path / "v.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=r"v\.json"):
+        read_json(path)
+
+
+def test_run_command_turns_a_user_error_into_one_line_and_exit_code_2(capsys):
+    def main():
+        raise UserError("no such scene; give another")
+
+    with pytest.raises(SystemExit) as exit_info:
+        run_command(main)
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == "error: no such scene; give another\n"

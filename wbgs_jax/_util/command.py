@@ -1,0 +1,34 @@
+"""What all command lines share: how errors become one line and an exit code, and lines for people."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+from wbgs_jax._util.errors import UserError
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Runs a command line's `main`; a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130."""
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+def say(line: str) -> None:
+    """Prints a line for people, on stderr: stdout is for results."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def option_value(arguments: Sequence[str], name: str, default: str) -> str:
+    """Returns what follows an option on the command line, or the default; the last one counts."""
+    value = default
+    for i, argument in enumerate(arguments):
+        if argument == name:
+            value = "".join(arguments[i + 1 : i + 2])
+        elif argument.startswith(f"{name}="):
+            value = argument.split("=", 1)[1]
+    return value

@@ -1,0 +1,78 @@
+"""Frozen dataclasses as pytrees."""
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+
+T = TypeVar("T")
+
+
+def static(**options: Any) -> Any:
+    """Returns a field that is part of the tree's structure, not a leaf; its value must be hashable.
+
+    `options` are those of `dataclasses.field`, such as `default=`.
+    """
+    return dataclasses.field(metadata={"static": True}, **options)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def pytree(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass and a pytree.
+
+    Unlike `jax.tree_util.register_dataclass`, rebuilding a tree does not call `__init__`: transformations put shapes, masks
+    and markers where the annotations promise arrays, and run-time type checks must not trip over them.
+    """
+    cls = dataclasses.dataclass(frozen=True)(cls)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    children = [f.name for f in fields if not f.metadata.get("static")]
+    constants = [f.name for f in fields if f.metadata.get("static")]
+
+    def flatten_with_keys(value: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        leaves = [(jax.tree_util.GetAttrKey(name), getattr(value, name)) for name in children]
+        return leaves, tuple(getattr(value, name) for name in constants)
+
+    def flatten(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        return [getattr(value, name) for name in children], tuple(getattr(value, name) for name in constants)
+
+    def unflatten(aux: tuple[Any, ...], leaves: Any) -> T:
+        value = object.__new__(cls)
+        for name, item in zip(children + constants, (*leaves, *aux), strict=True):
+            object.__setattr__(value, name, item)
+        return value
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
+
+
+def from_leaves(cls: type[T], leaves: Mapping[str, Any], constants: Mapping[str, Any] | None = None, prefix: str = "") -> T:
+    """Returns a `pytree` from its leaves by `jax.tree_util.keystr`, such as {".frame.centre": array}.
+
+    Its fields are arrays or other `pytree` classes. Static fields come from `constants`, else from their defaults. What has
+    no leaf is None.
+    """
+    hints, values = typing.get_type_hints(cls), {}
+    for f in dataclasses.fields(cls):  # type: ignore[arg-type]
+        path = f"{prefix}.{f.name}"
+        if f.metadata.get("static"):
+            values[f.name] = (constants or {}).get(f.name, f.default)
+        elif dataclasses.is_dataclass(hints[f.name]) and any(key.startswith(f"{path}.") for key in leaves):
+            values[f.name] = from_leaves(hints[f.name], leaves, None, path)
+        else:
+            values[f.name] = leaves.get(path)
+    return cls(**values)
+
+
+def with_leaves(tree: T, *leaves: Any) -> T:
+    """Returns the structure of a tree with other leaves, of any kind, in its order."""
+    return jax.tree.unflatten(jax.tree.structure(tree), leaves)
+
+
+def replaced(tree: T, **values: Any) -> T:
+    """Returns a `pytree` with other values in some fields, like `dataclasses.replace` but of any kind: names, masks, markers."""
+    new = object.__new__(type(tree))
+    for f in dataclasses.fields(tree):  # type: ignore[arg-type]
+        object.__setattr__(new, f.name, values.get(f.name, getattr(tree, f.name)))
+    return new

@@ -1,0 +1,18 @@
+"""Silences XLA in the processes of our own command lines; they import this module before JAX is loaded.
+
+XLA logs errors about tuning flags of cached programs, which are of no consequence, and reads its log level once, when it is
+loaded. In any other process nothing is changed.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+
+def is_command_line() -> bool:
+    """Returns whether this process runs `wbgs-jax` or `python -m wbgs_jax...`."""
+    return any(word == "wbgs_jax" or word.startswith("wbgs_jax.") or Path(word).name == "wbgs-jax" for word in sys.orig_argv)
+
+
+if is_command_line():
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -1,0 +1,107 @@
+"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset, Materials
+from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
+from wbgs_jax.data.splits import group_transmitters
+from wbgs_jax.types import Receiver, make_receiver, stack_receivers
+
+DATA_VARIABLE = "WBGS_DATA"
+"""Environment variable: a folder of scene files to use instead of those released with the package."""
+RELEASED = Path(__file__).parent / "released"
+"""Folder of the released scene files."""
+
+
+def load_dataset(
+    source: str | int | Path, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2
+) -> Dataset:
+    """Load a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout.
+
+    `frequency_hz`, `seed` and `test_fraction` are for folders that do not say (`wbgs_jax.data.layout.load_layout`); scene
+    files know their frequencies and their split.
+
+    Raises:
+        UserError: there is no such scene, or its files are missing or damaged.
+    """
+    from wbgs_jax.data.layout import load_layout  # here: `python -m wbgs_jax.data.layout` must not find itself imported
+
+    if (path := released_scenes().get(str(source))) is not None:
+        return scene_dataset(load_scene(path))
+    path = Path(str(source))
+    if path.is_dir():
+        return load_layout(path, frequency_hz=frequency_hz, seed=seed, test_fraction=test_fraction)
+    if path.suffix == ".npz":
+        return scene_dataset(load_scene(path))
+    known = ", ".join(released_scenes()) or f"none in {_scene_folder()} (make them with `make data`)"
+    raise UserError(f"there is no scene {str(source)!r}; give a released one ({known}), an .npz scene file or a folder")
+
+
+def scene_dataset(scene: SceneFile) -> Dataset:
+    """Returns the links of a scene file, transmitter by transmitter, then receiver by receiver, frequency fastest.
+
+    The split is the file's own. Links whose power is NaN, of a transmitter that a receiver does not hear, are left out.
+    """
+    links = _heard(scene)
+    tx, rx, freq = np.nonzero(links)
+    observed = {"snapshots": scene.snapshots, "images": scene.pas, "power_db": scene.power_db}
+    split = scene.split[tx]
+    return Dataset(
+        name=scene.name,
+        receivers=stack_receivers(_receivers(scene)),
+        tx_positions=scene.tx_positions[tx],
+        frequencies_hz=scene.frequencies_hz[freq],
+        receiver_index=rx,
+        tx_index=group_transmitters(scene.tx_positions[tx]),
+        train=np.flatnonzero(split == TRAIN),
+        validation=np.flatnonzero(split == VALIDATION),
+        test=np.flatnonzero(split == TEST),
+        **{key: None if values is None else values[links] for key, values in observed.items()},
+        vertices=scene.vertices,
+        faces=scene.faces,
+        face_part=scene.face_part,
+        materials=_materials(scene),
+    )
+
+
+def released_scenes() -> dict[str, Path]:
+    """Returns scene numbers ("1", "2", ...) and the scene files that hold them."""
+    files = {path.stem.removeprefix("scene"): path for path in _scene_folder().glob("scene*.npz")}
+    return dict(sorted(files.items(), key=lambda item: (len(item[0]), item[0])))
+
+
+def _scene_folder() -> Path:
+    folder = os.environ.get(DATA_VARIABLE)
+    return Path(folder) if folder else RELEASED
+
+
+def _heard(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
+    """Returns which links of a scene file were observed."""
+    return np.ones(scene.observations.shape[:3], bool) if scene.power_db is None else ~np.isnan(scene.power_db)
+
+
+def _receivers(scene: SceneFile) -> list[Receiver]:
+    named = scene.element_pattern
+    patterns = (named,) * len(scene.rx_position) if isinstance(named, str) else named
+    columns = zip(scene.rx_position, scene.rx_orientation, scene.element_positions, patterns, strict=True)
+    return [
+        make_receiver(position, orientation, elements, scene.element_unit, pattern)
+        for position, orientation, elements, pattern in columns
+    ]
+
+
+def _materials(scene: SceneFile) -> Materials | None:
+    """Returns what the triangles are made of: parts of one material and thickness share a material. None if the file does not
+    name its parts."""
+    parts = scene.meta.get("parts", [])
+    if len(parts) <= int(scene.face_part.max(initial=-1)):
+        return None
+    labels = [(str(part.get("material", part.get("name", i))), float(part.get("thickness", 0))) for i, part in enumerate(parts)]
+    kinds = sorted(set(labels))
+    material = np.array([kinds.index(label) for label in labels], np.int32)[scene.face_part]
+    return Materials(material, tuple(f"{name} {thickness:g}" for name, thickness in kinds), np.array([t for _, t in kinds]))

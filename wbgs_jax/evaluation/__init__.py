@@ -1,0 +1,1 @@
+"""Scores, baselines, reports and pictures of trained fields."""

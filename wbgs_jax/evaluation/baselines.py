@@ -1,0 +1,130 @@
+"""Baselines that learn nothing, reported beside every model: a model below inverse-distance weighting is of no use.
+
+A baseline takes indices of spectra of its data set and gives their predicted PAS. It looks at training spectra only; where
+a frequency does not occur among them, those of the nearest one (in log f) stand in.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas, steering_vector
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.radio.geometry import to_local
+
+Baseline = Callable[[Int[np.ndarray, "b"]], Float[np.ndarray, "b 90 360"]]
+
+BLOCK = 256
+"""Spectra held at a time: a scene has thousands, of 32,400 pixels each."""
+
+
+def baselines(dataset: Dataset) -> dict[str, Baseline]:
+    """Returns the baselines of a data set by name; each call gives float32 PAS (b, 90, 360) of b spectra.
+
+    Raises:
+        UserError: the data set has no training spectrum to predict from.
+    """
+    if len(dataset.train) == 0:
+        raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    return {
+        "mean_image": mean_image(dataset),
+        "nearest_tx": nearest_tx(dataset),
+        "inverse_distance": inverse_distance(dataset),
+        "line_of_sight": line_of_sight(dataset),
+    }
+
+
+def mean_image(dataset: Dataset) -> Baseline:
+    """Returns the mean of all training spectra, whatever is asked."""
+
+    @functools.cache
+    def mean() -> np.ndarray:
+        total = np.zeros(PAS_SHAPE)
+        for block in _blocks(dataset.train):
+            total += np.asarray(dataset.pas(block)).sum(0, dtype=np.float64)
+        return (total / len(dataset.train)).astype(np.float32)
+
+    return lambda index: np.tile(mean(), (len(index), 1, 1))
+
+
+def nearest_tx(dataset: Dataset) -> Baseline:
+    """Returns the training spectrum of the nearest transmitter at the same frequency and receiver."""
+
+    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+        predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
+        for chosen, neighbours in _by_frequency(dataset, index):
+            nearest = neighbours[_squared_distances(dataset, index[chosen], neighbours).argmin(1)]
+            for part, block in zip(_blocks(chosen), _blocks(nearest), strict=True):
+                predicted[part] = dataset.pas(block)
+        return predicted
+
+    return predict
+
+
+def inverse_distance(dataset: Dataset) -> Baseline:
+    """Returns the mean of all training spectra at the same frequency and receiver, weighted by 1/d^2 of their transmitters."""
+
+    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+        predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
+        for chosen, neighbours in _by_frequency(dataset, index):
+            # A square micrometre keeps a transmitter that itself trained (at another frequency) from dividing by zero.
+            weights = 1 / np.maximum(_squared_distances(dataset, index[chosen], neighbours), 1e-12)
+            weights = (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+            mixed = np.zeros((len(chosen), *PAS_SHAPE), np.float32)
+            for columns in _blocks(np.arange(len(neighbours))):
+                mixed += np.tensordot(weights[:, columns], np.asarray(dataset.pas(neighbours[columns])), 1)
+            predicted[chosen] = mixed
+        return predicted
+
+    return predict
+
+
+def line_of_sight(dataset: Dataset) -> Baseline:
+    """Returns the PAS of one plane wave from the transmitter's direction: geometry alone, also for directions below the
+    horizon."""
+
+    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+        predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
+        for number in np.unique(dataset.receiver_index[index]):
+            receiver = dataset.receiver(int(number))
+            for part in _blocks(np.flatnonzero(dataset.receiver_index[index] == number)):
+                query = dataset.query(index[part])
+                offsets = jnp.asarray(dataset.tx_positions[index[part]] - np.asarray(receiver.position), jnp.float32)
+                distances = jnp.linalg.norm(offsets, axis=-1, keepdims=True)
+                directions = to_local(offsets / jnp.maximum(distances, 1e-9), receiver.orientation)  # a TX at the receiver
+                elements = receiver.element_wavelengths(query.frequency_hz)
+                each = elements.ndim == 3
+                waves = (jax.vmap(steering_vector) if each else steering_vector)(elements, directions)
+                predicted[part] = snapshot_to_pas(waves, elements)
+        return predicted
+
+    return predict
+
+
+def _by_frequency(dataset: Dataset, index: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields for every receiver and frequency asked: places in `index`, and the training spectra to predict them from."""
+    asked, asked_of = dataset.frequencies_hz[index], dataset.receiver_index[index]
+    for number in np.unique(asked_of):
+        own = dataset.train[dataset.receiver_index[dataset.train] == number]
+        if not len(own):
+            raise UserError(f"{dataset.name} has no training spectra of receiver {number}; choose another split")
+        trained = dataset.frequencies_hz[own]
+        known = np.unique(trained)
+        for frequency in np.unique(asked[asked_of == number]):
+            stand_in = known[np.abs(np.log(known / frequency)).argmin()]
+            yield np.flatnonzero((asked == frequency) & (asked_of == number)), own[trained == stand_in]
+
+
+def _squared_distances(dataset: Dataset, index: np.ndarray, neighbours: np.ndarray) -> Float[np.ndarray, "b m"]:
+    """Square metres between transmitters, axis by axis to keep one (b, m) array rather than (b, m, 3)."""
+    a, b = dataset.tx_positions[index], dataset.tx_positions[neighbours]
+    return sum(((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3)), np.zeros((len(a), len(b))))
+
+
+def _blocks(index: np.ndarray) -> Iterator[np.ndarray]:
+    return (index[start : start + BLOCK] for start in range(0, len(index), BLOCK))

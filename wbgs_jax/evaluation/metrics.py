@@ -1,0 +1,86 @@
+"""How good predicted spectra are: SSIM (scikit-image's), PSNR and MAE, over all spectra and by frequency."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from skimage.metrics import structural_similarity
+
+from wbgs_jax._util.errors import UserError
+
+PSNR_LIMIT_DB = 100.0
+"""PSNR of a perfect prediction, which would be infinite and fit no report."""
+
+
+def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+    """Returns the structural similarity of every spectrum, float64: scikit-image, data_range 1, its default 7 x 7 window."""
+    pairs = zip(predicted, truth, strict=True)
+    return np.array([structural_similarity(p.astype(np.float64), t.astype(np.float64), data_range=1.0) for p, t in pairs])
+
+
+def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+    """Returns the mean absolute error of every spectrum, float64."""
+    pairs = zip(predicted, truth, strict=True)  # one by one: float64 copies of a whole scene are gigabytes
+    return np.array([np.mean(np.abs(p.astype(np.float64) - t)) for p, t in pairs])
+
+
+def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+    """Returns the peak signal-to-noise ratio (dB, peak 1) of every spectrum, float64, at most `PSNR_LIMIT_DB`."""
+    pairs = zip(predicted, truth, strict=True)
+    error = np.array([np.mean((p.astype(np.float64) - t) ** 2) for p, t in pairs])
+    return -10 * np.log10(np.maximum(error, 10 ** (-PSNR_LIMIT_DB / 10)))
+
+
+def score(
+    predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], frequencies_hz: Float[np.ndarray, "n"]
+) -> dict[str, Any]:
+    """Returns a report of predicted spectra, ready for JSON.
+
+    Returns:
+        n, median_ssim, mean_ssim, psnr_db (median), mae (mean), and per_frequency: a list, by ascending frequency, of the same
+        figures with frequency_ghz.
+
+    Raises:
+        UserError: there is no spectrum, or a prediction contains NaN or infinity.
+    """
+    if len(predicted) == 0:
+        raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
+    if broken := sum(not np.isfinite(p).all() for p in predicted):
+        raise UserError(f"{broken} of {len(predicted)} predicted spectra contain NaN or infinity; the model diverged")
+    values = {"ssim": ssim(predicted, truth), "psnr_db": psnr_db(predicted, truth), "mae": mae(predicted, truth)}
+    per_frequency = []
+    for frequency in np.unique(frequencies_hz):
+        chosen = {name: value[frequencies_hz == frequency] for name, value in values.items()}
+        per_frequency.append({"frequency_ghz": float(frequency / 1e9), **_summary(chosen)})
+    return {**_summary(values), "per_frequency": per_frequency}
+
+
+def score_power(
+    predicted: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"], frequencies_hz: Float[np.ndarray, "n"]
+) -> dict[str, Any]:
+    """Returns a report of received powers (dB), ready for JSON: n, power_error_db (median absolute error), per_frequency.
+
+    Raises:
+        UserError: there is no link, or a prediction is NaN or infinite.
+    """
+    if len(predicted) == 0:
+        raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
+    error = np.abs(predicted.astype(np.float64) - truth)
+    if not np.isfinite(error).all():
+        raise UserError(f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged")
+
+    def summary(chosen: np.ndarray) -> dict[str, Any]:
+        return {"n": len(chosen), "power_error_db": float(np.median(chosen))}
+
+    rows = [{"frequency_ghz": float(f / 1e9)} | summary(error[frequencies_hz == f]) for f in np.unique(frequencies_hz)]
+    return summary(error) | {"per_frequency": rows}
+
+
+def _summary(values: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {
+        "n": len(values["ssim"]),
+        "median_ssim": float(np.median(values["ssim"])),
+        "mean_ssim": float(np.mean(values["ssim"])),
+        "psnr_db": float(np.median(values["psnr_db"])),
+        "mae": float(np.mean(values["mae"])),
+    }

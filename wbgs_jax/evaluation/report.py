@@ -1,0 +1,106 @@
+"""Reports for people and for files: tables, and where a figure comes from."""
+
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.table import Table
+
+import wbgs_jax
+from wbgs_jax.config import to_dict
+from wbgs_jax.inference.predictor import Trained
+
+
+def environment() -> dict[str, Any]:
+    """Returns code version and device of this process."""
+    describe = ["git", "describe", "--always", "--dirty"]
+    git = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
+    device = jax.devices()[0]
+    return {
+        "version": wbgs_jax.__version__,
+        "commit": git.stdout.strip() or None,
+        "device": device.device_kind if device.platform != "cpu" else f"cpu {platform.machine()}",
+        "jax": jax.__version__,
+    }
+
+
+def provenance(trained: Any) -> dict[str, Any]:
+    """Returns where the figures of a trained field come from; `trained` is a `training.run_folder.TrainedField`."""
+    return environment() | {
+        "command": " ".join(["wbgs-jax train", *_training_arguments(trained.config)]),
+        "preset": trained.config.preset,
+        "seed": trained.config.seed,
+        "steps": trained.step,
+        "training_seconds": round(trained.seconds, 1),
+        **trained.field.sizes(trained.params),
+        "settings": to_dict(trained.config.settings, trained.config.field),
+    }
+
+
+def _training_arguments(config: Any) -> list[str]:
+    source = Path(config.source)
+    data = ["--data", source.name] if source.is_dir() else ["--scene", source.name]
+    if config.frequency_ghz is not None:
+        data += ["--frequency-ghz", f"{config.frequency_ghz:g}"]
+    if config.train_ghz:
+        data += ["--train-ghz", *(f"{f:g}" for f in config.train_ghz)]
+    if config.train_tx:
+        data += ["--train-tx", str(config.train_tx)]
+    if config.validation:
+        data += ["--validation", f"{config.validation:g}"]
+    return [*data, "--field", config.field, "--preset", config.preset, "--seed", str(config.seed)]
+
+
+def device_name() -> str:
+    """Returns a short name of the device for file names: cpu, or the GPU's kind."""
+    device = jax.devices()[0]
+    return "cpu" if device.platform == "cpu" else device.device_kind.lower().replace("nvidia", "").strip().replace(" ", "-")
+
+
+def result_path(folder: Path, report: dict[str, Any], preset: str) -> Path:
+    """Returns FOLDER/quality_<dataset>_<field>_<preset>_<device>.json."""
+    return folder / f"quality_{report['scene']}_{report['field']}_{preset}_{device_name()}.json"
+
+
+def table(report: dict[str, Any]) -> Table:
+    """Returns the report as a table: one row a frequency, the baselines beside the field."""
+    if "median_ssim" not in report:
+        return _power_table(report)
+    names = list(report["baselines"])
+    part = "held-out" if report["part"] == "test" else "validation"
+    result = Table(title=f"{report['scene']}, {report['field']}: {part} SSIM (median / mean) of {report['n']} spectra")
+    for column in ("GHz", report["field"], *(name.replace("_", " ") for name in names), "PSNR dB", "MAE"):
+        result.add_column(column, justify="right")
+
+    def row(label: str, own: dict[str, Any], others: list[dict[str, Any]]) -> None:
+        pair = [f"{r['median_ssim']:.3f} / {r['mean_ssim']:.3f}" for r in (own, *others)]
+        result.add_row(label, *pair, f"{own['psnr_db']:.1f}", f"{own['mae']:.3f}")
+
+    for i, own in enumerate(report["per_frequency"]):
+        row(f"{own['frequency_ghz']:g}", own, [report["baselines"][name]["per_frequency"][i] for name in names])
+    result.add_section()
+    row("all", report, [report["baselines"][name] for name in names])
+    return result
+
+
+def _power_table(report: dict[str, Any]) -> Table:
+    result = Table(title=f"{report['scene']}, {report['field']}: received power of {report['n']} held-out links")
+    for column in ("GHz", "median error dB"):
+        result.add_column(column, justify="right")
+    for own in report["per_frequency"]:
+        result.add_row(f"{own['frequency_ghz']:g}", f"{own['power_error_db']:.2f}")
+    result.add_section()
+    result.add_row("all", f"{report['power_error_db']:.2f}")
+    return result
+
+
+def closing_lines(report: dict[str, Any], block: int) -> list[str]:
+    """Returns what stands below the table."""
+    lines = []
+    if "snapshot_correlation" in report:
+        alike, error = report["snapshot_correlation"], report["power_error_db"]
+        lines.append(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")
+    single = report["ms_per_pas_single"]
+    return [*lines, f"{report['ms_per_pas']:.2f} ms a PAS in blocks of {block}, {single:.2f} ms for a single query"]

@@ -1,0 +1,95 @@
+"""How good a trained field is on held-out links: figures of every kind that field and data have, beside the baselines."""
+
+import time
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.evaluation import metrics
+from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.predictor import BLOCK, Trained, observe_links, render_pas
+from wbgs_jax.radio import channel
+
+Part = Literal["test", "validation"]
+"""What is held out: for the final figures, or for choices."""
+
+
+def evaluate(
+    trained: Trained, dataset: Dataset, part: Part = "test"
+) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
+    """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
+
+    Raises:
+        UserError: nothing is held out, or the field knows nothing of what was observed.
+    """
+    index = held_out(dataset, part)
+    seen = observe_links(trained.field, trained.params, dataset, index)
+    report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
+    report |= figures(seen, dataset, index) | time_queries(trained, dataset)
+    if dataset.kind != "power":
+        truth, frequencies = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index]
+        report["baselines"] = {
+            name: metrics.score(np.asarray(predict(index)), truth, frequencies) for name, predict in baselines(dataset).items()
+        }
+    return report, np.asarray(seen.pas)
+
+
+def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
+    """Returns the indices of the held-out links; none at all is a `UserError`."""
+    index = getattr(dataset, part)
+    if not len(index):
+        raise UserError(f"{dataset.name} has no {part} spectra; choose another split")
+    return index
+
+
+def figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any]:
+    """Returns the figures of observed links: of spectra, of snapshots where both have them, of power where it is all there is."""
+    frequencies = dataset.frequencies_hz[index]
+    if dataset.kind == "power":
+        if seen.power_db is None or dataset.power_db is None:
+            raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
+        return metrics.score_power(np.asarray(seen.power_db), dataset.power_db[index], frequencies)
+    report = metrics.score(np.asarray(seen.pas), np.asarray(dataset.pas(index)), frequencies)
+    if seen.snapshots is not None and dataset.snapshots is not None:
+        report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
+    return report
+
+
+def score_snapshots(
+    predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]
+) -> dict[str, float]:
+    """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB)."""
+    error = np.abs(np.asarray(channel.received_power_db(predicted)) - np.asarray(channel.received_power_db(truth)))
+    return {
+        "snapshot_correlation": float(np.median(np.asarray(channel.correlation(truth, predicted)))),
+        "power_error_db": float(np.median(error)),
+    }
+
+
+def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Mapping[str, float]:
+    """Returns the figure that the curves of a training show of some held-out links."""
+    seen = observe_links(field, params, dataset, index)
+    if dataset.kind == "power":
+        return {"held_out_power_error_db": figures(seen, dataset, index)["power_error_db"]}
+    return {"held_out_ssim": float(np.median(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index)))))}
+
+
+def time_queries(trained: Trained, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
+    """Returns milliseconds a PAS, for single queries and in blocks: medians over repeats after compilation."""
+    plan = trained.field.plan(trained.params, dataset.receiver())
+    result = {}
+    for name, size in (("ms_per_pas", BLOCK), ("ms_per_pas_single", 1)):
+        query = dataset.query(np.resize(dataset.test if len(dataset.test) else dataset.train, size))
+        seconds = []
+        for _ in range(repeats + 1):
+            begin = time.perf_counter()
+            jax.block_until_ready(render_pas(trained.field, trained.params, plan, query))
+            seconds.append(time.perf_counter() - begin)
+        result[name] = round(1e3 * float(np.median(seconds[1:])) / size, 3)  # the first call compiles
+    return result

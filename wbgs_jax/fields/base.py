@@ -1,0 +1,215 @@
+"""The seam between models and everything else.
+
+A field is a small frozen object: its settings and what never changes (where Gaussians start, the frame of its inputs, the
+facets of a mesh). What is trained lives in `params`, a pytree of floats. All methods but those that say "host" are pure and
+jittable; a field is itself a pytree, so it passes through `jax.jit` as an argument. Training, evaluation, predictors, export
+and experiments ask a field nothing else.
+"""
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, Key
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import from_leaves
+from wbgs_jax.config import PRESETS, Settings
+from wbgs_jax.fields.losses import image_loss
+from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
+
+Quantity = Literal["pas", "snapshots", "power", "paths"]
+"""What a field may know of a link."""
+
+
+class Observation(NamedTuple):
+    """What a field says of B links of one receiver."""
+
+    pas: Float[Array, "b 90 360"]
+    """Normalised power angular spectra."""
+    snapshots: Complex[Array, "b elements"] | None = None
+    """Complex array snapshots, of a field that knows phases."""
+    power_db: Float[Array, "b"] | None = None
+    """Received power relative to the transmitted power (dB), of a field that knows it."""
+
+
+class Aux(NamedTuple):
+    """What a step reports beside its loss."""
+
+    metrics: dict[str, Float[Array, ""]]
+    """Figures for the curves; NaN where a figure means nothing."""
+    required: Int[Array, "k"] | None = None
+    """What the limits should have been; None for a field without limits."""
+    overflow: Bool[Array, ""] | None = None
+    """The limits were too small: the step must not be used."""
+
+
+class Group(NamedTuple):
+    """How a group of parameters is optimised, by Adam."""
+
+    learning_rate: float
+    weight_decay: float = 0.0
+    """Decoupled weight decay."""
+    eps: float = 1e-15
+    """Adam's epsilon."""
+
+
+class Field(ABC):
+    """A model. Subclasses are decorated with `pytree` and declare `config` as their static field."""
+
+    name: ClassVar[str]
+    """What command lines and files call it."""
+    presets: ClassVar[Mapping[str, Settings]] = PRESETS
+    """Settings by preset; `Settings.field` has the type of `config`."""
+    gives: ClassVar[tuple[Quantity, ...]] = ("pas",)
+    """What it knows of a link."""
+    controls: ClassVar[tuple[str, ...]] = ()
+    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`."""
+    config: Any
+
+    @classmethod
+    def check(cls, config: Any) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+
+    @classmethod
+    def make(cls, config: Any, scene: Scene, seed: int) -> "Field":
+        """Returns the field of a scene (host)."""
+        return cls(config)  # type: ignore[call-arg]
+
+    @abstractmethod
+    def init(self, key: Key[Array, ""]) -> Any:
+        """Returns initial parameters: only what is trained, all floats."""
+
+    @abstractmethod
+    def plan(self, params: Any, receiver: Receiver, limits: Any = None, cache: Any = None) -> Any:
+        """Returns what is independent of the query.
+
+        A plan that is made outside of a differentiated function is a constant to its gradient: parameters that it holds get
+        none, or a part. `pas` plans inside. Under jit a field with `limits` needs them, and one that plans on the host the
+        `cache` of its links.
+        """
+
+    @abstractmethod
+    def render(self, params: Any, plan: Any, query: Query) -> Observation:
+        """Returns what the receiver of a plan observes for B queries."""
+
+    def prepare(self, links: Links, receivers: Receiver) -> Any:
+        """Returns what can be known of links before training (host); `receivers` has a leading axis."""
+        return None
+
+    def render_links(self, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
+        """Returns what `render` does, for links that `prepare` has seen."""
+        return self.render(params, plan, links.query)
+
+    def probe(self, params: Any) -> Any:
+        """Returns zeros that `loss` adds where a host control wants to know the gradient; nothing by default."""
+        return ()
+
+    def loss(
+        self, params: Any, cache: Any, batch: Batch, limits: Any = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the loss of a batch. By default it compares spectra, and power where the data have nothing else."""
+        plan = self.plan(params, batch.receiver, limits, cache)
+        seen = self.render_links(params, plan, cache, batch.links)
+        return compare(seen, batch)
+
+    def limits(self, params: Any, receivers: Receiver) -> Any:
+        """Returns the static sizes that planning needs under jit, hashable, with room to grow (host); None if it needs none."""
+        return None
+
+    def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:
+        """Returns limits that hold what an overflowed step required (host)."""
+        raise NotImplementedError("a field without limits does not overflow")
+
+    def arrivals(self, params: Any, plan: Any, query: Query) -> Arrivals:
+        """Returns what arrives over every path, of a field whose `gives` names "paths"."""
+        raise NotImplementedError(f"the {self.name} field knows no paths")
+
+    def portable(self, plan: Any) -> Any:
+        """Returns the plan without what is cheaply computed again from the parameters: what a file holds of it."""
+        return plan
+
+    def sizes(self, params: Any) -> dict[str, int]:
+        """Returns the numbers that tell how large a trained field is, for reports (host)."""
+        return {"parameters": sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))}
+
+    @classmethod
+    def groups(cls, config: Any) -> dict[str, Group]:
+        """Returns the optimiser's groups by name."""
+        return {"all": Group(1e-2)}
+
+    @classmethod
+    def labels(cls, params: Any) -> Any:
+        """Returns the group of every parameter: a tree of names, or a prefix of one."""
+        return jax.tree.map(lambda _: "all", params)
+
+
+def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2) -> tuple[Float[Array, ""], Aux]:
+    """Returns the image loss (paper, equation 5) of observed spectra, or the mean squared error in dB of received power."""
+    if batch.pas is not None:
+        loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight)
+        return loss, Aux({"batch_ssim": similarity})
+    if seen.power_db is None or batch.power_db is None:
+        raise UserError("these data are received powers, of which this field knows nothing; choose another field")
+    return jnp.mean((seen.power_db - batch.power_db) ** 2), Aux({})
+
+
+def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any = None) -> Float[Array, "b 90 360"]:
+    """Returns the power angular spectra of B queries: the differentiable function from parameters, receiver and query.
+
+    Nothing is frozen: the plan is made inside. Under `jit` or `grad` a field with limits needs them given
+    (`field.limits(params, receiver)`, on the host); too small ones give NaN, never a wrong spectrum. Reverse mode only.
+    """
+    return field.render(params, field.plan(params, receiver, limits), query).pas
+
+
+def from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) -> Field:
+    """Returns a field from its flattened arrays, `{".frame.centre": array, ...}`, and its settings."""
+    return from_leaves(cls, arrays, {"config": config})
+
+
+def single_receiver(receivers: Receiver, name: str) -> Receiver:
+    """Returns the only receiver; more than one is a `UserError`."""
+    count = receivers.position.shape[0]
+    if count != 1:
+        raise UserError(f"the {name} field knows one receiver, and the data have {count}; choose one (--receiver 0)")
+    return jax.tree.map(lambda leaf: leaf[0], receivers)
+
+
+_FIELDS: dict[str, type[Field]] = {}
+
+
+def register(cls: type[Field]) -> type[Field]:
+    """Makes a field known to command lines and run folders by its name; usable as a decorator."""
+    _FIELDS[cls.name] = cls
+    return cls
+
+
+def field_names() -> list[str]:
+    """Returns the names of all registered fields."""
+    return list(_FIELDS)
+
+
+def get_field(name: str) -> type[Field]:
+    """Returns the class of a field by its name; an unknown name is a `UserError`."""
+    if name not in _FIELDS:
+        raise UserError(f"unknown field {name!r}; choose one of: {', '.join(_FIELDS)}")
+    return _FIELDS[name]
+
+
+def default_field() -> str:
+    """Returns the name of the field that is trained where none is asked for: the paper's."""
+    return "wideband"
+
+
+def with_field(presets: Mapping[str, Settings], configs: Mapping[str, Any], **sections: Mapping[str, Any]) -> dict[str, Settings]:
+    """Returns presets with a field's settings in them, and other sections where given, by preset."""
+    return {
+        name: dataclasses.replace(base, field=configs[name], **{key: values[name] for key, values in sections.items()})
+        for name, base in presets.items()
+    }

@@ -1,0 +1,93 @@
+"""Training losses on PAS images: L = (1 - lambda) L1 + lambda (1 - SSIM)  (paper, equation 5)."""
+
+import functools
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax.radio.array import EXACT, squared_magnitude
+
+_WINDOW, _SIGMA = 11, 1.5
+FAINTEST = 1e-12
+"""Power relative to the truth's, below which predictions are all the same to the loss: a prediction of nearly nothing has no
+gradient that leads anywhere."""
+GOOD_MATCH = 2e-3
+"""One minus the squared correlation below which two snapshots are the same to a search."""
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+@functools.lru_cache
+def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
+    """Returns the banded matrix that blurs one axis, valid region only."""
+    offset = np.arange(_WINDOW) - _WINDOW // 2
+    window = np.exp(-(offset**2) / (2 * _SIGMA**2))
+    window /= window.sum()
+    matrix = np.zeros((size - _WINDOW + 1, size))
+    for row in range(len(matrix)):
+        matrix[row, row : row + _WINDOW] = window
+    return matrix
+
+
+def _blur(images: Float[Array, "*n h w"]) -> Float[Array, "*n h_valid w_valid"]:
+    """Returns the separable Gaussian blur as two matrix products: forward and backward 16-30 times faster than convolutions or shifted
+    sums on a CPU. Full precision: variances are differences of large numbers."""
+    rows, columns = (jnp.asarray(_blur_matrix(n), images.dtype) for n in images.shape[-2:])
+    return jnp.matmul(jnp.matmul(rows, images, precision=EXACT), columns.T, precision=EXACT)
+
+
+def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"]) -> Float[Array, "*n"]:
+    """Returns the differentiable mean SSIM of images with a data range of 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
+    mean_a, mean_b = _blur(a), _blur(b)
+    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
+    covariance = _blur(a * b) - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
+    structure = (2 * covariance + _C2) / (var_a + var_b + _C2)
+    return jnp.mean(luminance * structure, axis=(-2, -1))
+
+
+def snapshot_losses(
+    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns (correlation_loss, power_loss): one minus the squared correlation |y^H y'| / (|y| |y'|), and the squared error
+    of the log amplitude of the whole array (nepers), means over snapshots.
+
+    The correlation is blind to a common phase and scale.
+    """
+    squared_correlation, power = _correlation_and_power(predicted, truth)
+    return jnp.mean(1 - squared_correlation), jnp.mean((0.5 * jnp.log(power)) ** 2)
+
+
+def log_decorrelation(
+    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
+) -> Float[Array, "*n"]:
+    """Returns log(1 - correlation^2): the log-likelihood, up to its sign, where every snapshot has a noise of its own, unknown
+    level. No match is perfect (`GOOD_MATCH`)."""
+    squared_correlation, _ = _correlation_and_power(predicted, truth)
+    return jnp.log(1 - squared_correlation + GOOD_MATCH)
+
+
+def _correlation_and_power(
+    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Returns |y^H y'|^2 / (|y|^2 |y'|^2) and |y'|^2 / |y|^2."""
+    scale = jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
+    unit_truth, relative = truth / scale, predicted / scale
+    power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
+    return squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power, power
+
+
+def image_loss(
+    predicted: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], ssim_weight: float = 0.2
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Returns the mean loss over the images (paper, equation 5), and their mean SSIM."""
+    l1 = jnp.mean(jnp.abs(predicted - truth))
+    similarity = jnp.mean(ssim(predicted, truth))
+    return (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity), similarity
+
+
+def pixel_loss(predicted: Float[Array, "*n"], truth: Float[Array, "*n"], kind: Literal["l1", "l2"]) -> Float[Array, ""]:
+    """Returns the mean absolute or squared error, for pixels that make no image."""
+    error = predicted - truth
+    return jnp.mean(jnp.abs(error) if kind == "l1" else error**2)

@@ -1,0 +1,1 @@
+"""A trained field as a function, over maps, and as a file."""

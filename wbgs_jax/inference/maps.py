@@ -1,0 +1,55 @@
+"""Many queries at once: lists and maps of transmitters, in blocks of one compiled shape."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax.inference.predictor import BLOCK, Predictor
+from wbgs_jax.radio.array import PAS_SHAPE
+
+
+def predict_blocks(
+    predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
+) -> Iterator[Float[np.ndarray, "k 90 360"]]:
+    """Yields spectra (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
+
+    Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation.
+    """
+    positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
+    frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
+    n = len(positions)
+    for start in range(0, n, block):
+        index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up
+        yield np.asarray(predict(positions[index], frequencies[index]))[: n - start]
+
+
+def predict_many(
+    predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
+) -> Float[np.ndarray, "n 90 360"]:
+    """Returns all blocks of `predict_blocks` in one array."""
+    images = np.empty((len(np.atleast_2d(tx_positions)), *PAS_SHAPE), np.float32)
+    done = 0
+    for part in predict_blocks(predict, tx_positions, frequencies_hz, block):
+        images[done : done + len(part)] = part
+        done += len(part)
+    return images
+
+
+def map_queries(
+    xs: Any, ys: Any, height: float, frequencies_hz: Any
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Returns positions and frequencies of a map at one height: the x of the grid runs fastest, then y, then the frequency.
+
+    Metres and hertz; results of n = frequencies * ys * xs queries reshape to (frequencies, ys, xs, ...).
+    """
+    frequency, y, x = np.meshgrid(np.atleast_1d(frequencies_hz), np.atleast_1d(ys), np.atleast_1d(xs), indexing="ij")
+    return np.stack([x, y, np.full(x.shape, height)], -1).reshape(-1, 3).astype(float), frequency.reshape(-1).astype(float)
+
+
+def predict_map(
+    predict: Predictor, xs: Any, ys: Any, height: float, frequencies_hz: Any, block: int = BLOCK
+) -> Float[np.ndarray, "n 90 360"]:
+    """Returns the spectra (float32, 130 kB each) of a map of transmitters, in the order of `map_queries`."""
+    return predict_many(predict, *map_queries(xs, ys, height, frequencies_hz), block)

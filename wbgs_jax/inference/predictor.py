@@ -1,0 +1,117 @@
+"""Asking a trained field: as a pure function of (transmitter, frequency), or about the links of a dataset."""
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.fields import Field, Observation
+from wbgs_jax.radio.array import PAS_SHAPE
+from wbgs_jax.types import Links, Query, Receiver, check_query
+
+BLOCK = 16
+"""Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
+
+Predictor = Callable[[Any, Any], Array]
+"""(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360); leading axes broadcast like NumPy's."""
+
+
+@runtime_checkable
+class Trained(Protocol):
+    """A field with parameters, and the data it was trained on (`training.run_folder.TrainedField`)."""
+
+    field: Field
+    params: Any
+
+    def dataset(self) -> Dataset:
+        """Returns the data."""
+        ...
+
+    def origin(self) -> dict[str, Any]:
+        """Returns where it comes from: field, preset, seed and step."""
+        ...
+
+
+def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
+    """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, for `jit`, `vmap` and one reverse-mode
+    `grad`.
+
+    What does not depend on the query is planned here, once, for the receiver (default: the first of the data the field was
+    trained on, which are read for it). Compiles for every new number of queries; `maps.predict_many` keeps that number fixed.
+    """
+    receiver = trained.dataset().receiver() if receiver is None else receiver
+    plan = trained.field.plan(trained.params, receiver)
+    return on_any_shape(lambda query: render_pas(trained.field, trained.params, plan, query))
+
+
+@jax.jit
+def render_pas(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, "b 90 360"]:
+    """Returns the spectra of B queries; fields of equal shapes share one compilation."""
+    return field.render(params, plan, query).pas
+
+
+@jax.jit
+def _observe(field: Field, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
+    return field.render_links(params, plan, cache, links)
+
+
+def on_any_shape(render: Callable[[Query], Any]) -> Predictor:
+    """Lets a function of a flat batch of queries take positions (*b, 3) and frequencies (*b,) whose leading axes broadcast."""
+
+    def predict(tx_position: Any, frequency_hz: Any) -> Float[Array, "*b 90 360"]:
+        position, frequency = jnp.asarray(tx_position, jnp.float32), jnp.asarray(frequency_hz, jnp.float32)
+        if position.shape[-1:] != (3,):
+            raise ValueError(f"tx_position has shape {position.shape}; expected (3,) or (..., 3)")
+        shape = jnp.broadcast_shapes(position.shape[:-1], frequency.shape)
+        position, frequency = jnp.broadcast_to(position, (*shape, 3)), jnp.broadcast_to(frequency, shape)
+        query = Query(position.reshape(-1, 3), frequency.reshape(-1))
+        check_query(query)
+        if 0 in shape:
+            return jnp.zeros((*shape, *PAS_SHAPE), jnp.float32)
+        return render(query).reshape(*shape, *PAS_SHAPE)
+
+    return predict
+
+
+def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
+    """Returns what a field says of some of a dataset's links, as NumPy arrays in their order.
+
+    What it can know of links beforehand is prepared once; links are rendered in blocks of one shape, receiver by receiver.
+    """
+    links = dataset.links(index)
+    cache = field.prepare(links, dataset.receivers)
+    total: Observation | None = None
+    for number in np.unique(dataset.receiver_index[index]):
+        plan = field.plan(params, dataset.receiver(int(number)), None, cache)
+        of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
+        for start in range(0, len(of_receiver), BLOCK):
+            block = of_receiver[start : start + BLOCK]
+            filled = np.concatenate([block, np.repeat(block[-1:], BLOCK - len(block))])  # the last link fills the last block up
+            seen = _observe(field, params, plan, cache, jax.tree.map(lambda leaf, i=filled: leaf[i], links))
+            total = _like(seen, len(index)) if total is None else total
+            _put(total, block, seen)
+    return total if total is not None else Observation(np.zeros((0, *PAS_SHAPE), np.float32))
+
+
+def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:
+    """Returns the predicted spectra (float32) of some of a dataset's links."""
+    return np.asarray(observe_links(field, params, dataset, index).pas)
+
+
+def _like(seen: Observation, n: int) -> Observation:
+    return jax.tree.map(lambda leaf: np.empty((n, *leaf.shape[1:]), leaf.dtype), seen)
+
+
+def _put(total: Observation, place: Int[np.ndarray, "k"], seen: Observation) -> None:
+    for own, new in zip(jax.tree.leaves(total), jax.tree.leaves(seen), strict=True):
+        own[place] = np.asarray(new)[: len(place)]
+
+
+def trained_band(dataset: Dataset) -> tuple[float, float]:
+    """Returns the lowest and the highest frequency (hertz) of the training links."""
+    frequencies = dataset.frequencies_hz[dataset.train]
+    return float(frequencies.min()), float(frequencies.max())

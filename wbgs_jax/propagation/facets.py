@@ -1,0 +1,211 @@
+"""A mesh as a few planar facets: convex polygons of three or four corners, merged from coplanar triangles of one body.
+
+Facets are what reflects, transmits and shades. They tile every planar piece of the mesh without gaps or overlaps. A body is
+what they are merged in, and what edges are searched in (`edges.py`): an object of the scene, or several open sheets of one
+material that meet, such as the walls of a room. Objects that are closed stay apart even where they touch. Runs on the host.
+"""
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.types import Mesh
+
+AnyArray = Array | np.ndarray
+"""Geometry is found in NumPy, in double precision, and used in JAX."""
+CORNERS = 4
+WELD = 1e-5
+"""Metres: corners nearer than this are one."""
+SMALLEST_AREA = 1e-10
+"""Square metres: smaller triangles are no surface."""
+FLAT = 1e-4
+"""Sine of the largest angle between normals of one plane, and between edges of one straight line."""
+Polygon = list[int]
+
+
+@pytree
+class Facets:
+    """F planar convex polygons. A triangle repeats its last corner."""
+
+    corners: Float[AnyArray, "f 4 3"]
+    """World frame, metres, counter-clockwise around the normal."""
+    normal: Float[AnyArray, "f 3"]
+    """Unit vectors, world frame."""
+    offset: Float[AnyArray, "f"]
+    """Distance of the plane from the origin along the normal, metres."""
+    body: Int[AnyArray, "f"]
+    """What a facet may have edges with: the object that it belongs to, or the open sheets of its material that meet."""
+    material: Int[AnyArray, "f"]
+    """Index of the mesh's material."""
+
+
+@pytree
+class Outline:
+    """The sides of all facets: a point of the plane lies inside where inward . point >= offset for all four."""
+
+    inward: Float[AnyArray, "f 4 3"]
+    """Unit vectors in the plane, world frame; zero for a side of no length."""
+    offset: Float[AnyArray, "f 4"]
+    """Metres."""
+
+
+def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
+    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first, at most `most` of them."""
+    points, index = _weld(np.asarray(mesh.vertices, np.float64))
+    triangles, material = index[np.asarray(mesh.faces)], np.asarray(mesh.material)
+    body = _bodies(triangles, np.asarray(mesh.part), material)
+    normal, area = _normals(points, triangles)
+    keep = area > SMALLEST_AREA
+    triangles, normal, body, material = triangles[keep], normal[keep], body[keep], material[keep]
+    polygons: list[Polygon] = []
+    first = []  # triangle of every polygon's plane
+    for group in _coplanar(triangles, normal, body):
+        merged = _merge(points, triangles[group].tolist(), normal[group[0]])
+        polygons += merged
+        first += [group[0]] * len(merged)
+    rows = [polygon + polygon[-1:] * (CORNERS - len(polygon)) for polygon in polygons]
+    corners = points[np.array(rows, int).reshape(-1, CORNERS)]
+    normals, sizes = _polygon_normals(corners)
+    order = np.argsort(-sizes, kind="stable")[:most]
+    owner = np.array(first, int)[order]
+    offset = np.sum(normals[order] * corners[order].mean(1), -1)
+    return Facets(corners[order], normals[order], offset, body[owner].astype(np.int32), material[owner].astype(np.int32))
+
+
+def outline_of(facets: Facets) -> Outline:
+    """Returns the sides of all facets (float64)."""
+    corners = np.asarray(facets.corners, np.float64)
+    along = np.roll(corners, -1, 1) - corners
+    inward = np.cross(np.asarray(facets.normal)[:, None], along)
+    length = np.linalg.norm(inward, axis=-1, keepdims=True)
+    inward = np.where(length > WELD, inward / np.maximum(length, WELD), 0)
+    return Outline(inward, np.sum(inward * corners, -1))
+
+
+def areas(facets: Facets) -> Float[np.ndarray, "f"]:
+    """Returns the areas of all facets in square metres."""
+    return _polygon_normals(np.asarray(facets.corners))[1]
+
+
+def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "v"]]:
+    """Returns the corners without duplicates, and the new index of every vertex."""
+    pairs = cKDTree(vertices).query_pairs(WELD, output_type="ndarray")
+    index = _components(len(vertices), pairs[:, 0], pairs[:, 1])
+    _, first = np.unique(index, return_index=True)
+    return vertices[first], index
+
+
+def _components(count: int, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"]) -> Int[np.ndarray, "nodes"]:
+    """Returns which connected component each of `count` nodes is in; components are numbered by their first nodes."""
+    joined = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    return connected_components(joined, directed=False)[1]
+
+
+def _sides(triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "sides 2"]:
+    """Returns the three sides of every triangle, the smaller corner first."""
+    return np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+
+
+def _bodies(
+    triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, "t"], material: Int[np.ndarray, "t"]
+) -> Int[np.ndarray, "t"]:
+    """Returns the body of every triangle: its part, or all open parts of its material that meet in corners of their borders.
+
+    A part is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
+    blocks of one object that touch along an edge share it four times, and are closed.)
+    """
+    pieces, piece = np.unique(np.stack([part, material], 1), axis=0, return_inverse=True)
+    piece, sides = piece.reshape(-1), _sides(triangles)
+    proper = sides[:, 0] != sides[:, 1]
+    rows, count = np.unique(np.column_stack([np.repeat(piece, 3), sides])[proper], axis=0, return_counts=True)
+    border = rows[count % 2 == 1]
+    owner, corner = np.repeat(border[:, 0], 2), border[:, 1:].reshape(-1)
+    _, shared = np.unique(np.column_stack([pieces[owner, 1], corner]), axis=0, return_inverse=True)
+    # A graph whose nodes are the parts, and behind them the corners of borders, one for each material that meets there.
+    label = _components(len(pieces) + len(owner), owner, len(pieces) + shared.reshape(-1))
+    return label[piece]
+
+
+def _normals(
+    points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]]:
+    """Returns unit normals and areas (square metres) of triangles."""
+    a, b, c = points[triangles].swapaxes(0, 1)
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=-1)
+    return cross / np.maximum(length, 1e-30)[:, None], length / 2
+
+
+def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f"]]:
+    """Returns unit normals and areas (square metres) of polygons."""
+    cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    cross = np.where(
+        np.linalg.norm(corners[:, 3] - corners[:, 2], axis=-1, keepdims=True) < WELD,
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+        cross,
+    )
+    length = np.linalg.norm(cross, axis=-1)
+    return cross / np.maximum(length, 1e-30)[:, None], length / 2
+
+
+def _coplanar(
+    triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]
+) -> list[Int[np.ndarray, "k"]]:
+    """Returns the triangles of one body that share sides and a plane, as groups of indices."""
+    named = np.column_stack([np.repeat(body, 3), _sides(triangles)])
+    _, first, which = np.unique(named, axis=0, return_index=True, return_inverse=True)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    other = owner[first[which.reshape(-1)]]
+    flat = _parallel(normal[owner], normal[other])
+    label = _components(len(triangles), owner[flat], other[flat])
+    by_group = np.argsort(label, kind="stable")
+    return np.split(by_group, np.flatnonzero(np.diff(label[by_group])) + 1)
+
+
+def _parallel(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Returns whether unit normals agree."""
+    return (np.linalg.norm(np.cross(a, b), axis=-1) < FLAT) & (np.sum(a * b, -1) > 0)
+
+
+def _merge(points: Float[np.ndarray, "w 3"], polygons: list[Polygon], normal: Float[np.ndarray, "3"]) -> list[Polygon]:
+    """Returns polygons with neighbours joined while the union is convex with at most four corners."""
+    merged = True
+    while merged:
+        merged = False
+        owner: dict[tuple[int, int], int] = {}
+        for i, polygon in enumerate(polygons):
+            for side in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+                owner[side] = i
+        used: set[int] = set()
+        joined: list[Polygon] = []
+        for (u, v), i in owner.items():
+            j = owner.get((v, u))
+            if j is None or i == j or i in used or j in used:
+                continue
+            union = _join(points, polygons[i], polygons[j], u, v, normal)
+            if union is not None:
+                joined.append(union)
+                used |= {i, j}
+                merged = True
+        polygons = [polygon for i, polygon in enumerate(polygons) if i not in used] + joined
+    return polygons
+
+
+def _join(
+    points: Float[np.ndarray, "w 3"], first: Polygon, second: Polygon, u: int, v: int, normal: Float[np.ndarray, "3"]
+) -> Polygon | None:
+    """Returns the union over the side u-v, without corners on straight lines; None unless convex with at most four corners."""
+    i, j = first.index(v), second.index(u)
+    ring = first[i:] + first[:i] + (second[j:] + second[:j])[1:-1]
+    corners = []
+    for before, here, after in zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1], strict=True):
+        a, b = points[here] - points[before], points[after] - points[here]
+        turn = np.cross(a, b) @ normal / (np.linalg.norm(a) * np.linalg.norm(b))
+        if turn < -FLAT:
+            return None
+        if turn > FLAT:
+            corners.append(here)
+    return corners if 3 <= len(corners) <= CORNERS else None

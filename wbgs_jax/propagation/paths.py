@@ -1,0 +1,262 @@
+"""Where the wave runs from a transmitter to the receiver: straight legs between facets that mirror it and edges that diffract
+it, through facets it crosses.
+
+Every chain of `image_method.py` gives at most one specular path, every edge at most one diffracted path for each mirror in
+front of it or behind it. The candidates that promise most are cut with all facets, and of those that pass, the strongest are
+kept. Nothing here depends on the frequency or on what the facets are made of, and nothing is differentiated.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.propagation.edges import Edges
+from wbgs_jax.propagation.facets import CORNERS, AnyArray, Outline
+from wbgs_jax.propagation.image_method import Chains, Search
+from wbgs_jax.radio.array import EXACT
+
+MAX_ORDER = 3
+"""Reflections and diffractions a path may have."""
+MAX_INTERACTIONS = 5
+"""Facets and edges a path may interact with; what has crossed more of them is worth next to nothing."""
+NEAR = 1e-3
+"""Metres: a leg does not cross the facets within this distance of its ends (those that mirror it)."""
+NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
+"""Types of interaction."""
+INDICES, PLACES = 2**12, 2**17
+"""An interaction's key holds the index of a facet or vertex (less than `INDICES`) and its place, in parts of a leg."""
+MAX_FACETS = INDICES - MAX_ORDER
+"""More cannot be told apart by their keys."""
+NO_KEY = jnp.uint32(0xFFFFFFFF)
+CUT_AT_ONCE = 64
+"""Paths: few enough for a CPU's cache."""
+THROUGH = 0.5
+"""Guess of what is left of the amplitude behind a facet or a mirror, to rank paths by."""
+
+
+@pytree
+class Paths:
+    """K paths of one transmitter; leading axes stand for more of them."""
+
+    points: Float[Array, "*b k 5 3"]
+    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    interaction_facet: Int[Array, "*b k 5"]
+    """Indices of the facets (of the edge, where the type is `DIFFRACTED`) in the order in which they act; 0 beyond the last."""
+    interaction_type: Int[Array, "*b k 5"]
+    """`TRANSMITTED`, `REFLECTED` or `DIFFRACTED`; `NONE` beyond the last."""
+    interaction_leg: Int[Array, "*b k 5"]
+    """The leg (0: the first) that arrives there."""
+    alive: Bool[Array, "*b k"]
+    """Which of the K are paths; the rest is there to fill the array."""
+
+
+@pytree
+class TracedPaths:
+    """All paths of one transmitter; leading axes stand for more of them."""
+
+    specular: Paths
+    """Without diffraction, the line of sight among them."""
+    diffracted: Paths
+    """With one diffraction each."""
+
+
+class Candidates(NamedTuple):
+    """Paths before they are cut with facets."""
+
+    points: Float[Array, "c 5 3"]
+    interaction_facet: Int[Array, "c 3"]
+    interaction_type: Int[Array, "c 3"]
+    score: Float[Array, "c"]
+    """Guess of the amplitude; 0 for no path."""
+
+
+def trace_paths(
+    search: Search,
+    tx_position: Float[Array, "3"],
+    specular_tried: int,
+    specular_kept: int,
+    diffracted_tried: int,
+    diffracted_kept: int,
+) -> TracedPaths:
+    """Returns the paths of one transmitter (`jax.lax.map` takes more of them: a batch at once needs much memory).
+
+    Args:
+        search: of the receiver (`image_method.make_search`).
+        tx_position: world frame, metres.
+        specular_tried, diffracted_tried: candidates that are cut with all facets.
+        specular_kept, diffracted_kept: paths that are returned of them, the strongest ones; fewer if fewer are tried.
+    """
+    return TracedPaths(
+        specular_paths(tx_position, search, specular_tried, specular_kept),
+        diffracted_paths(tx_position, search, diffracted_tried, diffracted_kept),
+    )
+
+
+def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+    """Returns the `kept` strongest paths without diffraction, line of sight included, of at most `tried` candidates."""
+    parts = [_direct(tx, search.receiver_position), *(_mirrored(tx, search, chain) for chain in search.chains)]
+    return _select(parts, search, tried, kept, MAX_ORDER + 1)
+
+
+def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+    """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
+    parts = [_diffracted_only(tx, search), _diffracted_then_mirrored(tx, search), _mirrored_then_diffracted(tx, search)]
+    return _select(parts, search, tried, kept, 3)
+
+
+def _diffracted_only(tx, search: Search) -> Candidates:
+    """Returns one candidate an edge."""
+    edge = jnp.arange(search.edges.length.size)
+    point, strength = _diffracted(tx, search.receiver_position, edge, search.edges)
+    return _candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
+
+
+def _diffracted_then_mirrored(tx, search: Search) -> Candidates:
+    """Returns one candidate a pair of an edge and a mirror behind it."""
+    facet, edge = jnp.moveaxis(search.diffracted.after, -1, 0)
+    point, strength = _diffracted(tx, search.diffracted.after_image, edge, search.edges)
+    mirror, valid = _on_mirror(point, search.diffracted.after_image, search.facets.normal[facet], search.facets.offset[facet])
+    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    vertices = [(point, edge, DIFFRACTED), (mirror, facet, REFLECTED)]
+    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+
+
+def _mirrored_then_diffracted(tx, search: Search) -> Candidates:
+    """Returns one candidate a pair of an edge and a mirror in front of it."""
+    facet, edge = jnp.moveaxis(search.diffracted.before, -1, 0)
+    normal, offset = search.facets.normal[facet], search.facets.offset[facet]
+    image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
+    point, strength = _diffracted(image, search.receiver_position, edge, search.edges)
+    # Seen from the image, the point must lie behind the mirror: the wave runs from the transmitter to where it is reflected.
+    mirror, valid = _on_mirror(point, image, normal, offset)
+    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
+    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+
+
+def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
+    """Returns candidates from their vertices (points, facet or edge, type of interaction), in order."""
+
+    def rows(value, shape):
+        return jnp.broadcast_to(value, (count, *shape))
+
+    points = [tx, *(point for point, _, _ in vertices)]
+    points += [rx] * (MAX_ORDER + 2 - len(points))
+    missing = MAX_ORDER - len(vertices)
+    facet = jnp.stack([*(rows(facet, ()) for _, facet, _ in vertices), *[jnp.zeros(count, int)] * missing], 1)
+    types = rows(jnp.array([of_type for _, _, of_type in vertices] + [NONE] * missing), (MAX_ORDER,))
+    return Candidates(jnp.stack([rows(p, (3,)) for p in points], 1), facet, types, rows(score, ()))
+
+
+def _direct(tx, rx) -> Candidates:
+    """Returns the line of sight as a candidate."""
+    return _candidates(tx, rx, [], 1 / jnp.maximum(jnp.linalg.norm(tx - rx), NEAR), 1)
+
+
+def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
+    """Returns one candidate a chain."""
+    facets, (c, order) = search.facets, chains.facet.shape
+    here, valid = jnp.broadcast_to(tx, (c, 3)), jnp.ones(c, bool)
+    vertices = []
+    for j in range(order):
+        facet = chains.facet[:, j]
+        here, hits = _on_mirror(here, chains.image[:, j], facets.normal[facet], facets.offset[facet])
+        valid &= hits & _inside(here, search.outline, facet)
+        vertices.append((here, facet, REFLECTED))
+    length = jnp.linalg.norm(chains.image[:, 0] - tx, axis=-1)
+    return _candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / length, c)
+
+
+def _on_mirror(start, goal, normal, offset):
+    """Returns where the way from `start` to the image `goal` hits the plane of a mirror, and whether it does."""
+    height, beyond = (jnp.sum(normal * p, -1) - offset for p in (start, goal))
+    share = height / jnp.where(height == beyond, 1, height - beyond)
+    valid = (height * beyond < 0) & (jnp.abs(height) > NEAR) & (jnp.abs(beyond) > NEAR)
+    return start + jnp.clip(share, 0, 1)[..., None] * (goal - start), valid
+
+
+def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
+    """Returns whether points of a facet's plane lie inside its sides."""
+    return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
+
+
+def _diffracted(source, goal, edge: Int[Array, "c"], edges: Edges):
+    """Returns where the shortest way over an edge touches it (Keller's cone), and a guess of the amplitude, 0 if not."""
+    start, along = edges.start[edge], edges.direction[edge]
+
+    def place(p):
+        t = jnp.sum((p - start) * along, -1)
+        return t, jnp.linalg.norm(p - start - t[..., None] * along, axis=-1)
+
+    (t_in, r_in), (t_out, r_out) = place(source), place(goal)
+    t = t_in + (t_out - t_in) * r_in / jnp.maximum(r_in + r_out, NEAR)
+    point = start + t[..., None] * along
+    normal_0, normal_n = edges.normal_0[edge], edges.normal_n[edge]
+    valid = (t > 0) & (t < edges.length[edge]) & (jnp.minimum(r_in, r_out) > NEAR)
+    for p in (source, goal):
+        valid &= jnp.maximum(jnp.sum((p - point) * normal_0, -1), jnp.sum((p - point) * normal_n, -1)) > NEAR
+    before, after = (jnp.linalg.norm(p - point, axis=-1) for p in (source, goal))
+    flat_in, flat_out = source - point, goal - point
+    flat_in -= jnp.sum(flat_in * along, -1, keepdims=True) * along
+    flat_out -= jnp.sum(flat_out * along, -1, keepdims=True) * along
+    turn = jnp.sum(flat_in * flat_out, -1) / jnp.maximum(r_in * r_out, NEAR**2)
+    # Keller's coefficient falls as the wave is turned away from its shadow boundary, where it goes straight on.
+    strength = 1 / jnp.sqrt(jnp.maximum(before * after * (before + after), NEAR)) / jnp.sqrt(0.5 * (1 + turn) + 0.02)
+    return point, jnp.where(valid, strength, 0)
+
+
+def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
+    """Returns the best paths that are left of the best candidates when these have been cut with all facets."""
+    candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
+    score, best = jax.lax.top_k(candidates.score, min(tried, candidates.score.size))
+    found = Candidates(*(leaf[best] for leaf in candidates))
+    facet, types, leg, crossed = jax.lax.map(lambda c: _cut(c, search, legs), found, batch_size=CUT_AT_ONCE)
+    whole = crossed + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
+    score, best = jax.lax.top_k(jnp.where(whole, score * THROUGH**crossed, 0), min(kept, score.size))
+    return Paths(found.points[best], facet[best], types[best], leg[best], score > 0)
+
+
+def _cut(candidate: Candidates, search: Search, legs: int):
+    """Returns the interactions of one path in order (facet or edge, type, leg), and how many facets it crosses."""
+    # The place of an interaction is leg + share of the leg; a reflection or diffraction ends its leg. Place and index share an
+    # integer, so that plain minima find both: sorting or arg-minima take ten times as long on a CPU.
+    crossing = _crossings(candidate.points[: legs + 1], search) + jnp.arange(legs)[:, None]
+    n = crossing.shape[1]
+    vertex = jnp.where(candidate.interaction_type != NONE, jnp.arange(MAX_ORDER) + 1.0, jnp.inf)
+    keys = jnp.concatenate([_key(crossing, jnp.arange(n)).reshape(-1), _key(vertex, n + jnp.arange(MAX_ORDER))])
+    last, found = jnp.zeros((), jnp.uint32), []
+    for _ in range(MAX_INTERACTIONS):
+        last = jnp.min(jnp.where(keys > last, keys, NO_KEY))
+        found.append(last)
+    key = jnp.stack(found)
+    index, there = (key % INDICES).astype(jnp.int32), key < NO_KEY
+    leg = jnp.ceil((key // INDICES) / PLACES).astype(jnp.int32) - 1
+    slot = index - n
+    facet = jnp.where(slot < 0, index, candidate.interaction_facet[slot])
+    types = jnp.where(slot < 0, TRANSMITTED, candidate.interaction_type[slot])
+    crossed = jnp.isfinite(crossing).sum()
+    return jnp.where(there, facet, 0), jnp.where(there, types, NONE), jnp.where(there, leg, 0), crossed
+
+
+def _key(place: Float[Array, "*n"], index: Int[Array, "_"]) -> UInt32[Array, "*n"]:
+    """Returns place and index of an interaction as one integer that sorts by place; `NO_KEY` where the place is infinite."""
+    key = (place * PLACES).astype(jnp.uint32) * INDICES + index.astype(jnp.uint32)
+    return jnp.where(jnp.isfinite(place), key, NO_KEY)
+
+
+def _crossings(points: Float[Array, "p 3"], search: Search) -> Float[Array, "legs f"]:
+    """Returns after which share of a leg a facet is crossed; infinite if it is not."""
+    normal, outline = search.facets.normal, search.outline
+    height = jnp.matmul(points, normal.T, precision=EXACT) - search.facets.offset
+    start, end = height[:-1], height[1:]
+    share = start / jnp.where(start == end, 1, start - end)
+    length = jnp.linalg.norm(points[1:] - points[:-1], axis=-1, keepdims=True)
+    near = NEAR / jnp.maximum(length, NEAR)
+    inside = (share > near) & (share < 1 - near)
+    for i in range(CORNERS):
+        depth = jnp.matmul(points, outline.inward[:, i].T, precision=EXACT) - outline.offset[:, i]
+        inside &= depth[:-1] + share * (depth[1:] - depth[:-1]) >= 0
+    return jnp.where(inside, jnp.clip(share, 2 / PLACES, 1 - 2 / PLACES), jnp.inf)

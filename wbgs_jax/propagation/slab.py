@@ -1,0 +1,71 @@
+"""Reflection and transmission of a homogeneous slab in air (Recommendation ITU-R P.2040-3, section 2.2.2.2)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
+
+VACUUM_PERMITTIVITY = 8.8541878128e-12
+"""Farad a metre."""
+DAMPING = 1 - 1e-4
+"""A loss on every passage that nobody can measure: resonances of lossless slabs at grazing incidence stay finite."""
+
+
+@pytree
+class Slabs:
+    """What every facet is made of at one frequency."""
+
+    permittivity: Complex[Array, "f"]
+    """Relative and complex (`complex_permittivity`)."""
+    thickness: Float[Array, "f"]
+    """Metres."""
+
+
+class SlabCoefficients(NamedTuple):
+    """Amplitude coefficients for the electric field across (TE) and in (TM) the plane of incidence."""
+
+    reflect_te: Complex[Array, "*#n"]
+    reflect_tm: Complex[Array, "*#n"]
+    transmit_te: Complex[Array, "*#n"]
+    transmit_tm: Complex[Array, "*#n"]
+
+
+def complex_permittivity(
+    permittivity: Float[Array, "*#n"], conductivity: Float[Array, "*#n"], frequency_hz: Float[Array, "*#n"]
+) -> Complex[Array, "*#n"]:
+    """Returns the relative permittivity eps_r - j sigma / (eps_0 omega); conductivity sigma in S/m."""
+    return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * VACUUM_PERMITTIVITY)
+
+
+def slab_coefficients(
+    cosine: Float[Array, "*#n"],
+    permittivity: Complex[Array, "*#n"],
+    thickness: Float[Array, "*#n"],
+    frequency_hz: Float[Array, "*#n"],
+) -> SlabCoefficients:
+    """Returns the coefficients of a slab in air (ITU-R P.2040-3, section 2.2.2.2).
+
+    A transmitted wave keeps its direction and is not shifted; the phase of the free space it replaces is not taken out.
+
+    Args:
+        cosine: of the angle of incidence (0..1).
+        permittivity: relative and complex, imaginary part at most 0.
+        thickness: metres.
+        frequency_hz: of the wave.
+    """
+    inner = jnp.sqrt(permittivity - (1 - cosine**2))
+    # Twice the one-way phase; clipped where nothing is left, so that gradients stay finite.
+    q = 2 * jnp.pi * frequency_hz / SPEED_OF_LIGHT * thickness * inner
+    one_way = DAMPING * jnp.exp(-1j * q.real + jnp.maximum(q.imag, -40.0))
+    round_trip = one_way * one_way
+
+    def both(r):
+        ground = 1 - r * r * round_trip
+        return r * (1 - round_trip) / ground, (1 - r * r) * one_way / ground
+
+    te = both((cosine - inner) / (cosine + inner))
+    tm = both((permittivity * cosine - inner) / (permittivity * cosine + inner))
+    return SlabCoefficients(te[0], tm[0], te[1], tm[1])

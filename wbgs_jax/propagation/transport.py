@@ -1,0 +1,231 @@
+"""The wave on every path: the field vector through reflections, transmissions and a diffraction, and the array's snapshot.
+
+The electric field is a complex vector across the ray, split at every slab into its components across (TE) and in (TM) the
+plane of incidence. Antennas are vertically polarised: along theta-hat of their own frame. The time factor is exp(+j omega t).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from wbgs_jax.propagation.edges import Edges
+from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
+from wbgs_jax.propagation.slab import Slabs, slab_coefficients
+from wbgs_jax.propagation.utd import wedge_coefficients
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
+from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.radio.patterns import element_gain, zenith_vector
+from wbgs_jax.types import Receiver
+
+SHORTEST = 1e-9
+"""Metres: legs that are shorter fill the places of reflections that a path does not have."""
+
+
+class _Legs(NamedTuple):
+    """The straight pieces of K paths."""
+
+    length: Float[Array, "k 4"]
+    """Metres."""
+    direction: Float[Array, "k 4 3"]
+    """Unit vectors along the way of the wave, world frame."""
+    total: Float[Array, "k"]
+    """Length of the whole path, metres."""
+
+
+class _SlabInteractions(NamedTuple):
+    """The slabs on K paths: how they split the field and what they do to its parts."""
+
+    across: Float[Array, "k 5 3"]
+    """Unit vectors across the plane of incidence."""
+    within_in: Float[Array, "k 5 3"]
+    """Unit vectors in it and across the ray that arrives."""
+    within_out: Float[Array, "k 5 3"]
+    """Unit vectors in it and across the ray that leaves."""
+    te: Complex[Array, "k 5"]
+    tm: Complex[Array, "k 5"]
+
+
+def arrivals(
+    paths: Paths, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""], receiver: Receiver, diffracted: bool
+) -> Arrivals:
+    """Returns what a vertically polarised isotropic transmitter of unit power sends over K paths.
+
+    Args:
+        paths: of one transmitter (`paths.trace_paths`).
+        search: that the paths were found in: its facets and edges are what they refer to.
+        slabs: what the facets are made of at this frequency.
+        frequency_hz: of the carrier.
+        receiver: whose array stands where the paths end.
+        diffracted: whether every path has one diffraction, or none has any; static under `jax.jit`.
+    """
+    legs = _legs(paths)
+    field = zenith_vector(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
+    interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
+    active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
+    if diffracted:
+        field, spreading = _over_edges(field, paths, legs, interactions, active, search.edges, slabs, frequency_hz)
+    else:
+        field, spreading = _through_slabs(field, interactions, active), 1 / legs.total
+    ends_leg = (paths.interaction_type == REFLECTED) | (paths.interaction_type == DIFFRACTED)
+    last = jnp.sum(ends_leg, -1)
+    local = to_local(-legs.direction[jnp.arange(len(last)), last], receiver.orientation)
+    seen = _dot(to_local(field, receiver.orientation), zenith_vector(local))
+    wavelength = SPEED_OF_LIGHT / frequency_hz
+    carrier = jnp.exp(-2j * jnp.pi * jnp.mod(legs.total / wavelength, 1.0))
+    gain = element_gain(local) ** receiver.pattern_exponent
+    amplitude = wavelength / (4 * jnp.pi) * spreading * gain * seen * carrier
+    return Arrivals(jnp.where(paths.alive, amplitude, 0), local, legs.total)
+
+
+def snapshots_from_paths(arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""]) -> Complex[Array, "elements"]:
+    """Returns the complex voltages of the receiver's elements, every path a plane wave; `jax.vmap` takes more transmitters.
+
+    Args:
+        arrived: what arrives over K paths.
+        receiver: whose elements it is received with.
+        frequency_hz: of the carrier; it matters to elements whose positions are in metres.
+    """
+    steering = steering_vector(receiver.element_wavelengths(frequency_hz), arrived.direction)
+    return jnp.matmul(arrived.amplitude, steering, precision=EXACT)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Returns the scalar product over the last axis."""
+    return jnp.sum(a * b, -1)
+
+
+def _unit(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Returns unit vectors; a zero vector stays finite."""
+    return v / jnp.sqrt(jnp.maximum(_dot(v, v), 1e-12))[..., None]
+
+
+def _legs(paths: Paths) -> _Legs:
+    """Returns the legs of paths."""
+    legs = paths.points[:, 1:] - paths.points[:, :-1]
+    lengths = jnp.sqrt(jnp.maximum(_dot(legs, legs), SHORTEST**2))
+    return _Legs(lengths, legs / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
+
+
+def _slab_interactions(
+    paths: Paths, legs: _Legs, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""]
+) -> _SlabInteractions:
+    """Returns what the slabs of all paths do; nonsense where an interaction is none with a slab."""
+    facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
+    along = jnp.take_along_axis(legs.direction, paths.interaction_leg[..., None], 1)
+    normal, reflects = search.facets.normal[facet], paths.interaction_type == REFLECTED
+    cosine = _dot(along, normal)
+    c = slab_coefficients(jnp.abs(cosine), slabs.permittivity[facet], slabs.thickness[facet], frequency_hz)
+    across = _across(along, normal)
+    within = jnp.cross(across, along)
+    mirrored = along - 2 * cosine[..., None] * normal
+    return _SlabInteractions(
+        across,
+        within,
+        jnp.where(reflects[..., None], jnp.cross(across, mirrored), within),
+        jnp.where(reflects, c.reflect_te, c.transmit_te),
+        jnp.where(reflects, c.reflect_tm, c.transmit_tm),
+    )
+
+
+def _through_slabs(
+    field: Complex[Array, "k 3"], interactions: _SlabInteractions, active: Bool[Array, "k 5"]
+) -> Complex[Array, "k 3"]:
+    """Returns the field behind the slabs that are active, in their order."""
+    for i in range(MAX_INTERACTIONS):
+        across, into, out, te, tm = (leaf[:, i] for leaf in interactions)
+        changed = (te * _dot(field, across))[:, None] * across + (tm * _dot(field, into))[:, None] * out
+        field = jnp.where(active[:, i, None], changed, field)
+    return field
+
+
+def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Returns the unit vector across the plane of incidence; any one at normal incidence."""
+    s = jnp.cross(along, normal)
+    return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, normal[..., jnp.array([1, 2, 0])]), s))
+
+
+def _over_edges(
+    field: Complex[Array, "k 3"],
+    paths: Paths,
+    legs: _Legs,
+    interactions: _SlabInteractions,
+    active: Bool[Array, "k 5"],
+    edges: Edges,
+    slabs: Slabs,
+    frequency_hz: Float[Array, ""],
+) -> tuple[Complex[Array, "k 3"], Float[Array, "k"]]:
+    """Returns the field behind the slabs before an edge, the edge, and the slabs after it; and the spreading factor."""
+    k, place = jnp.arange(len(field)), jnp.arange(MAX_INTERACTIONS)
+    slot = jnp.argmax(paths.interaction_type == DIFFRACTED, -1)
+    leg, edge = paths.interaction_leg[k, slot], paths.interaction_facet[k, slot]
+    before = jnp.sum(jnp.where(jnp.arange(legs.length.shape[1]) <= leg[:, None], legs.length, 0), -1)
+    after = jnp.maximum(legs.total - before, SHORTEST)
+    field = _through_slabs(field, interactions, active & (place < slot[:, None]))
+    rays = legs.direction[k, leg], legs.direction[k, leg + 1]
+    field = _diffract(field, *rays, before, after, edge, edges, slabs, frequency_hz)
+    field = _through_slabs(field, interactions, active & (place > slot[:, None]))
+    return field, 1 / jnp.sqrt(before * after * legs.total)
+
+
+def _diffract(
+    field: Complex[Array, "k 3"],
+    ki: Float[Array, "k 3"],
+    ko: Float[Array, "k 3"],
+    before: Float[Array, "k"],
+    after: Float[Array, "k"],
+    edge: Int[Array, "k"],
+    edges: Edges,
+    slabs: Slabs,
+    frequency_hz: Float[Array, ""],
+) -> Complex[Array, "k 3"]:
+    """Returns the field vector behind the edge, without spreading: the dyadic of `utd.py` in vectors.
+
+    Args:
+        field: at the edge.
+        ki, ko: unit vectors along the incident and the diffracted ray.
+        before, after: length of the way to the edge and from it, metres.
+        edge: index of the edge.
+        edges, slabs: of the scene.
+        frequency_hz: of the carrier.
+    """
+    normal_0, normal_n, direction = edges.normal_0[edge], edges.normal_n[edge], edges.direction[edge]
+    incident, d_n, d_0 = _edge_coefficients(ki, ko, before, after, normal_0, normal_n, direction, frequency_hz)
+    first, second = (-incident * part for part in _components(field, ki, _unit(jnp.cross(ki, direction))))
+    facet = edges.facet[edge]
+    for normal, cosine, weight in ((normal_0, _dot(ki, normal_0), d_0), (normal_n, _dot(ko, normal_n), d_n)):
+        c = slab_coefficients(jnp.abs(cosine), slabs.permittivity[facet], slabs.thickness[facet], frequency_hz)
+        mirrored = ki - 2 * _dot(ki, normal)[:, None] * normal
+        across = _across(ki, normal)
+        s, p = _components(field, ki, across)
+        reflected = (weight * c.reflect_te * s)[:, None] * across
+        reflected += (weight * c.reflect_tm * p)[:, None] * jnp.cross(mirrored, across)
+        # Its components in the basis of the reflection boundary are those in the basis of the diffracted ray.
+        s, p = _components(reflected, mirrored, -_unit(jnp.cross(mirrored, direction)))
+        first, second = first + s, second + p
+    basis = -_unit(jnp.cross(ko, direction))
+    return first[:, None] * basis + second[:, None] * jnp.cross(ko, basis)
+
+
+def _edge_coefficients(ki, ko, before, after, normal_0, normal_n, direction, frequency_hz):
+    """Returns the diffraction coefficients of edges for rays of known lengths (`utd.wedge_coefficients`)."""
+    tangent = jnp.cross(normal_0, direction)
+
+    def angle(v):
+        phi = jnp.arctan2(_dot(v, normal_0), _dot(v, tangent))
+        return jnp.where(phi < 0, phi + 2 * jnp.pi, phi)
+
+    n = 1 + jnp.arccos(jnp.clip(_dot(normal_0, normal_n), -1, 1)) / jnp.pi
+    sin_beta = jnp.sqrt(jnp.maximum(1 - _dot(ki, direction) ** 2, 1e-6))
+    wavenumber = 2 * jnp.pi * frequency_hz / SPEED_OF_LIGHT
+    kl = wavenumber * before * after / (before + after) * sin_beta**2
+    return wedge_coefficients(angle(-ki), angle(ko), n, sin_beta, kl, wavenumber)
+
+
+def _components(
+    vector: Complex[Array, "k 3"], along: Float[Array, "k 3"], basis: Float[Array, "k 3"]
+) -> tuple[Complex[Array, "k"], Complex[Array, "k"]]:
+    """Returns the components of a field across a ray: along a unit vector across the ray, and along the third direction."""
+    return _dot(vector, basis), _dot(vector, jnp.cross(along, basis))

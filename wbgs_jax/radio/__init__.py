@@ -1,0 +1,1 @@
+"""Antenna arrays, element patterns, frames, and what engineers read from a channel."""

@@ -1,0 +1,123 @@
+"""The receiver's antenna array: element positions, steering vectors, conventional beamforming, snapshot -> PAS.
+
+Frame: the receiver's local one, z towards the zenith of the PAS. A direction is the unit vector
+k = (sin t cos p, sin t sin p, cos t) with zenith t and azimuth p in radians. Element positions are in wavelengths, so one
+array serves every frequency. A plane wave from k arrives at element position p with phase exp(+j 2 pi p.k).
+
+A power angular spectrum (PAS) pixel is |a(k)^H y| / max: the AMPLITUDE of conventional beamforming of one complex snapshot
+y, scaled by its own maximum. Rows are zenith 0..90 degrees (row 0 = zenith), columns azimuth -180..180 degrees; both ends
+are included, so the first and last column are the same direction.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+PAS_HEIGHT, PAS_WIDTH = 90, 360
+PAS_SHAPE = (PAS_HEIGHT, PAS_WIDTH)
+SPEED_OF_LIGHT = 299_792_458.0
+"""Metres a second."""
+EXACT = jax.lax.Precision.HIGHEST
+"""Of matrix products on positions and phases: the default of a GPU may be TF32, whose ten bits are millimetres in a room."""
+
+
+def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float[np.ndarray, "elements 3"]:
+    """Returns the element positions (wavelengths, float64) of a planar array in the local y-z plane, centred on the origin.
+
+    The order is that of Sionna RT's `PlanarArray` with identity orientation: columns of elements from -y to +y, each from
+    +z down to -z.
+    """
+    y = (np.arange(columns) - (columns - 1) / 2) * spacing
+    z = ((rows - 1) / 2 - np.arange(rows)) * spacing
+    return np.stack([np.zeros(rows * columns), np.repeat(y, rows), np.tile(z, columns)], -1)
+
+
+@functools.cache
+def _pas_directions() -> Float[np.ndarray, "90 360 3"]:
+    zenith = np.linspace(0, np.pi / 2, PAS_HEIGHT)[:, None]
+    azimuth = np.linspace(-np.pi, np.pi, PAS_WIDTH)[None]
+    ones = np.ones(PAS_SHAPE)
+    directions = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith) * ones], -1)
+    directions.setflags(write=False)
+    return directions
+
+
+def pas_directions() -> Float[np.ndarray, "90 360 3"]:
+    """Returns the unit vectors (float64, read-only) of the PAS pixels in the receiver's local frame."""
+    return _pas_directions()
+
+
+def steering_vector(
+    element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]
+) -> Complex[Array, "*n elements"]:
+    """Returns the element phases exp(+j 2 pi p.k) of plane waves from unit vectors `directions`; positions in wavelengths."""
+    return jnp.exp(2j * jnp.pi * jnp.matmul(directions, element_positions.T, precision=EXACT))
+
+
+def array_response(
+    element_positions: Float[Array, "elements 3"] | Float[Array, "m elements 3"],
+    first: Float[Array, "n 3"],
+    second: Float[Array, "m 3"],
+    steering_first: Complex[Array, "n elements"] | None = None,
+) -> Float[Array, "n m"]:
+    """Returns |a(u)^H a(v)| / elements, 0..1: what the array hears in unit directions u of plane waves from v.
+
+    Directions are those of the receiver's frame. Positions are in wavelengths: the same for all v, or those of each.
+    `steering_first` are the steering vectors of u, where they are known.
+    """
+    if element_positions.ndim == 3:
+        alone = jax.vmap(lambda positions, v: array_response(positions, first, v[None])[:, 0], out_axes=1)
+        return alone(element_positions, second)
+    steering_second = steering_vector(element_positions, second)
+    if steering_first is None:
+        steering_first = steering_vector(element_positions, first)
+    return jnp.abs(jnp.matmul(steering_first, steering_second.conj().T, precision=EXACT)) / element_positions.shape[0]
+
+
+def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m elements"]) -> Float[Array, "*nm"]:
+    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and every steering vector: shape (*n, *m)."""
+    return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]], precision=EXACT))
+
+
+def snapshot_to_pas(
+    snapshot: Complex[Array, "*n elements"], element_positions: Float[Array, "elements 3"] | Float[Array, "n elements 3"]
+) -> Float[Array, "*n 90 360"]:
+    """Returns the power angular spectra, each scaled to a maximum of 1, of complex array snapshots. A zero snapshot gives a zero
+    PAS.
+
+    Element positions are in wavelengths: the same for all snapshots, or those of each of n (an array of fixed size in metres).
+    """
+    snapshot = jnp.asarray(snapshot)
+    positions = jnp.asarray(element_positions, snapshot.real.dtype)
+    if positions.ndim == 3:
+        return jax.vmap(snapshot_to_pas)(snapshot, positions)
+    return normalise(cbf(snapshot, steering_vector(positions, jnp.asarray(pas_directions(), positions.dtype))))
+
+
+def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
+    """Returns every PAS scaled to a maximum of 1; an all-zero PAS stays zero."""
+    peak = jnp.max(pas, axis=(-2, -1), keepdims=True)
+    return pas / jnp.where(peak > 0, peak, 1)
+
+
+def lag_basis(element_positions: Float[np.ndarray, "elements 3"], tolerance: float = 1e-9) -> Float[np.ndarray, "pixels rank"]:
+    """Returns an orthonormal basis (float64) of the space that holds every squared PAS of an array, pixels in row-major order.
+
+    |a^H y|^2 is a trigonometric polynomial whose frequencies are the differences of element positions (the array's lags);
+    the 4x4 half-wavelength array has 49 of them. `tolerance` is relative to the largest singular value.
+    """
+    positions = np.asarray(element_positions, np.float64)
+    lags = (positions[:, None] - positions[None]).reshape(-1, 3)
+    lags = np.unique(np.round(lags, 9), axis=0)
+    phase = 2 * np.pi * (_pas_directions().reshape(-1, 3) @ lags.T)
+    waves = np.concatenate([np.cos(phase), np.sin(phase)], -1)
+    u, s, _ = np.linalg.svd(waves, full_matrices=False)
+    return u[:, s > tolerance * s[0]]
+
+
+def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
+    """Returns |z|^2, with a gradient that is finite at 0."""
+    return z.real**2 + z.imag**2

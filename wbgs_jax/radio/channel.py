@@ -1,0 +1,75 @@
+"""What engineers read from a channel: power, beamforming gain, K-factor, delay spread, and how alike two snapshots are.
+
+Pure functions; `snapshot` is the complex voltages of the receiver's elements, `Arrivals` what arrives over
+every path. Leading axes are free.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector
+
+
+class Arrivals(NamedTuple):
+    """What reaches a receiver over K paths."""
+
+    amplitude: Complex[Array, "*b k"]
+    """At the array's centre, carrier phase included; 0 for paths that are none."""
+    direction: Float[Array, "*b k 3"]
+    """Unit vectors in the receiver's frame, towards where the wave comes from."""
+    length: Float[Array, "*b k"]
+    """Length of the whole path, metres."""
+
+
+SMALLEST = 1e-30
+"""Power that stands for nothing, so that decibels stay finite."""
+
+
+def snapshots_of_arrivals(arrivals: Arrivals, element_wavelengths: Float[Array, "elements 3"]) -> Complex[Array, "elements"]:
+    """Returns the array's complex voltages, every path a plane wave; element positions in wavelengths, receiver's frame."""
+    steering = steering_vector(element_wavelengths, arrivals.direction)
+    return jnp.matmul(arrivals.amplitude, steering, precision=EXACT)
+
+
+def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Returns 10 log10 of powers."""
+    return 10 * jnp.log10(jnp.maximum(power, SMALLEST))
+
+
+def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
+    """Returns the mean power an element receives, relative to the transmitted power (dB): the negative path loss."""
+    return decibels(jnp.mean(squared_magnitude(snapshot), -1))
+
+
+def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Returns the power of the best conventional beam over that of one element (dB, at most 10 log10 of the number of elements).
+
+    `peak` is the largest |a^H y| over all directions.
+    """
+    mean = jnp.mean(squared_magnitude(snapshot), -1)
+    return decibels(peak**2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
+
+
+def k_factor_db(arrivals: Arrivals) -> Float[Array, "*b"]:
+    """Returns the power of the strongest path over that of all others (dB; Rice)."""
+    power = squared_magnitude(arrivals.amplitude)
+    strongest = jnp.max(power, -1)
+    return decibels(strongest / jnp.maximum(jnp.sum(power, -1) - strongest, SMALLEST))
+
+
+def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
+    """Returns the r.m.s. delay spread (seconds), weighted by power."""
+    power = squared_magnitude(arrivals.amplitude)
+    weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
+    delay = arrivals.length / SPEED_OF_LIGHT
+    mean = jnp.sum(weight * delay, -1, keepdims=True)
+    return jnp.sqrt(jnp.sum(weight * (delay - mean) ** 2, -1))
+
+
+def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
+    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for a snapshot of nothing."""
+    norm_a, norm_b = (jnp.sqrt(jnp.sum(squared_magnitude(v), -1)) for v in (a, b))
+    product = jnp.sqrt(squared_magnitude(jnp.sum(a.conj() * b, -1)))
+    return product / jnp.where(norm_a * norm_b > 0, norm_a * norm_b, 1)

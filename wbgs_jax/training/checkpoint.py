@@ -1,0 +1,137 @@
+"""Checkpoints with Orbax: the training state, the field it belongs to, and metadata.
+
+A tree is saved as a flat dictionary of arrays named by their place in it; those of the field begin with "field". Orbax writes to
+a temporary folder and renames it, so a checkpoint is whole or absent (one that is written again is absent for a moment).
+"""
+
+import contextlib
+import logging
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from wbgs_jax._util.errors import UserError
+
+FIELD, EMPTY = "field", "empty"
+
+
+@dataclass(frozen=True)
+class Saved:
+    """The content of a checkpoint."""
+
+    path: Path
+    state: dict[str, np.ndarray]
+    """Arrays of the state by their place, such as ".params.gaussians.means"."""
+    field: dict[str, np.ndarray]
+    """Arrays of the field by their place, such as ".frame.centre"."""
+    metadata: dict[str, Any]
+
+
+def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
+    return {prefix + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def checkpoint_steps(folder: Path) -> list[int]:
+    """Returns the steps of the complete checkpoints in a folder, ascending."""
+    if not folder.is_dir():
+        return []
+    return sorted(int(entry.name) for entry in folder.iterdir() if entry.name.isdigit())
+
+
+def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, Any], keep: int) -> None:
+    """Writes a checkpoint (replacing one of the same step) and removes the oldest beyond `keep`."""
+    from orbax.checkpoint import v1 as ocp
+
+    target = (folder / str(step)).absolute()
+    # Host arrays load on any device; Orbax refuses empty ones, which the metadata stand for.
+    host = {key: np.asarray(leaf) for key, leaf in (_flatten(state) | _flatten(field, FIELD)).items()}
+    empty = {key: [list(leaf.shape), leaf.dtype.name] for key, leaf in host.items() if not leaf.size}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _quiet():
+            full = {key: leaf for key, leaf in host.items() if leaf.size}
+            ocp.save(target, full, custom_metadata=metadata | {EMPTY: empty}, overwrite=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot write checkpoint {target}: {error.strerror or error}; free some space or choose another OUT"
+        ) from error
+    for old in checkpoint_steps(folder)[:-keep]:
+        shutil.rmtree(folder / str(old))
+
+
+def read(folder: Path, step: int) -> Saved:
+    """Returns the content of a checkpoint; a damaged one is a `UserError`."""
+    from orbax.checkpoint import v1 as ocp
+
+    path = folder / str(step)
+    with _explained(path), _quiet():
+        metadata = ocp.metadata(path.absolute()).custom_metadata
+        if not metadata:  # Orbax gives None for a file that it cannot read
+            raise ValueError("no metadata")
+        found = {key: np.asarray(value) for key, value in ocp.load(path.absolute()).items()}
+    metadata = dict(metadata)
+    found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.pop(EMPTY, {}).items()}
+    field = {key.removeprefix(FIELD): value for key, value in found.items() if key.startswith(FIELD)}
+    return Saved(path, {key: value for key, value in found.items() if not key.startswith(FIELD)}, field, metadata)
+
+
+def fill(saved: Saved, init: Callable[[Any], Any], key: Key[Array, ""], prefix: str) -> Any:
+    """Returns saved parameters in the structure that `init(key)` gives; numbers of rows are those that were saved."""
+    like = jax.eval_shape(init, key)
+
+    def shaped(path: Any, leaf: Any) -> Any:
+        value = saved.state.get(prefix + jax.tree_util.keystr(path))
+        _demand(value is not None and value.shape[1:] == leaf.shape[1:] and value.ndim == len(leaf.shape), saved)
+        assert value is not None
+        return jax.ShapeDtypeStruct(value.shape, leaf.dtype)
+
+    return fill_like(saved, jax.tree_util.tree_map_with_path(shaped, like), prefix)
+
+
+def fill_like(saved: Saved, like: Any, prefix: str = "") -> Any:
+    """Returns the saved state in the structure, shapes and dtypes of `like` (arrays or ShapeDtypeStructs).
+
+    `prefix` names the part of the saved state that `like` stands for, such as ".params".
+    """
+    wanted = _flatten(like, prefix)
+    _demand(all(key in saved.state and saved.state[key].shape == leaf.shape for key, leaf in wanted.items()), saved)
+    leaves = [jax.numpy.asarray(saved.state[key], leaf.dtype) for key, leaf in wanted.items()]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _demand(fits: bool, saved: Saved) -> None:
+    if not fits:
+        raise UserError(f"checkpoint {saved.path} does not fit this configuration; start a new run in another OUT")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Silences Orbax, which reports every file that it writes; what fails is explained by a `UserError` here."""
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, UserError):
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(
+            f"checkpoint {path} is damaged or incomplete ({reason}); delete that folder to use an older one"
+        ) from error

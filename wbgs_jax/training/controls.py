@@ -1,0 +1,63 @@
+"""Host controls: what is done to a field between jitted epochs. All are alike to the loop.
+
+A field asks for controls by name (`Field.controls`); the settings section of that name switches one on. A control may watch
+every step (`statistics` and `accumulate` are pure and run inside the epoch) and change parameters between epochs (`apply` runs
+on the host). It says how whatever is stored beside the parameters, such as optimiser moments, follows.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from wbgs_jax.fields import Field
+from wbgs_jax.training.data import TrainingData
+
+
+class Edit(NamedTuple):
+    """What a control did."""
+
+    params: Any
+    statistics: Any
+    """What the control has watched, from here on."""
+    moments: Callable[[Any], Any] | None
+    """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
+    report: dict[str, Any]
+    """For metrics.jsonl; nothing is written if it is empty."""
+
+
+class Context(NamedTuple):
+    """What a control may look at."""
+
+    data: TrainingData
+    cache: Any
+    """Of the field's `prepare`."""
+    train: np.ndarray
+    """Indices of the training links."""
+
+
+class Control(Protocol):
+    """A host control: a frozen, hashable object."""
+
+    @property
+    def stream(self) -> int:
+        """Number of its stream of random numbers."""
+        ...
+
+    def statistics(self, params: Any) -> Any:
+        """Returns zeros, to be accumulated over steps; () if it watches nothing."""
+        ...
+
+    def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
+        """Returns the statistics after a step, from the gradients of the parameters and of the field's probe (pure)."""
+        ...
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether something is to be done after this step of so many."""
+        ...
+
+    def apply(
+        self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
+        """Returns the changed parameters."""
+        ...

@@ -1,0 +1,69 @@
+"""A dataset on the device: snapshots or 8-bit pixels of all links, from which a step makes the spectra of its batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int, Key, UInt8
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.radio.array import cbf, normalise, pas_directions, snapshot_to_pas, steering_vector
+from wbgs_jax.types import Batch, Links, Receiver
+
+
+@pytree
+class TrainingData:
+    """All links, and what was observed on them: exactly one kind is not None."""
+
+    receivers: Receiver
+    """With a leading axis."""
+    links: Links
+    snapshots: Complex[Array, "n elements"] | None
+    steering: Complex[Array, "90 360 elements"] | None
+    """Of the only receiver, if its array scales with the frequency: made once."""
+    images: UInt8[Array, "n 90 360"] | None
+    power_db: Float[Array, "n"] | None
+
+    def receiver_of(self, index: Int[Array, "b"]) -> Receiver:
+        """Returns the receiver of some links, all of which have the same."""
+        if self.receivers.position.shape[0] == 1:
+            return jax.tree.map(lambda leaf: leaf[0], self.receivers)
+        number = self.links.receiver_index[index[0]]
+        return jax.tree.map(lambda leaf: leaf[number], self.receivers)
+
+    def pas(self, index: Int[Array, "b"]) -> Float[Array, "b 90 360"] | None:
+        """Returns the observed spectra of some links of one receiver; None where only powers are known."""
+        if self.images is not None:
+            return self.images[index].astype(jnp.float32) / 255
+        if self.snapshots is None:
+            return None
+        if self.steering is not None:
+            return normalise(cbf(self.snapshots[index], self.steering))
+        elements = self.receiver_of(index).element_wavelengths(self.links.query.frequency_hz[index])
+        return snapshot_to_pas(self.snapshots[index], elements)
+
+    def batch(self, index: Int[Array, "b"], key: Key[Array, ""]) -> Batch:
+        """Returns some links of one receiver with everything that was observed on them."""
+        return Batch(
+            links=jax.tree.map(lambda leaf: leaf[index], self.links),
+            receiver=self.receiver_of(index),
+            pas=self.pas(index),
+            snapshots=None if self.snapshots is None else self.snapshots[index],
+            power_db=None if self.power_db is None else self.power_db[index],
+            key=key,
+        )
+
+
+def training_data(dataset: Dataset) -> TrainingData:
+    """Returns a dataset on the device."""
+    receivers, steering = dataset.receivers, None
+    if dataset.snapshots is not None and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
+        steering = jax.jit(steering_vector)(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
+    return TrainingData(
+        receivers=receivers,
+        links=dataset.links(np.arange(len(dataset))),
+        snapshots=None if dataset.snapshots is None else jnp.asarray(dataset.snapshots, jnp.complex64),
+        steering=steering,
+        images=None if dataset.images is None else jnp.asarray(dataset.images),
+        power_db=None if dataset.power_db is None else jnp.asarray(dataset.power_db, jnp.float32),
+    )

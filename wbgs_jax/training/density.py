@@ -1,0 +1,186 @@
+"""Adaptive density control on the host, between jitted epochs (paper, section 4.5; Kerbl et al. 2023).
+
+A Gaussian whose positional gradient on the image is large is not well reconstructed: a small one is cloned, the clone moved
+along the descent direction of its mean; a large one is split in two. Gaussians that hardly attenuate are removed, and now and
+then delta_o is reset close to zero so that the useless ones can be told. Optimiser moments travel with their Gaussian;
+new ones start from zero moments.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from wbgs_jax._util.pytree import pytree, replaced
+from wbgs_jax.config import DensityConfig
+from wbgs_jax.fields import Field
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.geometry import rotation_matrix
+from wbgs_jax.splat import slots_for
+from wbgs_jax.training.controls import Context, Edit
+from wbgs_jax.types import Gaussians
+
+SPLIT_SHRINK = 1.6
+"""Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting)."""
+CLONE_STEP = 0.5
+"""How far a clone moves, in its smallest standard deviations."""
+
+
+@pytree
+class DensityStatistics:
+    """What density control needs to know about every Gaussian, summed since the last control."""
+
+    gradient_norm: Float[Array, "n"]
+    """Norm of the positional gradient on the image, in normalised coordinates (-1..1 across the image)."""
+    mean_gradient: Float[Array, "n 3"]
+    """Gradient of the loss with respect to the mean (per metre)."""
+    visible: Float[Array, "n"]
+    """Steps in which the Gaussian touched the image."""
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one control did."""
+
+    cloned: int
+    split: int
+    pruned: int
+    alive: int
+
+
+@dataclass(frozen=True)
+class DensityControl:
+    """The host control of fields whose parameters hold `gaussians` and whose probe is the offset (n, 2), in pixels, of their
+    projected centres."""
+
+    config: DensityConfig
+    stream: int = 3
+
+    def statistics(self, params: Any) -> DensityStatistics:
+        """Returns zero statistics of all slots."""
+        n = params.gaussians.means.shape[0]
+        return DensityStatistics(jnp.zeros(n), jnp.zeros((n, 3)), jnp.zeros(n))
+
+    def accumulate(self, statistics: DensityStatistics, gradients: Any, probe: Float[Array, "n 2"]) -> DensityStatistics:
+        """Returns the statistics after a step."""
+        to_normalised = jnp.array([PAS_WIDTH / 2, PAS_HEIGHT / 2])
+        norm = jnp.linalg.norm(probe * to_normalised, axis=-1)
+        mean_gradient = statistics.mean_gradient + gradients.gaussians.means
+        return DensityStatistics(statistics.gradient_norm + norm, mean_gradient, statistics.visible + (norm > 0))
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether the schedule asks for a control or a reset after this step."""
+        config = self.config
+        if not config.every or step < max(config.start, 1) or step > config.stop_fraction * steps:
+            return False
+        return step % config.every == 0 or self._resets(step)
+
+    def _resets(self, step: int) -> bool:
+        return bool(self.config.reset_every) and step % self.config.reset_every == 0
+
+    def apply(
+        self,
+        field: Field,
+        params: Any,
+        statistics: DensityStatistics,
+        context: Context,
+        step: int,
+        rng: np.random.Generator,
+    ) -> Edit:
+        """Returns the parameters after clones, splits, prunes and, where it is time, a reset of delta_o."""
+        edit = Edit(params, statistics, lambda tree: tree, {})
+        if step % self.config.every == 0:
+            edit = control_density(params, statistics, self.config, rng)
+            edit = edit._replace(statistics=self.statistics(edit.params))
+        return reset_attenuation(edit, self.config) if self._resets(step) else edit
+
+
+def control_density(
+    params: Any, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator
+) -> Edit:
+    """Returns parameters with Gaussians cloned, split and pruned; the number of slots may change."""
+    gaussians = jax.tree.map(np.asarray, params.gaussians)
+    statistics = jax.tree.map(np.asarray, statistics)
+    keep, clone, split = choose(gaussians, statistics, config)
+    source, fresh = _sources(keep, clone, split)
+    edited = _edit(gaussians, statistics, source, clone, split, int(keep.sum()), rng)
+    pad = slots_for(len(source)) - len(source)
+    source, fresh = np.pad(source, (0, pad)), np.pad(fresh, (0, pad), constant_values=True)
+    edited = jax.tree.map(lambda a: jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1))), edited)
+    empty = jnp.arange(len(source)) >= len(source) - pad
+    edited = dataclasses.replace(edited, opacity_logits=jnp.where(empty, -jnp.inf, edited.opacity_logits))
+
+    def gather_moments(tree: Any) -> Any:
+        def gather(leaf: Any) -> Any:
+            return jnp.where(fresh.reshape((-1,) + (1,) * (leaf.ndim - 1)), 0, leaf[source])
+
+        return replaced(tree, gaussians=jax.tree.map(gather, tree.gaussians))
+
+    before, alive = int(np.asarray(gaussians.alive).sum()), int(keep.sum() + clone.sum() + split.sum() * 2)
+    report = DensityReport(int(clone.sum()), int(split.sum()), before - int(keep.sum()) - int(split.sum()), alive)
+    params = dataclasses.replace(params, gaussians=edited)
+    return Edit(params, statistics, gather_moments, {"density": dataclasses.asdict(report)})
+
+
+def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:
+    """Returns an edit in which delta_o is lowered to at most `reset_attenuation`, its moments forgotten."""
+    gaussians = edit.params.gaussians
+    ceiling = math.log(config.reset_attenuation / (1 - config.reset_attenuation))
+    lowered = dataclasses.replace(gaussians, opacity_logits=jnp.minimum(gaussians.opacity_logits, ceiling))
+
+    def forget(tree: Any) -> Any:
+        tree = edit.moments(tree) if edit.moments else tree
+        zero = jax.tree.map(jnp.zeros_like, tree.gaussians.opacity_logits)
+        return replaced(tree, gaussians=replaced(tree.gaussians, opacity_logits=zero))
+
+    return edit._replace(params=dataclasses.replace(edit.params, gaussians=lowered), moments=forget)
+
+
+def choose(
+    gaussians: Gaussians, statistics: DensityStatistics, config: DensityConfig
+) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Returns masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is. Never grows beyond the maximum."""
+    alive = np.asarray(gaussians.alive)
+    attenuation = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits)))
+    useful = alive & (attenuation >= config.prune_attenuation)
+    if not useful.any():  # an empty field could never recover
+        useful = alive
+    gradient = np.asarray(statistics.gradient_norm) / np.maximum(np.asarray(statistics.visible), 1)
+    wanting = useful & (gradient > config.gradient_threshold)
+    room = max(config.max_gaussians - int(useful.sum()), 0)
+    if wanting.sum() > room:  # the neediest first; stable, so that equal runs stay equal
+        chosen = np.argsort(-np.where(wanting, gradient, -1), kind="stable")[:room]
+        wanting = np.zeros_like(wanting)
+        wanting[chosen] = True
+    large = np.exp(np.asarray(gaussians.log_scales)).max(-1) > config.split_scale
+    split = wanting & large
+    return useful & ~split, wanting & ~large, split
+
+
+def _sources(keep, clone, split) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+    """Returns for every new slot the Gaussian it comes from, and whether it is new: kept ones, clones, then pairs of halves."""
+    kept, cloned, halves = (np.flatnonzero(mask) for mask in (keep, clone, split))
+    source = np.concatenate([kept, cloned, np.repeat(halves, 2)])
+    return source, np.arange(len(source)) >= len(kept)
+
+
+def _edit(gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator) -> Gaussians:
+    """Returns the new Gaussians, without empty slots: clones stepped downhill, halves drawn from the Gaussian they replace."""
+    means, log_scales, quats, logits = (
+        np.asarray(a)[source].copy() for a in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits)
+    )
+    clones = slice(n_kept, n_kept + int(clone.sum()))
+    halves = slice(n_kept + int(clone.sum()), None)
+    gradient = np.asarray(statistics.mean_gradient)[source[clones]]
+    downhill = -gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-20)
+    means[clones] += CLONE_STEP * np.exp(log_scales[clones]).min(-1, keepdims=True) * downhill
+    draw = rng.normal(size=means[halves].shape) * np.exp(log_scales[halves])
+    rotation = np.asarray(rotation_matrix(jnp.asarray(quats[halves])))
+    means[halves] += np.einsum("nij,nj->ni", rotation, draw).astype(means.dtype)
+    log_scales[halves] -= math.log(SPLIT_SHRINK)
+    return Gaussians(*map(jnp.asarray, (means, log_scales, quats, logits)))

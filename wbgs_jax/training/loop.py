@@ -1,0 +1,258 @@
+"""The host loop: jitted epochs, host controls between them, checkpoints, curves, resume.
+
+A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step. What a field is
+made of is the field's business; the loop knows the seam alone (`fields.base.Field`).
+"""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.config import Settings, limit_steps
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.evaluation.score import watch
+from wbgs_jax.fields import Field, from_arrays, get_field
+from wbgs_jax.training import checkpoint, curves
+from wbgs_jax.training.controls import Context, Control, Edit
+from wbgs_jax.training.data import TrainingData, training_data
+from wbgs_jax.training.density import DensityControl
+from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
+from wbgs_jax.training.materials import MaterialSearch
+from wbgs_jax.training.optim import make_optimizer
+from wbgs_jax.training.progress import TrainingProgress
+from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
+
+CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": MaterialSearch}
+"""Host controls by the names that fields and settings give them."""
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a training run leaves."""
+
+    field: Field
+    params: Any
+    steps: int
+    seconds: float
+    """Wall-clock training time, summed over resumed parts."""
+    compilations: int
+    """Times the jitted epoch changed its shapes in this process: at the start and whenever a limit or size changed."""
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """How large the trained field is."""
+        return self.field.sizes(self.params)
+
+
+class Run:
+    """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
+
+    def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path):
+        self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
+        kind, self.key = get_field(field), jax.random.key(seed)
+        self.controls = tuple(CONTROLS[name](getattr(settings, name)) for name in kind.controls if getattr(settings, name))
+        self.optimizer = make_optimizer(kind, settings.field, settings.optim)
+        self.checkpoints = folder / "checkpoints"
+        self.seconds, self.compilations = 0.0, 1
+        self.field = kind.make(settings.field, DatasetScene(dataset), seed)
+        self.state = init_state(self.field.init(self.key), self.optimizer, self.controls)
+        self.limits = self.field.limits(self.state.params, dataset.receivers)
+        self.data: TrainingData = training_data(dataset)
+        self.cache = self.field.prepare(self.data.links, self.data.receivers)
+        rng = np.random.default_rng([seed, 1])
+        part = dataset.validation if len(dataset.validation) else dataset.test
+        self.watched = np.sort(rng.choice(part, min(settings.loop.evaluate_spectra, len(part)), replace=False))
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return int(self.state.step)
+
+    def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
+        """Returns the batches of an epoch, each of one receiver: a function of seed and epoch alone, so that a resumed run sees
+        the same ones."""
+        rng = np.random.default_rng([self.seed, 2, epoch])
+        pool = self.pool(epoch * steps / self.settings.optim.steps)
+        batch = min(self.settings.optim.batch, len(self.dataset.train))
+        return np.stack([self._draw(rng, pool, batch) for _ in range(steps)]).astype(np.int32)
+
+    def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, "n"], batch: int) -> Int[np.ndarray, "b"]:
+        if self.dataset.n_receivers > 1:  # a receiver as often as its share of the links
+            of_receiver = self.dataset.receiver_index[pool]
+            pool = pool[of_receiver == rng.choice(of_receiver)]
+        return rng.choice(pool, batch, replace=len(pool) < batch)
+
+    def pool(self, progress: float) -> Int[np.ndarray, "n"]:
+        """Returns the training links that batches are drawn from after this share of the steps: low frequencies first, if
+        asked."""
+        train, curriculum = self.dataset.train, self.settings.optim.curriculum
+        frequencies = self.dataset.frequencies_hz[train]
+        if progress >= curriculum:
+            return train
+        low, high = frequencies.min(), frequencies.max()
+        return train[frequencies <= low * (high / low) ** (progress / curriculum) * (1 + 1e-6)]
+
+    def epoch(self) -> dict[str, float]:
+        """Runs one block of steps and returns means of the loss and of the metrics. Overflowed steps are repeated with larger
+        limits."""
+        begin, length = time.perf_counter(), self.settings.loop.epoch_steps
+        batches = self.batches(self.step // length, length)
+        done, figures = 0, dict[str, list[float]]()
+        while done < length:
+            self.state, report = run_epoch(
+                self.state,
+                self.field,
+                self.cache,
+                self.data,
+                jnp.asarray(batches),
+                jnp.asarray(done, jnp.int32),
+                self.key,
+                optimizer=self.optimizer,
+                controls=self.controls,
+                limits=self.limits,
+            )
+            ran = slice(done, done + int(report.good_steps))
+            for name, values in ({"loss": report.loss} | report.metrics).items():
+                figures.setdefault(name, []).extend(np.asarray(values)[ran].tolist())
+            done = ran.stop
+            if report.stopped:
+                self._recover(report, batches[done])
+        self.seconds += time.perf_counter() - begin
+        return {name: float(np.mean(values)) for name, values in figures.items()}
+
+    def _recover(self, report: EpochReport, batch: Int[np.ndarray, "b"]) -> None:
+        """Grows the limits after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
+        if report.overflow:
+            self.limits = self.field.grow(self.limits, np.asarray(report.required))
+            self.compilations += 1
+            return
+        saved = checkpoint.checkpoint_steps(self.checkpoints)
+        last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
+        raise UserError(
+            f"the loss of step {self.step} or its gradient is not finite (spectra {batch.tolist()}); {last}. "
+            "Check these spectra, or start again with smaller learning rates"
+        )
+
+    def control(self) -> None:
+        """Lets every host control act that is due."""
+        for number, control in enumerate(self.controls):
+            if control.due(self.step, self.settings.optim.steps):
+                begin, step = time.perf_counter(), self.step
+                rng = np.random.default_rng([self.seed, control.stream, step])
+                context = Context(self.data, self.cache, self.dataset.train)
+                edit = control.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
+                self._commit(number, edit)
+                self.seconds += time.perf_counter() - begin
+                if edit.report:
+                    self.log({"step": step} | edit.report)
+
+    def _commit(self, number: int, edit: Edit) -> None:
+        """Puts a control's edit into the state, moments and all."""
+        old, statistics = self.state, list(self.state.statistics)
+        if _shapes(edit.params) != _shapes(old.params):
+            self.compilations += 1
+        moments = self.optimizer.init(edit.params) if edit.moments is None else _map_like(old, edit.moments)
+        statistics[number] = edit.statistics
+        self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
+
+    def evaluate(self) -> dict[str, float]:
+        """Returns figures of the watched held-out spectra."""
+        return watch(self.field, self.state.params, self.dataset, self.watched)
+
+    def log(self, entry: dict[str, Any]) -> None:
+        """Appends a line to metrics.jsonl."""
+        curves.append(self.folder / "metrics.jsonl", entry)
+
+    def save(self) -> None:
+        """Writes a checkpoint of the present step."""
+        limits = dataclasses.asdict(self.limits) if self.limits else None
+        metadata = {"limits": limits, "seconds": self.seconds}
+        checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, self.settings.loop.keep_checkpoints)
+
+    def restore(self) -> bool:
+        """Loads the newest checkpoint, if there is one, and returns whether there was."""
+        steps = checkpoint.checkpoint_steps(self.checkpoints)
+        curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1)
+        if not steps:
+            return False
+        saved = checkpoint.read(self.checkpoints, steps[-1])
+        self.field = from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
+        params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
+        like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
+        self.state = checkpoint.fill_like(saved, like)
+        self.seconds = float(saved.metadata["seconds"])
+        if saved.metadata["limits"]:
+            self.limits = type(self.limits)(**saved.metadata["limits"])
+        self.cache = self.field.prepare(self.data.links, self.data.receivers)
+        return True
+
+
+def _shapes(tree: Any) -> list[tuple[int, ...]]:
+    return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def _map_like(state: TrainState, function: Callable[[Any], Any]) -> Any:
+    """Returns the optimiser's state with every tree in it that is like the parameters transformed."""
+
+    def alike(value: Any) -> bool:
+        return type(value) is type(state.params) and (not isinstance(value, dict) or value.keys() == state.params.keys())
+
+    return jax.tree.map(lambda leaf: function(leaf) if alike(leaf) else leaf, state.optimizer, is_leaf=alike)
+
+
+def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:
+    """Trains a field, by its name, and leaves checkpoints and curves in `folder`.
+
+    Raises:
+        UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder,
+            no training spectra.
+        Interrupted: Ctrl-C; the state is saved.
+        KeyboardInterrupt: Ctrl-C in the last epoch; the state is saved, and nothing is left to train.
+    """
+    if len(dataset.train) == 0:
+        raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    settings = limit_steps(settings, len(dataset.train))
+    run = Run(dataset, field, settings, seed, folder)
+    if resume:
+        run.restore()
+    total = settings.optim.steps
+    with deferred_interrupt() as interrupt, TrainingProgress(total, run.step) as progress:
+        if run.step == 0:
+            run.control()
+        while run.step < total:
+            _advance(run, total, progress, interrupt)
+    return TrainResult(run.field, run.state.params, run.step, run.seconds, run.compilations)
+
+
+def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:
+    """Runs an epoch and all that is due after it."""
+    before, loop = run.step, run.settings.loop
+    figures = run.epoch()
+    run.control()
+    entry: dict[str, Any] = {"step": run.step} | {name: None if np.isnan(v) else v for name, v in figures.items()}
+    entry |= run.field.sizes(run.state.params) | {"seconds": run.seconds}
+    if len(run.watched) and (_crosses(before, run.step, loop.evaluate_every) or run.step == total):
+        entry |= run.evaluate()
+    run.log(entry)
+    progress.update(entry)
+    if _crosses(before, run.step, loop.checkpoint_every) or run.step == total or interrupt["set"]:
+        run.save()
+    if interrupt["set"] and run.step < total:
+        raise Interrupted(
+            f"stopped at step {run.step} of {total}; the state is saved: run the same command with --resume to go on"
+        )
+
+
+def _crosses(before: int, after: int, interval: int) -> bool:
+    return before // interval != after // interval

@@ -1,0 +1,143 @@
+"""Search for materials on the host, before the first epoch: what gradients alone cannot find.
+
+The phase behind a slab turns by many radians at high frequencies. Its permittivity then has a valley of the loss for every
+turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
+data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
+apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
+spectra best is taken, unless what is there fits better by more than chance. Training goes on from there.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.losses import log_decorrelation
+from wbgs_jax.training.controls import Context, Edit
+from wbgs_jax.training.data import TrainingData
+
+ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
+    # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
+    "concrete": (5.24, 0.0462, 0.7822),
+    "brick": (3.91, 0.0238, 0.16),
+    "plasterboard": (2.73, 0.0085, 0.9395),
+    "wood": (1.99, 0.0047, 1.0718),
+    "glass": (6.31, 0.0036, 1.3394),
+    "ceiling board": (1.48, 0.0011, 1.0750),
+    "chipboard": (2.58, 0.0217, 0.78),
+    "plywood": (2.71, 0.33, 0.0),
+    "marble": (7.074, 0.0055, 0.9262),
+    "floorboard": (3.66, 0.0044, 1.3515),
+    "metal": (1.01, 1e7, 0.0),
+}
+"""ITU-R P.2040-3, table 3 (metal has permittivity 1 there; log(eps_r - 1) is what is stored)."""
+UNSEEN = 1e-6
+"""A material that changes the scores by less is in no path of the spectra, and stays what it is."""
+Scores = Callable[[Any, Any], Float[Array, "k n"]]
+"""(parameters, K candidates for their materials) -> log decorrelation of N spectra."""
+
+
+@dataclass(frozen=True)
+class SearchReport:
+    """What a search did."""
+
+    before: float
+    """Mean log decorrelation of the spectra that were looked at."""
+    after: float
+    """The same with the materials that were taken."""
+    taken: dict[int, str]
+    """Materials, and the entry that each of them got."""
+
+
+@dataclass(frozen=True)
+class MaterialSearch:
+    """The host control of fields whose parameters hold `materials` of ITU-R P.2040 and whose links are prepared."""
+
+    config: SearchConfig
+    stream: int = 6
+
+    def statistics(self, params: Any) -> tuple[()]:
+        """Returns nothing: it watches no step."""
+        return ()
+
+    def accumulate(self, statistics: tuple[()], gradients: Any, probe: Any) -> tuple[()]:
+        """Returns nothing."""
+        return ()
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether it is before the first step."""
+        return step == 0 and self.config.rounds > 0
+
+    def apply(
+        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
+        """Returns the parameters with the materials that fit some training spectra best."""
+        spectra = rng.choice(context.train, min(self.config.spectra, len(context.train)), replace=False)
+        score = make_scores(field, context.cache, context.data, jnp.asarray(spectra, jnp.int32))
+        params, report = search_materials(params, score, self.config)
+        return Edit(params, (), None, {"search": dataclasses.asdict(report)})
+
+
+def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[Any, SearchReport]:
+    """Returns parameters with the materials whose scores are best."""
+    before, taken, settled = np.zeros(0), dict[int, str](), 0
+    count = len(params.materials.slope)
+    for turn in range(config.rounds * count):
+        material = turn % count
+        candidates = [params.materials, *_entries(params.materials, material)]
+        scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)))
+        best = 1 + int(np.argmin(scores[1:].mean(1)))
+        before = before if turn else scores[0]
+        settled += 1
+        if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
+            if taken.get(material) != (entry := list(ITU_MATERIALS)[best - 1]):
+                taken[material], settled = entry, 1
+            params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
+        if settled == count:  # all others are what they were when each was looked at
+            break
+    return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
+
+
+def _surely_better(new: Float[np.ndarray, "n"], old: Float[np.ndarray, "n"], errors: float) -> bool:
+    """Returns whether scores are lower by more than so many standard errors of the mean difference."""
+    gain = old - new
+    return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
+
+
+def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
+    """Returns the function that scores candidates on some spectra of one receiver."""
+    return lambda params, candidates: _score(field, params, candidates, cache, data, spectra)
+
+
+@jax.jit
+def _score(field: Field, params: Any, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"]):
+    batch = data.batch(spectra, jax.random.key(0))
+    plan = field.plan(params, batch.receiver, None, cache)
+
+    def one(materials):
+        seen = field.render_links(dataclasses.replace(params, materials=materials), plan, cache, batch.links)
+        if seen.snapshots is not None and batch.snapshots is not None:
+            return log_decorrelation(seen.snapshots, batch.snapshots)
+        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
+
+    return jax.lax.map(one, candidates)
+
+
+def _entries(materials: Any, material: int) -> list[Any]:
+    """Returns copies in which one material is one of ITU-R P.2040."""
+    return [
+        dataclasses.replace(
+            materials,
+            log_susceptibility=materials.log_susceptibility.at[material].set(np.log(permittivity - 1)),
+            log_conductivity=materials.log_conductivity.at[material].set(np.log(c)),
+            slope=materials.slope.at[material].set(d),
+        )
+        for permittivity, c, d in ITU_MATERIALS.values()
+    ]

@@ -1,0 +1,98 @@
+"""What a person sees of long work: a live bar on a terminal, a plain line now and then in a log."""
+
+import sys
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+LOG_INTERVAL = 20.0
+"""Seconds between two lines when the output is no terminal."""
+HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
+"""Figures that are measured now and then, and shown until they are measured again."""
+LABELS = {"batch_ssim": "SSIM", "held_out_ssim": "held-out SSIM", "held_out_power_error_db": "held-out power error dB"}
+UNSHOWN = ("step", "seconds")
+
+
+class TrainingProgress:
+    """Shows the figures of a training, steps a second and the time left, on stderr."""
+
+    def __init__(self, total: int, done: int = 0):
+        self.total, self.done, self.start_step = total, done, done
+        self.held_out: dict[str, float] = {}
+        self.started = self.last_line = time.monotonic()
+        self.console = Console(file=sys.stderr)
+        self.bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.completed}/{task.total}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
+
+    def __enter__(self) -> "TrainingProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.bar.stop()
+
+    def update(self, entry: dict[str, Any]) -> None:
+        """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
+        step = int(entry["step"])
+        self.held_out = {name: entry[name] for name in HELD_OUT if entry.get(name) is not None} or self.held_out
+        shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in UNSHOWN}
+        figures = [f"{name} {value:.4g}" for name, value in shown.items() if value is not None]
+        elapsed = max(time.monotonic() - self.started, 1e-9)
+        rate = (step - self.start_step) / elapsed
+        status = "  ".join([*figures, f"{rate:.1f} steps/s"])
+        self.bar.update(self.task, completed=step, status=status)
+        if not self.console.is_terminal and (time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total):
+            self.last_line = time.monotonic()
+            left = (self.total - step) / max(rate, 1e-9)
+            print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)
+
+
+class CountProgress:
+    """Shows how many of equal pieces of work are done and the time left, on stderr."""
+
+    def __init__(self, label: str, total: int, done: int = 0):
+        self.label, self.total, self.done, self.start_done = label, total, done, done
+        self.started = self.last_line = time.monotonic()
+        self.console = Console(file=sys.stderr)
+        columns = (TextColumn(label), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
+        self.bar = Progress(
+            *columns, TextColumn("left"), TimeRemainingColumn(), console=self.console, disable=not self.console.is_terminal
+        )
+        self.task = self.bar.add_task(label, total=total, completed=done)
+
+    def __enter__(self) -> "CountProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.bar.stop()
+
+    def advance(self) -> None:
+        """One more piece is done."""
+        self.done += 1
+        self.bar.update(self.task, completed=self.done)
+        now = time.monotonic()
+        if not self.console.is_terminal and (now - self.last_line > LOG_INTERVAL or self.done == self.total):
+            self.last_line = now
+            left = (self.total - self.done) * (now - self.started) / (self.done - self.start_done)
+            print(f"{self.label}: {self.done}/{self.total}  {left:.0f} s left", file=sys.stderr, flush=True)

@@ -1,0 +1,141 @@
+"""A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
+
+config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
+"""
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import wbgs_jax
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.config import Settings, from_dict, sections, to_dict
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, select_receivers, unseen_frequencies
+from wbgs_jax.fields import Field, from_arrays, get_field
+from wbgs_jax.training import checkpoint
+
+FIRST_PRESET = "cpu"
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that determines a run."""
+
+    source: str
+    """Scene number, scene file or folder."""
+    field: str
+    preset: str
+    seed: int
+    frequency_ghz: float | None
+    """Frequency of a single-frequency folder that does not say."""
+    settings: Settings
+    train_ghz: tuple[float, ...] = ()
+    """Train at these frequencies and test at the others; none: train and test at all."""
+    train_tx: int = 0
+    """Number of training transmitters; 0: all."""
+    validation: float = 0.0
+    """Share of the training transmitters that is held out for validation."""
+    receiver: int | None = None
+    """Number of the only receiver that is looked at; None: all."""
+
+    def dataset(self) -> Dataset:
+        """Returns the data that the run was trained on."""
+        frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
+        dataset = load_dataset(self.source, frequency_hz=frequency, seed=self.seed)
+        if self.receiver is not None:
+            dataset = select_receivers(dataset, [self.receiver])
+        if self.train_ghz:
+            dataset = unseen_frequencies(dataset, self.train_ghz)
+        if self.validation:
+            dataset = hold_out_validation(dataset, self.validation, self.seed)
+        return fewer_transmitters(dataset, self.train_tx, self.seed) if self.train_tx else dataset
+
+
+@dataclass(frozen=True)
+class TrainedField:
+    """A field with the parameters of a run's newest checkpoint."""
+
+    config: RunConfig
+    field: Field
+    params: Any
+    step: int
+    seconds: float
+    """Training time."""
+
+    def dataset(self) -> Dataset:
+        """Returns the data that it was trained on."""
+        return self.config.dataset()
+
+    def origin(self) -> dict[str, Any]:
+        """Returns where it comes from: field, preset, seed and step."""
+        return {name: getattr(self.config, name) for name in ("field", "preset", "seed")} | {"step": self.step}
+
+
+def write_config(folder: Path, config: RunConfig) -> None:
+    """Starts a run folder."""
+    values = {"version": wbgs_jax.__version__} | {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    write_json(folder / "config.json", values | {"settings": to_dict(config.settings, config.field)})
+
+
+def read_config(folder: Path) -> RunConfig:
+    """Returns the configuration of a run folder; a folder without one, or of another version, is a `UserError`."""
+    path = folder / "config.json"
+    if not path.exists():
+        raise UserError(f"{folder} is not a run folder: it has no config.json; train first (make train SCENE=1)")
+    values = read_json(path)
+    try:
+        values = {f.name: values[f.name] for f in dataclasses.fields(RunConfig)}
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{path} lacks {error}; it belongs to another version of wbgs-jax: train again") from error
+    default = get_field(values["field"]).presets[FIRST_PRESET]
+    settings = from_dict(values["settings"], default, values["field"])
+    return RunConfig(**values | {"settings": settings, "train_ghz": tuple(values["train_ghz"])})
+
+
+def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
+    """Makes the run folder, or makes sure that the one there belongs to the same run."""
+    if not (folder / "config.json").exists():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise UserError(f"{folder} holds other files; choose another OUT")
+        write_config(folder, config)
+    elif found := difference(read_config(folder), config):
+        raise UserError(f"{folder} holds a run of another configuration ({found}); choose another OUT or remove the folder")
+    elif not resume:
+        raise UserError(f"{folder} already holds this run; add --resume to go on with it, or choose another OUT")
+    if not os.access(folder, os.W_OK):
+        raise UserError(f"cannot write to run folder {folder}; choose another OUT or mend its permissions")
+
+
+def difference(a: RunConfig, b: RunConfig) -> str:
+    """Returns the first setting in which two configurations differ, as "name: a, not b"; empty if they are equal."""
+
+    def flat(config: RunConfig) -> dict[str, Any]:
+        values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name != "settings"}
+        for section, part in sections(config.settings, config.field).items():
+            values |= {f"settings.{section}.{name}": value for name, value in dataclasses.asdict(part).items()}
+        return values
+
+    left, right = flat(a), flat(b)
+    return next((f"{key}: {left[key]}, not {right.get(key)}" for key in left if left[key] != right.get(key)), "")
+
+
+def load_trained(folder: Path | str) -> TrainedField:
+    """Returns the field of a run's newest checkpoint; the data are not read."""
+    folder = Path(folder)
+    config = read_config(folder)
+    steps = checkpoint.checkpoint_steps(folder / "checkpoints")
+    if not steps:
+        raise UserError(f"{folder} holds no checkpoint yet; train on with the same command and --resume")
+    saved = checkpoint.read(folder / "checkpoints", steps[-1])
+    field = from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
+    params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
+    return TrainedField(config, field, params, steps[-1], float(saved.metadata["seconds"]))
+

@@ -1,0 +1,125 @@
+"""The jitted part of training: pure functions on a `TrainState`.
+
+An epoch is a `lax.scan` over a block of batches with donated state. A step that overflowed its field's limits, or whose loss or
+gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and says where
+it stopped, and the host decides (larger limits and repeat, or stop with a message).
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.fields import Aux, Field
+from wbgs_jax.training.controls import Control
+from wbgs_jax.training.data import TrainingData
+
+
+@pytree
+class TrainState:
+    """Everything that changes during training."""
+
+    params: Any
+    optimizer: Any
+    statistics: tuple[Any, ...]
+    """What every host control has watched since it last acted."""
+    step: Int[Array, ""]
+
+
+@pytree
+class EpochReport:
+    """What an epoch of K steps tells the host."""
+
+    loss: Float[Array, "k"]
+    """NaN for steps that did not run or failed."""
+    metrics: dict[str, Float[Array, "k"]]
+    """Figures of the steps, such as the mean SSIM of the batch; NaN where they mean nothing."""
+    good_steps: Int[Array, ""]
+    """Steps committed, counted from the epoch's start."""
+    overflow: Bool[Array, ""]
+    """The step after the last good one did not fit its limits ..."""
+    required: Int[Array, "r"] | None
+    """... and required this much (the largest seen); None for a field without limits."""
+    stopped: Bool[Array, ""]
+    """The epoch ended early, by overflow or a loss or gradient that is not finite."""
+
+
+def init_state(params: Any, optimizer: optax.GradientTransformation, controls: tuple[Control, ...] = ()) -> TrainState:
+    """Returns the state before the first step."""
+    statistics = tuple(control.statistics(params) for control in controls)
+    return TrainState(params, optimizer.init(params), statistics, jnp.zeros((), jnp.int32))
+
+
+def loss_and_gradients(
+    field: Field, params: Any, cache: Any, data: TrainingData, index: Int[Array, "b"], limits: Any, key: Key[Array, ""]
+) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
+    """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch."""
+
+    def objective(params, probe):
+        return field.loss(params, cache, data.batch(index, key), limits, probe)
+
+    return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, field.probe(params))
+
+
+def _all_finite(tree: Any) -> Bool[Array, ""]:
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+
+
+def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+@partial(jax.jit, static_argnames=("optimizer", "controls", "limits"), donate_argnames="state")
+def run_epoch(
+    state: TrainState,
+    field: Field,
+    cache: Any,
+    data: TrainingData,
+    batches: Int[Array, "k b"],
+    first: Int[Array, ""],
+    key: Key[Array, ""],
+    *,
+    optimizer: optax.GradientTransformation,
+    controls: tuple[Control, ...] = (),
+    limits: Any = None,
+) -> tuple[TrainState, EpochReport]:
+    """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away."""
+
+    def run(state: TrainState, index: Int[Array, "b"]):
+        (loss, aux), (gradients, probe) = loss_and_gradients(
+            field, state.params, cache, data, index, limits, jax.random.fold_in(key, state.step)
+        )
+        overflow = jnp.zeros((), bool) if aux.overflow is None else aux.overflow
+        ok = _all_finite((loss, gradients)) & ~overflow
+        updates, moments = optimizer.update(gradients, state.optimizer, state.params)
+        watched = zip(controls, state.statistics, strict=True)
+        statistics = tuple(control.accumulate(seen, gradients, probe) for control, seen in watched)
+        new = TrainState(optax.apply_updates(state.params, updates), moments, statistics, state.step + 1)
+        return _where(ok, new, state), loss, aux._replace(overflow=overflow), ok
+
+    shapes: Any = jax.eval_shape(run, state, batches[0])
+    nothing: Aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes[2])
+    nothing = nothing._replace(metrics={name: jnp.full((), jnp.nan) for name in nothing.metrics})
+
+    def step(carry, position_and_batch):
+        state, good, stopped, overflow, required = carry
+        index, position = position_and_batch
+
+        def pass_by(state: TrainState):
+            return state, jnp.full((), jnp.nan), nothing._replace(overflow=overflow), jnp.zeros((), bool)
+
+        active = (position >= first) & ~stopped
+        state, loss, aux, ok = jax.lax.cond(active, lambda state: run(state, index), pass_by, state)
+        required = jax.tree.map(jnp.maximum, required, aux.required)
+        carry = (state, good + ok, stopped | (active & ~ok), aux.overflow, required)
+        return carry, (jnp.where(ok, loss, jnp.nan), aux.metrics)
+
+    carry = (state, jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros((), bool), nothing.required)
+    (state, good, stopped, overflow, required), (loss, metrics) = jax.lax.scan(
+        step, carry, (batches, jnp.arange(batches.shape[0]))
+    )
+    return state, EpochReport(loss, metrics, good, overflow, required, stopped)
