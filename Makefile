@@ -19,11 +19,11 @@ SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
 NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCENE)),$(notdir $(basename $(SCENE))),scene$(SCENE)))
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval test simulator data lint typecheck bench experiments tables clean
+.PHONY: help setup train eval test test-slow simulator data lint typecheck bench experiments tables docs clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 setup: $(READY)  ## make .venv with the locked dependencies (uv where it is, else venv and pip)
 
@@ -40,14 +40,17 @@ $(READY): uv.lock requirements.lock pyproject.toml
 	@touch $@
 
 train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|cpu|gpu DATA=folder OUT=runs/x SEED=]
-	$(PY) -m wbgs_jax.train $(SOURCE) --field $(FIELD) --preset $(PRESET) --seed $(SEED) --out $(RUN) --resume
-	$(PY) -m wbgs_jax.eval --run $(RUN)
+	$(VENV)/bin/wbgs-jax train $(SOURCE) --field $(FIELD) --preset $(PRESET) --seed $(SEED) --out $(RUN) --resume
+	$(VENV)/bin/wbgs-jax eval --run $(RUN)
 
 eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
-	$(PY) -m wbgs_jax.eval --run $(RUN)
+	$(VENV)/bin/wbgs-jax eval --run $(RUN)
 
 test: setup  ## run the tests
-	$(PY) -m pytest -n 2 --dist worksteal
+	$(PY) -m pytest -n 2 --dist worksteal -m "not slow"
+
+test-slow: setup  ## run the slow tests too, in fully optimised code: larger cases of what `make test` checks
+	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
 
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \
@@ -57,8 +60,8 @@ simulator: setup  ## also install Sionna RT, which only `make data` needs
 data: simulator  ## trace a scene with Sionna RT, or go on with it: make data SCENE=1 [ARGS="--frequency-set 21"]
 	$(PY) -m data_gen.generate --scene $(SCENE) $(ARGS)
 
-lint: setup  ## ruff
-	$(PY) -m ruff check . && $(PY) -m ruff format --check .
+lint: setup  ## ruff, and the layers of docs/architecture.md
+	$(PY) -m ruff check . && $(PY) -m ruff format --check . && $(VENV)/bin/lint-imports --no-logo
 
 typecheck: setup  ## mypy
 	$(PY) -m mypy
@@ -71,6 +74,9 @@ experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE
 
 tables: setup  ## write docs/results.md from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
+
+docs: setup  ## write docs/api.md from the docstrings
+	$(PY) docs/make_api.py
 
 clean:  ## remove caches; runs, data and .venv stay
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist

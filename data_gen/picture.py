@@ -159,7 +159,10 @@ def _view(axes: Axes, spec: SceneSpec) -> None:
 
 
 class _Raster:
-    """A picture with a depth buffer, seen from far away along a fixed direction (matplotlib itself has no depth buffer)."""
+    """A picture with a depth buffer, seen from far away along a fixed direction.
+
+    matplotlib has no depth buffer, trimesh draws through OpenGL and a window only.
+    """
 
     def __init__(self, bounds: Float[np.ndarray, "2 3"]) -> None:
         elevation, azimuth = np.radians([ELEVATION, AZIMUTH])

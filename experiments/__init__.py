@@ -1,1 +1,9 @@
-"""Experiments and measurements; they use public names only."""
+"""Measurements on top of `wbgs_jax`: the paper's tables and figures, series of single changes, and what a machine can do.
+
+* `runner.py` runs jobs (`python -m experiments.runner`): `jobs.py` says what a job is, `profiles.py` how large, `variants.py`
+  what it changes, `settings.py` puts that together, `execute.py` trains and scores, `results.py` keeps what comes out.
+* `tables/`: a file a table or figure of the paper (`python -m experiments.tables`), which shows the results that there are.
+* `series/`: one change at a time (`--only choices`, `tuning`, `wave_choices`).
+* `results/`: a JSON file a job, and all of them as one table, `results.csv` (`result_table.py`).
+* `bench/`: this machine (`python -m experiments.bench`).
+"""

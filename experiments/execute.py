@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, settings
-from wbgs_jax.evaluation import metrics
-from wbgs_jax.config import Settings
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.eval import environment
-from wbgs_jax.fields import get_field
+from experiments.jobs import BASELINES, PICTURED_GHZ, Job
+from experiments.profiles import PROFILES
+from experiments.settings import settings
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax.config import Settings
+from wbgs_jax.data import Dataset
+from wbgs_jax.evaluation import metrics
+from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.predictor import predict_spectra
-from wbgs_jax.evaluation.baselines import references
-from wbgs_jax.training.run_folder import RunConfig
-from wbgs_jax.train import prepare_folder
 from wbgs_jax.training.loop import train
+from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 CURVE_POINTS = 200
 ENVIRONMENT = environment()
@@ -48,26 +48,24 @@ class Part:
     pictures: UInt8[np.ndarray, "k 90 360"]
 
 
-def execute(
-    job: Job, profile: str, folder: Path, may_go_on: Callable[[], None] = lambda: None
-) -> tuple[dict[str, Any], np.ndarray | None]:
+def execute(job: Job, folder: Path, may_go_on: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], np.ndarray | None]:
     """Train and score a job, or go on with it: its result, and its pictures (k, 90, 360) if they are kept.
 
     `may_go_on` is called where stopping loses nothing, and raises if the job is to stop.
     """
-    origin = {"profile": profile, "environment": ENVIRONMENT}
-    if job.field == REFERENCES:
-        return reference_scores(job) | origin, None
-    chosen = settings(job, PROFILES[profile])
-    parts = [part(job, profile, dataset, chosen, folder / name, may_go_on) for name, dataset in job.models()]
+    origin = {"profile": job.profile, "environment": ENVIRONMENT}
+    if job.field == BASELINES:
+        return baseline_scores(job) | origin, None
+    chosen = settings(job)
+    parts = [part(job, dataset, chosen, folder / name, may_go_on) for name, dataset in job.models()]
     pictures = np.concatenate([p.pictures for p in parts]) if job.pictured else None
-    return merged(parts, chosen.optim.batch) | {"preset": PROFILES[profile].preset} | origin, pictures
+    return merged(parts, chosen.optim.batch) | {"preset": PROFILES[job.profile].preset} | origin, pictures
 
 
-def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
+def part(job: Job, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
     """Train one model and score it, unless that is done."""
     trained_ghz = job.train_ghz if job.combination else ()
-    config = RunConfig(job.scene, job.field, PROFILES[profile].preset, job.seed, None, chosen, trained_ghz)
+    config = RunConfig(job.scene, job.field, PROFILES[job.profile].preset, job.seed, None, chosen, trained_ghz)
     prepare_folder(folder, config, resume=True)  # refuses what other settings have begun
     done = folder / "part.npz"
     if done.exists():
@@ -76,10 +74,10 @@ def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Pat
     trained = train(dataset, job.field, chosen, job.seed, folder, resume=True)
     may_go_on()
     begin = time.perf_counter()
-    predicted = predict_spectra(get_field(job.field), trained.params, dataset, dataset.test)
+    predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test)
     scores = score(dataset, predicted)
     seconds = np.array([trained.seconds, time.perf_counter() - begin])
-    sizes = np.array([trained.steps, trained.gaussians])
+    sizes = np.array([trained.steps, trained.sizes.get("gaussians", 0)])
     shown = pictured(dataset) if job.pictured else np.zeros(0, int)
     pictures = (np.clip(predicted[shown], 0, 1) * 255).round().astype(np.uint8)
     result = Part(**scores, curve=curve(folder), sizes=sizes, seconds=seconds, pictures=pictures)
@@ -89,7 +87,7 @@ def part(job: Job, profile: str, dataset: Dataset, chosen: Settings, folder: Pat
 
 
 def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[str, np.ndarray]:
-    """SSIM and PSNR of the test spectra, by transmitter and frequency."""
+    """Returns SSIM and PSNR of the test spectra, by transmitter and frequency."""
     test = dataset.test
     ghz = np.unique(dataset.frequencies_hz[test]) / 1e9
     tx = dataset.tx_index[test].reshape(-1, len(ghz))[:, 0]
@@ -103,7 +101,7 @@ def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[st
 
 
 def pictured(dataset: Dataset) -> Int[np.ndarray, "k"]:
-    """Places in `dataset.test` of the spectra that figure 4 shows: another held-out transmitter at every frequency."""
+    """Returns the places in `dataset.test` of the spectra that figure 4 shows: another transmitter at every frequency."""
     ghz, transmitters = dataset.frequencies_hz[dataset.test] / 1e9, dataset.tx_index[dataset.test]
     shown = np.random.default_rng([0, 6]).permutation(np.unique(transmitters))[
         np.arange(len(PICTURED_GHZ)) % len(set(transmitters))
@@ -114,7 +112,7 @@ def pictured(dataset: Dataset) -> Int[np.ndarray, "k"]:
 
 
 def curve(folder: Path) -> Float[np.ndarray, "2 points"]:
-    """Steps and losses of a run, thinned to at most `CURVE_POINTS` by averaging neighbours."""
+    """Returns steps and losses of a run, thinned to at most `CURVE_POINTS` by averaging neighbours."""
     entries = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     points = np.array([(e["step"], e["loss"]) for e in entries if "loss" in e])
     thin = -(-len(points) // CURVE_POINTS)
@@ -122,7 +120,7 @@ def curve(folder: Path) -> Float[np.ndarray, "2 points"]:
 
 
 def merged(parts: list[Part], batch: int) -> dict[str, Any]:
-    """The result of a job from those of its models."""
+    """Returns the result of a job from those of its models."""
     ssim = {f"{f:g}": p.ssim[:, i] for p in parts for i, f in enumerate(p.ghz)}
     psnr = {f"{f:g}": float(np.median(p.psnr_db[:, i])) for p in parts for i, f in enumerate(p.ghz)}
     everything = np.concatenate(list(ssim.values()))
@@ -145,18 +143,18 @@ def merged(parts: list[Part], batch: int) -> dict[str, Any]:
     }
 
 
-def reference_scores(job: Job) -> dict[str, Any]:
-    """Median SSIM by frequency of the predictors that learn nothing."""
+def baseline_scores(job: Job) -> dict[str, Any]:
+    """Returns the median SSIM by frequency of the predictors that learn nothing."""
     dataset = job.dataset()
     begin = time.perf_counter()
     scores = {}
-    for name, predictor in references(dataset).items():
+    for name, predictor in baselines(dataset).items():
         values = score(dataset, predictor(dataset.test))
         medians = np.median(values["ssim"], 0)
         scores[name] = {f"{f:g}": rounded(m) for f, m in zip(values["ghz"], medians, strict=True)}
-    return {"references": scores, "evaluation_seconds": round(time.perf_counter() - begin, 1)}
+    return {BASELINES: scores, "evaluation_seconds": round(time.perf_counter() - begin, 1)}
 
 
 def rounded(values: Any) -> Any:
-    """Four digits, as plain numbers."""
+    """Returns four digits, as plain numbers."""
     return np.round(values, 4).tolist()

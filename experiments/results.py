@@ -1,6 +1,7 @@
-"""Result files: written by the runner, read by the tables. One small JSON a job, with where it comes from."""
+"""Result files: written by the runner, read by tables and series. One small JSON a job, with where it comes from."""
 
 import dataclasses
+import functools
 import json
 import re
 from dataclasses import dataclass
@@ -12,7 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job, differences
+from experiments.jobs import PICTURED_GHZ, Job
+from experiments.old_names import todays
+from experiments.settings import differences
 from wbgs_jax._util.files import atomic_write, read_json
 
 FOLDER = Path(__file__).parent / "results"
@@ -39,45 +42,50 @@ class Result:
         """Of every scored spectrum."""
         return np.array(list(self.values["ssim"].values())).T
 
+    @property
+    def seconds(self) -> float:
+        """Of training and evaluation, as far as they are known."""
+        return self.values.get("training_seconds", 0) + self.values.get("evaluation_seconds", 0)
+
     def at(self, ghz: list[float], tx: list[int]) -> Float[np.ndarray, "tx ghz"]:
-        """SSIM of some of the transmitters at some of the frequencies."""
+        """Returns the SSIM of some of the transmitters at some of the frequencies."""
         known = self.tx.tolist()
         return self.ssim[np.ix_([known.index(i) for i in tx], [self.ghz.index(float(f)) for f in ghz])]
+
+    def belongs_to(self, job: Job) -> bool:
+        """Whether it was made with the settings that the job has today."""
+        return todays(self.values.get("settings", {}), job.field) == differences(job)
 
 
 @dataclass(frozen=True)
 class Results:
-    """The results of a profile."""
+    """The results of all jobs, those of the tables in one profile."""
 
     profile: str
     folder: Path = FOLDER
 
     def path(self, job: Job) -> Path:
-        """Where a job's result is or will be."""
-        return self.folder / self.profile / f"{job.name}.json"
+        """Returns where a job's result is or will be."""
+        return self.folder / job.sized(self.profile).profile / f"{job.name}.json"
 
     def pictures_path(self, job: Job) -> Path:
-        """Where its pictures are."""
+        """Returns where its pictures are."""
         return self.path(job).with_suffix(".png")
 
     def get(self, job: Job) -> Result | None:
-        """A job's result; None if it has not been run yet, or with other settings."""
+        """Returns a job's result; None if it has not been run yet, or with other settings."""
         path = self.path(job)
         if not path.exists():
             return None
-        values = read_json(path)
-        return Result(values) if values.get("settings", {}) == self.settings(job) else None
-
-    def settings(self, job: Job) -> dict[str, Any]:
-        """What a job's result says of its settings: those that are not the preset's."""
-        return {} if job.field == REFERENCES else differences(job, PROFILES[self.profile])
+        result = _read(path, path.stat().st_mtime_ns)
+        return result if result.belongs_to(job.sized(self.profile)) else None
 
     def all(self, jobs: list[Job]) -> list[Result]:
-        """Those that there are."""
+        """Returns those that there are."""
         return [result for result in map(self.get, jobs) if result is not None]
 
     def pictures(self, job: Job) -> UInt8[np.ndarray, "k 90 360"] | None:
-        """The kept pictures, one for each of `PICTURED_GHZ`."""
+        """Returns the kept pictures, one for each of `PICTURED_GHZ`."""
         path = self.pictures_path(job)
         if self.get(job) is None or not path.exists():
             return None
@@ -86,15 +94,23 @@ class Results:
 
     def write(self, job: Job, values: dict[str, Any], pictures: UInt8[np.ndarray, "k 90 360"] | None = None) -> None:
         """Keep a result; the JSON is written last, so that it stands for everything."""
+        job = job.sized(self.profile)
         if pictures is not None:
             with atomic_write(self.pictures_path(job)) as stream:
                 Image.fromarray(pictures.reshape(-1, pictures.shape[-1])).save(stream, format="png", optimize=True)
-        whole = {"job": dataclasses.asdict(job)} | values | {"settings": self.settings(job)}
+        whole = {"job": dataclasses.asdict(job)} | values | {"settings": differences(job)}
         text = json.dumps(whole, indent=2, allow_nan=False)
         with atomic_write(self.path(job)) as stream:
             stream.write((one_line_lists(text) + "\n").encode())
 
 
+@functools.lru_cache(maxsize=1000)
+def _read(path: Path, modified_ns: int) -> Result:
+    """Returns the content of a file, read once for each time that it was written."""
+    return Result(read_json(path))
+
+
 def one_line_lists(text: str) -> str:
-    """Indented JSON with lists of plain values on one line each: a tenth of the size, and a line a frequency in a diff."""
+    """Returns indented JSON with lists of plain values on one line each: a tenth of the size, and a line a frequency in a
+    diff."""
     return re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]).replace("[ ", "[").replace(" ]", "]"), text)

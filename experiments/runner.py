@@ -1,15 +1,17 @@
-"""Run what the tables and figures need: `python -m experiments.runner --profile quick [--only table1] [--minutes 9]`.
+"""Run experiments: `python -m experiments.runner [--profile quick] [--only table1] [--minutes 9]`.
 
-Jobs come in the order of importance: every experiment's first seed, then further ones. What is done is skipped, what was cut
-goes on where it stopped, however it was cut; runners side by side never do the same job. `make tables` shows the results.
+Without `--only` these are the tables and figures of the paper; the series (`--only choices`, `tuning`, `wave_choices`) are run
+by name. Jobs come in the order of importance: every experiment's first seed, then further ones. What is done is skipped, what
+was cut goes on where it stopped, however it was cut; runners side by side never do the same job. `make tables` shows the
+results.
 """
 
 import contextlib
+import dataclasses
 import fcntl
 import shutil
 import signal
 import statistics
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,12 +21,13 @@ from typing import Literal
 import jax
 import tyro
 
+from experiments.catalogue import EXPERIMENTS, unique_jobs
 from experiments.execute import execute
-from experiments.jobs import BUDGETS, DENSE_SCENE, PROFILES, Job
+from experiments.jobs import Job
+from experiments.paper import DENSE_SCENE
 from experiments.results import FOLDER, Results
-from experiments.tables import EXPERIMENTS, unique_jobs
+from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
-from wbgs_jax._util.command import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.training.loop import Interrupted
 
@@ -36,15 +39,18 @@ class Command:
     """Run the experiments that have no result yet."""
 
     profile: Literal["quick", "paper", "smoke"] = "quick"
-    """quick: two CPU cores, hours. paper: full size, a GPU. smoke: minutes, proves that everything works."""
+    """quick: two CPU cores, hours. paper: full size, a GPU. smoke: minutes, proves that everything works. The series have sizes
+    of their own, and are small with smoke too."""
     only: tuple[str, ...] = ()
-    """Experiments (table1, figure7, ...); all by default."""
+    """Experiments (table1, figure7, ..., choices, tuning, wave_choices); all tables and figures by default."""
     scenes: tuple[str, ...] = ()
     """Scenes (1, 2, ..., 1_21f); all by default."""
+    data: str | None = None
+    """Run the jobs on this scene file or folder of spectra instead."""
     seeds: tuple[int, ...] = ()
     """Seeds; all by default."""
     fields: tuple[str, ...] = ()
-    """Fields (wideband, wrfgs, wave, references, ...); all by default."""
+    """Fields (wideband, wrfgs, wave, baselines, ...); all by default."""
     minutes: float | None = None
     """Stop after this time; what is cut goes on the next time."""
     dry_run: bool = False
@@ -91,22 +97,24 @@ class Clock:
             signal.signal(number, handler)
 
 
-def all_jobs(names: tuple[str, ...] = ()) -> list[Job]:
-    """The jobs of some experiments (all by default), each once, first seeds first, repetitions of costly jobs last."""
+def all_jobs(names: tuple[str, ...] = (), profile: str = "quick") -> list[Job]:
+    """Returns the jobs of some experiments, each once, first seeds first, repetitions of costly jobs last."""
     if unknown := [name for name in names if name not in EXPERIMENTS]:
         raise UserError(f"there is no experiment {unknown[0]!r}; choose among: {', '.join(EXPERIMENTS)}")
-    jobs = unique_jobs(names)
-    return sorted(jobs, key=lambda job: (job.seed > 0 and (job.variant in BUDGETS or job.field == "wave"), job.seed))
+    jobs = list(dict.fromkeys(job.sized(profile) for job in unique_jobs(names)))
+    return sorted(jobs, key=lambda job: (job.seed > 0 and (job.budget > 1 or job.field == "wave"), job.seed))
 
 
 def chosen_jobs(command: Command) -> list[Job]:
-    """What a command line asks for."""
-    jobs = all_jobs(command.only)
+    """Returns what a command line asks for."""
+    jobs = all_jobs(command.only, command.profile)
     for name, wanted in (("scene", command.scenes), ("seed", command.seeds), ("field", command.fields)):
         jobs = [job for job in jobs if not wanted or getattr(job, name) in wanted]
     if not jobs:
         raise UserError("no job fits this choice; see `python -m experiments.runner --dry-run`")
-    return jobs
+    if command.data is None:
+        return jobs
+    return list(dict.fromkeys(dataclasses.replace(job, scene=command.data) for job in jobs))
 
 
 @contextlib.contextmanager
@@ -129,42 +137,47 @@ class Durations:
         self.known: dict[tuple, list[float]] = {}
         for job in jobs:
             if result := results.get(job):
-                parts = result.values.get("training_seconds", 0) + result.values["evaluation_seconds"]
-                seconds = max(parts, result.values["wall_seconds"])  # of a job that was cut, the wall clock saw its end alone
+                # Of a job that was cut, the wall clock saw its end alone.
+                seconds = max(result.seconds, result.values.get("wall_seconds", 0))
                 self.known.setdefault(self.kind(job), []).append(seconds)
 
     @staticmethod
     def kind(job: Job) -> tuple:
-        """Jobs of a kind take about as long."""
-        return job.field, BUDGETS.get(job.variant, 1), job.scene == DENSE_SCENE and not job.combination, job.all_tx
+        """Returns what jobs have in common that take about as long."""
+        return (job.field, job.profile), job.budget, job.scene == DENSE_SCENE and not job.combination, job.all_tx
 
     def expect(self, job: Job) -> float | None:
-        """Seconds; None if no such job is done."""
-        field, budget, *_ = kind = self.kind(job)
+        """Returns seconds; None if no such job is done."""
+        model, budget, *_ = kind = self.kind(job)
         known = self.known.get(kind) or [
-            s * budget / other[1] for other, seconds in self.known.items() if other[0] == field for s in seconds
+            s * budget / other[1] for other, seconds in self.known.items() if other[0] == model for s in seconds
         ]
         return statistics.median(known) if known else None
 
     def left(self, jobs: list[Job]) -> str:
-        """Time left, for people."""
+        """Returns the time left, for people."""
         times = [self.expect(job) for job in jobs]
         hours = sum(t for t in times if t is not None) / 3600
         unknown = sum(t is None for t in times)
         return f"{len(jobs)} left, about {hours:.1f} h" + (f" and {unknown} of unknown length" if unknown else "")
 
 
+def folder_of(job: Job, command: Command) -> Path:
+    """Returns where an unfinished run is kept."""
+    return command.runs / job.profile / job.name
+
+
 def run_job(job: Job, command: Command, results: Results, clock: Clock) -> str:
-    """Run one job unless it is done or another process has it; says what became of it."""
-    folder = command.runs / command.profile / job.name
-    with claimed(command.runs / command.profile / "locks" / job.name) as mine:
+    """Run one job unless it is done or another process has it; returns what became of it."""
+    folder = folder_of(job, command)
+    with claimed(folder.parent / "locks" / job.name) as mine:
         if not mine:
             return "another process has it"
         if results.get(job):
             return "done meanwhile"
         begin = time.perf_counter()
         try:
-            values, pictures = execute(job, command.profile, folder, clock.may_go_on)
+            values, pictures = execute(job, folder, clock.may_go_on)
         finally:
             jax.clear_caches()  # otherwise every job's compiled programs stay in memory
         seconds = time.perf_counter() - begin
@@ -199,18 +212,18 @@ def run(jobs: list[Job], command: Command) -> list[str]:
 
 
 def one_line(error: Exception) -> str:
-    """An error for people; of a mistake in the code, its kind too."""
+    """Returns an error for people; of a mistake in the code, its kind too."""
     text = (str(error).splitlines() or [""])[0]
     return text if isinstance(error, UserError) else f"{type(error).__name__}: {text}"
 
 
 def listing(jobs: list[Job], command: Command) -> str:
-    """One line a job: done, begun or open, and the time it takes."""
+    """Returns one line a job: done, begun or open, and the time it takes."""
     results = Results(command.profile, command.results)
     durations = Durations(results, jobs)
     lines = []
     for job in jobs:
-        begun = (command.runs / command.profile / job.name).exists()
+        begun = folder_of(job, command).exists()
         state = "done" if results.get(job) else "begun" if begun else "open"
         seconds = durations.expect(job)
         lines.append(f"{state:6} {'?' if seconds is None else f'{seconds:.0f}':>6} s  {job.name}")
@@ -218,15 +231,9 @@ def listing(jobs: list[Job], command: Command) -> str:
     return "\n".join([*lines, f"{len(jobs)} jobs: {durations.left(open_jobs)}"])
 
 
-def say(line: str) -> None:
-    """A line for people, on stderr."""
-    print(line, file=sys.stderr, flush=True)
-
-
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.runner")
-    assert command.profile in PROFILES
     jobs = chosen_jobs(command)
     if command.dry_run:
         print(listing(jobs, command))

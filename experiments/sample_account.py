@@ -14,21 +14,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 import tyro
 from jaxtyping import Float
 
-from wbgs_jax.evaluation import metrics
-from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.config import WaveConfig
-from wbgs_jax.data import load_dataset
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import make_mesh
+from wbgs_jax import WaveConfig, make_mesh, pas_directions, wave
 from wbgs_jax._util.command import run_command
-from wbgs_jax.eval import environment
-from wbgs_jax.fields import wave
 from wbgs_jax._util.files import write_json
-from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.data import Dataset, load_dataset
+from wbgs_jax.evaluation import metrics
+from wbgs_jax.evaluation.report import environment
+from wbgs_jax.fields import Field, Observation
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
+from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.types import Links
 
 RESULTS = Path(__file__).parent / "results"
 CONFIG = WaveConfig(
@@ -51,14 +50,14 @@ def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.sample_account")
     dataset = load_dataset(command.data)
-    params = wave.init(jax.random.key(0), make_mesh(dataset), CONFIG)
+    field = wave.make_field(make_mesh(dataset), CONFIG)
+    prepared = field.prepare(dataset.links(np.arange(len(dataset))), dataset.receivers)
     _, first = np.unique(dataset.tx_index, return_index=True)
-    plan, traced = wave.remember(params, dataset.receiver, jnp.asarray(dataset.tx_positions[first], jnp.float32))
-    reflections = np.asarray((traced.plain.kind == REFLECTED).sum(-1))
-    passes = np.asarray((traced.plain.kind == TRANSMITTED).sum(-1))
+    kind = np.asarray(prepared.paths.specular.interaction_type)
+    reflections, passes = (kind == REFLECTED).sum(-1), (kind == TRANSMITTED).sum(-1)
     kept = {"line of sight": reflections == 0, "one reflection": reflections <= 1, "two reflections": reflections <= 2}
     kept |= {"two reflections, nothing passes": (reflections <= 2) & (passes == 0), "no line of sight": reflections > 0}
-    scores = {name: ssim(dataset, params, plan, keep(traced, mask)) for name, mask in kept.items()}
+    scores = {name: ssim(dataset, field, keep(prepared, mask)) for name, mask in kept.items()}
     local = in_sight(dataset)
     sine, sight = local[:, 2], power_in_sight(dataset, local)
     horizon = [
@@ -75,50 +74,60 @@ def main() -> None:
         print(f"{name:28}", row, file=sys.stderr)
 
 
-def keep(traced: wave.Traced, mask: np.ndarray) -> wave.Traced:
-    """The paths of a mask alone."""
-    return dataclasses.replace(traced, plain=dataclasses.replace(traced.plain, alive=traced.plain.alive & jnp.asarray(mask)))
+def keep(prepared: wave.PreparedPaths, mask: np.ndarray) -> wave.PreparedPaths:
+    """Returns the paths of a mask alone."""
+    specular = prepared.paths.specular
+    specular = dataclasses.replace(specular, alive=specular.alive & jnp.asarray(mask))
+    return dataclasses.replace(prepared, paths=dataclasses.replace(prepared.paths, specular=specular))
 
 
-def ssim(dataset: Dataset, params: Any, plan: Any, traced: wave.Traced) -> Float[np.ndarray, "n"]:
-    """Of every spectrum."""
-    observe, found = jax.jit(wave.observe), []
+@jax.jit
+def observe(field: Field, params: Any, plan: Any, prepared: wave.PreparedPaths, links: Links) -> Observation:
+    """Returns what the field says of links whose paths are given."""
+    return field.render_links(params, plan, prepared, links)
+
+
+def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> Float[np.ndarray, "n"]:
+    """Returns the score of every spectrum."""
+    params, found = field.init(jax.random.key(0)), []
+    plan = field.plan(params, dataset.receiver(), cache=prepared)
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
-        seen = observe(params, (plan, traced), dataset.receiver, dataset.query(index), jnp.asarray(dataset.tx_index[index]))
+        seen = observe(field, params, plan, prepared, dataset.links(index))
         found.append(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index))))
     return np.concatenate(found)
 
 
 def in_sight(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
-    """Unit vector to every spectrum's transmitter in the receiver's frame; its third component is above the array's horizon."""
-    offset = dataset.tx_positions - np.asarray(dataset.receiver.position, np.float64)
-    local = np.asarray(to_local(jnp.asarray(offset, jnp.float32), dataset.receiver.orientation))
+    """Returns the unit vector to every spectrum's transmitter in the receiver's frame; its third component is above the array's
+    horizon."""
+    receiver = dataset.receiver()
+    offset = dataset.tx_positions - np.asarray(receiver.position, np.float64)
+    local = np.asarray(to_local(jnp.asarray(offset, jnp.float32), receiver.orientation))
     return local / np.linalg.norm(local, axis=-1, keepdims=True)
 
 
 def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Of every observed spectrum: its power at the pixel nearest to the transmitter's direction, relative to its largest."""
+    """Returns the power of every observed spectrum at the pixel nearest to the transmitter's direction, relative to its
+    largest."""
     nearest = np.argmax(np.asarray(pas_directions(), np.float32).reshape(-1, 3) @ local.T, 0)
     spectra = (np.asarray(dataset.pas(np.array([i]))).reshape(-1) for i in range(len(dataset)))
     return np.array([spectrum[pixel] ** 2 for spectrum, pixel in zip(spectra, nearest, strict=True)])
 
 
 def obstructed(dataset: Dataset, tx_position: Float[np.ndarray, "3"]) -> bool:
-    """Whether any triangle of the whole mesh lies between a transmitter and the receiver (Moeller and Trumbore 1997)."""
-    start = np.asarray(dataset.receiver.position, np.float64)
-    a, b, c = (dataset.vertices[dataset.faces[:, i]].astype(np.float64) for i in range(3))
-    along, offset = tx_position - start, start - a
-    across = np.cross(along, c - a)
-    volume = np.sum((b - a) * across, -1)
-    scale = np.where(np.abs(volume) > 1e-12, 1 / np.where(volume == 0, 1, volume), 0)
-    turned = np.cross(offset, b - a)
-    u, v, t = np.sum(offset * across, -1) * scale, turned @ along * scale, np.sum((c - a) * turned, -1) * scale
-    return bool(((scale != 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6) & (t < 1 - 1e-6)).any())
+    """Returns whether any triangle of the whole mesh lies between a transmitter and the receiver."""
+    start = np.asarray(dataset.receiver().position, np.float64)
+    line, triangles = tx_position - start, dataset.vertices[dataset.faces].astype(np.float64)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lines = (np.broadcast_to(vector, normals.shape) for vector in (start, line))
+    points, cut, along = trimesh.intersections.planes_lines(triangles[:, 0], trimesh.unitize(normals), *lines, True)
+    inside = (trimesh.triangles.points_to_barycentric(triangles[cut], points) >= 0).all(1)
+    return bool((inside & (along > 1e-6) & (along < 1 - 1e-6)).any())
 
 
 def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Median SSIM of training and test transmitters, above the horizon and not."""
+    """Returns the median SSIM of training and test transmitters, above the horizon and not."""
     test = np.isin(np.arange(len(dataset)), dataset.test)
     groups = {}
     for role, members in (("training", ~test), ("test", test)):

@@ -1,12 +1,18 @@
 """Fixtures shared by all tests: a fresh, printed random seed and the optional folder of published data."""
 
 import os
+import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before anything imports jax
+# Before anything imports jax.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("WBGS_CACHE", "")  # command lines under test leave nothing in the home folder
+if not os.environ.get("WBGS_TEST_OPTIMISED"):
+    # Nearly all of the time goes into compiling programs that run once, on next to nothing: half of it is for their speed.
+    FAST_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FAST_TO_COMPILE}".strip()
 
 import numpy as np
 import pytest
@@ -15,6 +21,12 @@ SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        # What one worker or command has compiled the others load.
+        folder = tempfile.TemporaryDirectory(prefix="wbgs-test-cache-", ignore_cleanup_errors=True)
+        config.add_cleanup(folder.cleanup)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder.name)
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns about tuning flags of cached programs
     # In the environment, so that the workers of pytest-xdist draw the same.
     os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)
 

@@ -98,9 +98,14 @@ def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Rec
 
 def snapshot_of(search, tx, frequency, receiver=None, **slab) -> np.ndarray:
     """The voltages of an array (the 4x4 one of isotropic elements unless another is given) where the search's receiver is."""
+    return snapshot_over(search, trace(search, tx), frequency, receiver, **slab)
+
+
+def snapshot_over(search, traced, frequency, receiver=None, **slab) -> np.ndarray:
+    """The same, of paths that are known."""
     receiver = make_receiver(search.receiver_position) if receiver is None else receiver
     frequency = jnp.asarray(frequency, search.receiver_position.dtype)
-    found = arrivals_of(search, trace(search, tx), slabs_of(search, frequency, **slab), receiver, frequency)
+    found = arrivals_of(search, traced, slabs_of(search, frequency, **slab), receiver, frequency)
     return np.asarray(snapshots_from_paths(found, receiver, frequency))
 
 

@@ -4,62 +4,100 @@ import dataclasses
 import json
 
 import pytest
+from synthetic import tiny_settings
 
-from experiments.choices import CHANGES, changed_settings
-from wbgs_jax.config import PRESETS, Settings, check, from_dict, limit_steps, to_dict
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.config import PRESETS, changed, check, from_dict, from_sections, limit_steps, sections, to_dict
+from wbgs_jax.fields import field_names, get_field
+
+SETTINGS = get_field("wideband").presets["cpu"]
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
-def test_presets_are_valid_and_survive_json(name):
-    check(PRESETS[name])
-    assert from_dict(json.loads(json.dumps(to_dict(PRESETS[name])))) == PRESETS[name]
-
-
-@pytest.mark.parametrize("name", list(CHANGES))
-def test_every_measured_choice_is_a_valid_configuration_and_changes_something(name):
-    settings = changed_settings(name, 1000)
+def check_all(field, settings):
+    """What a command line checks before any work is done."""
     check(settings)
-    assert settings.optim.steps == 1000
-    assert (settings != changed_settings("default", 1000)) == (name != "default")
+    get_field(field).check(settings.field)
+
+
+@pytest.mark.parametrize("field", field_names())
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_presets_are_valid_and_survive_json(preset, field):
+    settings = get_field(field).presets[preset]
+    check_all(field, settings)
+    values = json.loads(json.dumps(to_dict(settings, field)))
+    assert from_dict(values, get_field(field).presets["cpu"], field) == settings
+
+
+@pytest.mark.parametrize("field", field_names())
+def test_a_field_has_its_own_settings_and_those_of_the_controls_that_it_asks_for(field):
+    for preset in PRESETS:
+        settings = get_field(field).presets[preset]
+        parts = sections(settings, field)
+        assert parts.keys() == {field, "optim", "loop", *get_field(field).controls}
+        assert parts[field] is settings.field
+        assert from_sections(parts, field) == settings
 
 
 def test_small_data_sets_get_fewer_steps():
-    settings = PRESETS["cpu"]
-    assert limit_steps(settings, 10**6).optim.steps == settings.optim.steps
-    assert limit_steps(settings, 8).optim.steps == settings.optim.min_steps
-    some = limit_steps(settings, 1500).optim.steps
-    assert some == settings.optim.max_epochs * 1500 / settings.optim.batch and some % settings.loop.epoch_steps == 0
+    assert limit_steps(SETTINGS, 10**6).optim.steps == SETTINGS.optim.steps
+    assert limit_steps(SETTINGS, 8).optim.steps == SETTINGS.optim.min_steps
+    some = limit_steps(SETTINGS, 1500).optim.steps
+    assert some == SETTINGS.optim.max_epochs * 1500 / SETTINGS.optim.batch and some % SETTINGS.loop.epoch_steps == 0
 
 
 @pytest.mark.parametrize(
-    ("group", "change", "message"),
+    ("field", "section", "change", "message"),
     [
-        ("optim", {"steps": 0}, "optim.steps"),
-        ("optim", {"steps": 75}, "multiple"),
-        ("optim", {"batch": 0}, "optim.batch"),
-        ("optim", {"ssim_weight": 1.5}, "between 0 and 1"),
-        ("wideband", {"gaussians": 3}, "at least 4"),
-        ("wideband", {"tx_octaves": -1}, "tx-octaves"),
-        ("wideband", {"fusion": 4}, "fusion"),
-        ("loop", {"keep_checkpoints": 0}, "keep-checkpoints"),
+        ("wideband", "optim", {"steps": 0}, "optim.steps"),
+        ("wideband", "optim", {"steps": 75}, "multiple"),
+        ("wideband", "optim", {"batch": 0}, "optim.batch"),
+        ("wideband", "loop", {"keep_checkpoints": 0}, "keep-checkpoints"),
+        ("wideband", "field", {"ssim_weight": 1.5}, "wideband.ssim-weight .* between 0 and 1"),
+        ("wideband", "field", {"gaussians": 3}, "wideband.gaussians .* at least 4"),
+        ("wideband", "field", {"tx_octaves": -1}, "wideband.tx-octaves"),
+        ("wideband", "field", {"fusion": 4}, "wideband.fusion"),
+        ("wideband", "field", {"width": 0}, "wideband.width"),
+        ("wrfgs", "field", {"fusion": 4}, "wrfgs.fusion"),
+        ("wrfgs", "field", {"radiance_frequency": True}, "no frequency input"),
+        ("wave", "field", {"max_facets": 10**6}, "wave.max-facets"),
+        ("wave", "search", {"spectra": 0}, "search.spectra"),
+        ("nerf2", "field", {"directions": 10**6}, "nerf2.directions"),
+        ("nerf2", "field", {"point_octaves": -1}, "nerf2.point-octaves"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(group, change, message):
-    settings = Settings()
-    broken = dataclasses.replace(settings, **{group: dataclasses.replace(getattr(settings, group), **change)})
+def test_settings_that_cannot_work_are_refused(field, section, change, message):
+    broken = changed(get_field(field).presets["cpu"], {section: change})
     with pytest.raises(UserError, match=message):
-        check(broken)
+        check_all(field, broken)
 
 
 def test_settings_of_another_version_are_refused():
-    values = to_dict(Settings())
+    def read(values):
+        return from_dict(values, SETTINGS, "wideband")
+
+    values = to_dict(SETTINGS, "wideband")
     values["optim"]["momentum"] = 0.9
     with pytest.raises(UserError, match="momentum"):
-        from_dict(values)
+        read(values)
     del values["optim"]["momentum"], values["optim"]["batch"]
     with pytest.raises(UserError, match="batch"):
-        from_dict(values)
+        read(values)
     del values["optim"]
     with pytest.raises(UserError, match="optim"):
-        from_dict(values)
+        read(values)
+    with pytest.raises(UserError, match="wideband"):
+        from_dict(to_dict(SETTINGS, "wideband"), get_field("wave").presets["cpu"], "wave")
+
+
+def test_settings_survive_a_dictionary():
+    settings = tiny_settings(field={"relative": False, "means_lr": 1 / 3})
+    assert from_dict(json.loads(json.dumps(to_dict(settings, "wideband"))), SETTINGS, "wideband") == settings
+
+
+def test_some_settings_are_changed_and_all_others_stay():
+    after = changed(SETTINGS, {"field": {"width": 7}, "optim": {"steps": 50}})
+    assert (after.field.width, after.optim.steps) == (7, 50)
+    assert dataclasses.replace(after, field=SETTINGS.field, optim=SETTINGS.optim) == SETTINGS
+    assert dataclasses.replace(after.field, width=SETTINGS.field.width) == SETTINGS.field
+    with pytest.raises(TypeError, match="no_such_setting"):
+        changed(SETTINGS, {"optim": {"no_such_setting": 1}})

@@ -1,8 +1,8 @@
 """Wideband RF radiance fields with frequency-embedded 3D Gaussian splatting, in JAX.
 
-Pure functions on pytrees, for use under `jax.jit`, `jax.vmap` and `jax.grad`. SI units: metres, hertz, radians. Names are loaded
-when they are first asked for: importing this package changes nothing in the process, and the pure part stands without the
-host's modules. `__init__.pyi` lists them with their types; docs/api.md describes them.
+Pure functions on pytrees, for use under `jax.jit`, `jax.vmap` and `jax.grad`. SI units: metres, hertz, radians. Names are
+loaded when they are first asked for: importing this package changes nothing in the process, and the pure part stands without
+the host's modules. `__init__.pyi` lists them with their types; docs/api.md describes them.
 
 * fields: `wideband` (the paper's), `wave` (coherent), `wrfgs` and `nerf2` (baselines); `pas` is the differentiable function
   from parameters, receiver and query to spectra, `Field` the seam that a new model fits

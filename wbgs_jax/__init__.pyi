@@ -1,3 +1,5 @@
+from ._util.pytree import pytree as pytree
+from ._util.pytree import static as static
 from .data.load import load_dataset as load_dataset
 from .data.scene_file import load_scene as load_scene
 from .data.scene_file import save_scene as save_scene
@@ -46,5 +48,6 @@ from .types import Receiver as Receiver
 from .types import Surface as Surface
 from .types import make_query as make_query
 from .types import make_receiver as make_receiver
+from .types import stack_receivers as stack_receivers
 
 __version__: str

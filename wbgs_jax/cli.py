@@ -26,10 +26,8 @@ COMMANDS = {
 def usage() -> str:
     """Returns what `wbgs-jax --help` prints."""
     rows = [f"  {name:8} {entry.help}" for name, entry in COMMANDS.items()]
-    return "\n".join(
-        ["usage: wbgs-jax COMMAND [OPTIONS]", "", "Wideband RF radiance fields in JAX.", "", *rows, ""]
-        + ["wbgs-jax COMMAND --help says more of each."]
-    )
+    head, tail = "usage: wbgs-jax COMMAND [OPTIONS]", "wbgs-jax COMMAND --help says more of each."
+    return "\n".join([head, "", "Wideband RF radiance fields in JAX.", "", *rows, "", tail])
 
 
 def dispatch() -> None:

@@ -5,7 +5,7 @@ wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|de
 wbgs-jax predict --run RUN --export field.zip
 """
 
-import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+import wbgs_jax._util.quiet
 
 # isort: split
 
@@ -202,7 +202,7 @@ def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: 
 
 
 def draw(spectra: Spectra) -> Figure:
-    """Returns the first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter side by side or below each other."""
+    """Returns a figure of the first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter in a row."""
     images = spectra.pas.reshape(-1, *spectra.pas.shape[2:])[:SHOWN]
     columns = min(2, len(images))
     rows = -(-len(images) // columns)

@@ -35,7 +35,7 @@ class Command:
     """Folder of the published layout (spectrum/*.png, tx_pos.csv, ...), instead of --scene."""
     out: Path | None = None
     """Run folder; the default names scene, field, preset and seed under runs/."""
-    field: str = "wideband"
+    field: str = dataclasses.field(default_factory=default_field)
     """The model."""
     preset: str = "cpu"
     """smoke (less than a minute), cpu (the default without a GPU) or gpu (the paper's size)."""

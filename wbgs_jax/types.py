@@ -3,7 +3,7 @@
 SI units: metres, hertz, radians. Constructors check what they are given; arrays are float32 on the device.
 """
 
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +132,7 @@ class Mesh:
     """Thickness of every material, metres; 0 where it is not known."""
 
 
+@runtime_checkable
 class Scene(Protocol):
     """What a field may ask about a place when it is made (`data.surface.DatasetScene`)."""
 
@@ -173,8 +174,8 @@ def make_receiver(
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion)
-    arrays = (position, quaternion, elements, pattern_exponent(pattern))
-    return Receiver(*(jnp.asarray(np.asarray(a), jnp.float32) for a in arrays), unit)
+    arrays = [jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements, pattern_exponent(pattern))]
+    return Receiver(arrays[0], arrays[1], arrays[2], arrays[3], unit)
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
@@ -183,7 +184,7 @@ def stack_receivers(receivers: list[Receiver]) -> Receiver:
 
 
 def make_query(tx_position: Any, frequency_hz: Any) -> Query:
-    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one number in hertz."""
+    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz."""
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
     frequency = jnp.broadcast_to(jnp.asarray(frequency_hz, jnp.float32), position.shape[:1])
     return Query(position, frequency)

@@ -14,7 +14,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from data_gen.materials import THICKNESS, check_material
-from data_gen.scenes.geometry import Vec3, box_distance, crossings, distance, winding_number
+from data_gen.scenes.geometry import Vec3, crossings, distance, winding_number
 from wbgs_jax._util.errors import UserError
 
 GAP = 0.01
@@ -83,6 +83,10 @@ class SceneSpec:
         found = [np.asarray(p.mesh.triangles) for p in self.parts if p.kind in (kinds or KINDS)]
         return np.concatenate([np.zeros((0, 3, 3)), *found])
 
+    def mesh(self, *kinds: str) -> trimesh.Trimesh:
+        """The same triangles as one mesh."""
+        return trimesh.Trimesh(**trimesh.triangles.to_kwargs(self.triangles(*kinds)), process=False)
+
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Lowest and highest corner of the room."""
         corners = np.concatenate([p.mesh.bounds for p in self.parts])
@@ -92,27 +96,23 @@ class SceneSpec:
         """Which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
         low, high = self.bounds()
         outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # askew, to meet no edge of a wall
-        return crossings(self.triangles("shell"), points, outside) % 2 == 1
+        return crossings(self.mesh("shell"), points, outside) % 2 == 1
 
     def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """From which points nothing, not even glass, hides the receiver."""
-        return crossings(self.triangles(), points, np.asarray(self.rx_position)) == 0
+        return crossings(self.mesh(), points, np.asarray(self.rx_position)) == 0
 
     def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
         """Which points are inside a solid."""
         inside = np.zeros(len(points), bool)
         for p in self.solids:
-            near = box_distance(p.mesh, points) == 0
+            near = trimesh.bounds.contains(p.mesh.bounds, points)  # the others need no look at the triangles
             inside[near] |= np.abs(winding_number(p.mesh, points[near])) > 0.5
         return inside
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance (metres) of every point to the nearest surface."""
-        nearest = np.full(len(points), np.inf)
-        for p in self.parts:
-            closer = box_distance(p.mesh, points) < nearest  # the others need no look at the triangles
-            nearest[closer] = np.minimum(nearest[closer], distance(p.mesh, points[closer]))
-        return nearest
+        return distance(self.mesh(), points)
 
     def accessible_tx(self) -> Float[np.ndarray, "tx 3"]:
         """The candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.

@@ -21,11 +21,11 @@ import tyro
 from rich.console import Console
 
 from experiments.bench import gate, quality, queries, renderer, training
-from experiments.bench.timing import Effort, Report, say
-from wbgs_jax._util.command import run_command
+from experiments.bench.timing import Effort, Report
+from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.eval import device_name, environment
 from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.evaluation.report import device_name, environment
 
 RESULTS = Path(__file__).parents[1] / "results"
 Part = Literal["renderer", "training", "queries", "memory", "quality"]

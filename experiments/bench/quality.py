@@ -15,10 +15,11 @@ from pathlib import Path
 
 import jax
 
-from experiments.bench.timing import Effort, Report, say
-from experiments.bench.training import preset, start_run
-from wbgs_jax.config import PRESETS
+from experiments.bench.timing import Effort, Report
+from experiments.bench.training import preset, settings, start_run
+from wbgs_jax._util.command import say
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.training.step import run_epoch
 
 TARGETS = (0.72, 0.80, 0.85)
 PLATEAU = 0.01
@@ -58,8 +59,8 @@ class Curve:
         return sum(name == f"jit({function})" for name, _ in self.compiled)
 
 
-def train(effort: Effort, folder: Path) -> tuple[Curve, str]:
-    """A whole training, evaluated after every epoch; the curve and the name of the jitted epoch."""
+def train(effort: Effort, folder: Path) -> Curve:
+    """Returns the curve of a whole training, evaluated after every epoch."""
     if not effort.quick:
         jax.clear_caches()  # what an earlier part compiled would be free
     curve, spent, begin = Curve(), 0.0, time.perf_counter()
@@ -74,15 +75,15 @@ def train(effort: Effort, folder: Path) -> tuple[Curve, str]:
             run.control()
         spent += time.perf_counter() - begin
         curve.seconds.append(spent)
-        curve.ssim.append(run.evaluate())
+        curve.ssim.append(run.evaluate()["held_out_ssim"])
         if run.step % 1000 == 0:
             say(f"  step {run.step}: {spent:.0f} s, SSIM {curve.ssim[-1]:.3f}")
-    return curve, run.run_epoch.__name__
+    return curve
 
 
 def start_seconds(effort: Effort) -> tuple[float, float]:
     """Seconds of the training command for one epoch, with JAX's persistent compilation cache empty and filled."""
-    steps = PRESETS[preset(effort)].loop.epoch_steps
+    steps = settings(effort).loop.epoch_steps
     command = [sys.executable, "-m", "wbgs_jax.train", "--scene", "1", "--preset", preset(effort), "--optim.steps", str(steps)]
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +103,7 @@ def measure(report: Report, effort: Effort) -> None:
     """Seconds to every target and to the plateau, compilations, and what the persistent cache spares."""
     say(f"quality: {preset(effort)} preset on scene 1")
     with tempfile.TemporaryDirectory() as folder:
-        curve, epoch = train(effort, Path(folder))
+        curve = train(effort, Path(folder))
     for target in TARGETS:
         name = f"time_to_ssim_{round(100 * target):03d}_s"
         if (seconds := curve.time_to(target)) is None:
@@ -113,7 +114,7 @@ def measure(report: Report, effort: Effort) -> None:
     assert plateau is not None
     report.add("time_to_plateau_s", plateau, "s", "lower")
     report.add("ssim_last", curve.ssim[-1], "SSIM", "higher")
-    report.add("compilations_per_run", curve.compilations_of(epoch), "compilations", "lower")
+    report.add("compilations_per_run", curve.compilations_of(run_epoch.__name__), "compilations", "lower")
     report.add("compile_s_per_run", sum(seconds for _, seconds in curve.compiled), "s", "lower")
     if not effort.quick:
         for name, seconds in zip(("cold", "warm"), start_seconds(effort), strict=True):

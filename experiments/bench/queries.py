@@ -1,13 +1,15 @@
-"""Answering queries with a field of the device's preset, its geometry folded in."""
+"""Answering queries with a field of the device's preset, everything planned that does not depend on the query."""
 
+import functools
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from experiments.bench.timing import Effort, Report, interleaved, say, timed
+from experiments.bench.timing import Effort, Report, interleaved, timed
 from experiments.bench.training import start_run
-from wbgs_jax.inference.predictor import BLOCK, make_predictor
+from wbgs_jax._util.command import say
+from wbgs_jax.inference.predictor import BLOCK, render_pas
 
 QUERIES = 1000
 
@@ -21,7 +23,8 @@ def measure(report: Report, effort: Effort) -> None:
     index = np.random.default_rng(effort.seed).choice(run.dataset.test, count)
     blocks = [run.dataset.query(np.resize(index[i : i + BLOCK], BLOCK)) for i in range(0, count, BLOCK)]
     single = run.dataset.query(index[:1])
-    predictor = make_predictor(run.field, run.state.params, run.dataset.receiver)
+    plan = run.field.plan(run.state.params, run.dataset.receiver())
+    predictor = functools.partial(render_pas, run.field, run.state.params, plan)
     first = timed(lambda: predictor(blocks[0]))
     seconds = interleaved(
         {"all": lambda: [np.asarray(predictor(block)) for block in blocks], "single": lambda: predictor(single)}, effort

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wbgs_jax import (
-    Capacity,
     Gaussians,
     Receiver,
+    TileLimits,
     geometry_plan,
     make_receiver,
-    measure_capacity,
+    measure_limits,
     project,
     render_dense,
     render_splats,
@@ -32,7 +32,7 @@ class Scene:
     attenuation: Float[Array, "n b"]
     signal: Float[Array, "n b"]
     cotangent: Float[Array, "b 90 360"]
-    capacity: Capacity
+    limits: TileLimits
 
     def inputs(self, b: int) -> tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"], Float[Array, "b 90 360"]]:
         """Inputs of compiled functions, for the first b queries."""
@@ -40,7 +40,7 @@ class Scene:
 
     def tiled(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
         """The project's renderer, geometry included."""
-        return render_splats(geometry_plan(gaussians, self.receiver, self.capacity), attenuation, signal)
+        return render_splats(geometry_plan(gaussians, self.receiver, self.limits), attenuation, signal)
 
     def dense(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
         """The reference."""
@@ -84,7 +84,7 @@ def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:
     means = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], -1) * distance[:, None]
     sigma = np.deg2rad(rng.uniform(2, 10, n)) / 3 * distance
     log_scales = np.log(sigma[:, None] * rng.uniform(0.6, 1.4, (n, 3)))
-    arrays = (means, log_scales, rng.normal(size=(n, 4)), np.zeros(n), np.ones(n))
+    arrays = (means, log_scales, rng.normal(size=(n, 4)), np.zeros(n))
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
@@ -94,8 +94,8 @@ def random_scene(n: int, b: int, seed: int) -> Scene:
     gaussians, receiver = random_gaussians(rng, n), make_receiver([0.0, 0.0, 0.0])
     attenuation, signal = (jnp.asarray(rng.uniform(0, 0.6, (n, b)), jnp.float32) for _ in range(2))
     cotangent = jnp.asarray(rng.normal(size=(b, 90, 360)), jnp.float32)
-    capacity = measure_capacity(project(gaussians, receiver), 1.05)
-    return Scene(gaussians, receiver, attenuation, signal, cotangent, capacity)
+    limits = measure_limits(project(gaussians, receiver), 1.05)
+    return Scene(gaussians, receiver, attenuation, signal, cotangent, limits)
 
 
 def temporary_gb(compiled: jax.stages.Compiled) -> float:

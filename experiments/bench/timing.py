@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import sys
 import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
@@ -10,6 +9,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jaxtyping import Float
+
+from wbgs_jax._util.command import say
 
 Seconds = Float[np.ndarray, "rounds"]
 Name = TypeVar("Name", bound=Hashable)
@@ -78,11 +79,6 @@ class Report:
 
 def _rounded(value: float, digits: int) -> float:
     return float(f"{value:.{digits}g}")
-
-
-def say(line: str) -> None:
-    """A line for people, on stderr: stdout is for results."""
-    print(line, file=sys.stderr, flush=True)
 
 
 def timed(call: Callable[[], Any]) -> float:

@@ -4,7 +4,6 @@ Parts are jitted alone, in a loop: as in an epoch, fresh memory is paid for once
 some). `backward` is the gradient less the forward pass, `rest` what the step takes beyond gradient and optimiser.
 """
 
-import dataclasses
 import functools
 import tempfile
 from collections.abc import Callable
@@ -15,16 +14,18 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from experiments.bench.timing import Effort, Report, interleaved, say
-from wbgs_jax.config import PRESETS, limit_steps
+from experiments.bench.timing import Effort, Report, interleaved
+from wbgs_jax._util.command import say
+from wbgs_jax.config import Settings, changed, limit_steps
 from wbgs_jax.data import load_dataset
-from wbgs_jax.fields import wideband
+from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
-from wbgs_jax.splat import GeometryPlan, render_splats
+from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.train import default_preset
-from wbgs_jax.training.step import loss_and_gradients
 from wbgs_jax.training.loop import Run
+from wbgs_jax.training.step import loss_and_gradients
 
+FIELD = "wideband"
 STEPS = 10
 """Steps of one timed block."""
 
@@ -34,38 +35,43 @@ def preset(effort: Effort) -> str:
     return "smoke" if effort.quick else default_preset()
 
 
+def settings(effort: Effort) -> Settings:
+    """Returns the settings of that preset."""
+    return get_field(FIELD).presets[preset(effort)]
+
+
 def start_run(effort: Effort, folder: Path, epoch_steps: int | None = None) -> Run:
     """A training of scene 1 before its first step."""
     dataset = load_dataset(1)
-    settings = limit_steps(PRESETS[preset(effort)], len(dataset.train))
+    chosen = limit_steps(settings(effort), len(dataset.train))
     if epoch_steps:
-        settings = dataclasses.replace(settings, loop=dataclasses.replace(settings.loop, epoch_steps=epoch_steps))
-    return Run(dataset, "wideband", settings, effort.seed, folder)
+        chosen = changed(chosen, {"loop": {"epoch_steps": epoch_steps}})
+    return Run(dataset, FIELD, chosen, effort.seed, folder)
 
 
 def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
     """The parts of a step as separate calls, on a copy of the run's state (the trainer gives its own away)."""
-    state, data, optim = jax.tree.map(jnp.copy, run.state), run.data, run.settings.optim
-    params, capacity = state.params, run.capacity
+    state, data, field = jax.tree.map(jnp.copy, run.state), run.data, run.field
+    params, receiver, weight = state.params, run.dataset.receiver(), run.settings.field.ssim_weight
     index = jnp.asarray(run.batches(0, 1)[0])
 
     def plan(params):
-        return wideband.plan(params, data.receiver, capacity)
+        return geometry_plan(params.gaussians, receiver, run.limits, run.settings.field.projection)
 
-    def networks(params, query):
-        return wideband.em_features(params, data.receiver, query)
+    def networks(params, query, planned):
+        return wideband.em_features(params, planned, query)
 
     def composite(splats, jobs, attenuation, signal):
         return render_splats(GeometryPlan(splats, jobs), attenuation, signal)
 
     def loss(image, data):
-        return image_loss(image, data.pas(index), optim.ssim_weight)[0]
+        return image_loss(image, data.pas(index), weight)[0]
 
     def forward(params, query, data):
-        return loss(wideband.render(params, plan(params), query), data)
+        return loss(wideband.render(params, field.plan(params, receiver, run.limits), query), data)
 
     def gradient(params, data):
-        return loss_and_gradients(run.field, params, data, index, capacity, optim)
+        return loss_and_gradients(field, params, run.cache, data, index, run.limits, run.key)
 
     def optimiser(gradients, state):
         updates, moments = run.optimizer.update(gradients, state.optimizer, state.params)
@@ -75,15 +81,16 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         """Forward and backward of a part; the sum costs next to nothing."""
         return jax.grad(lambda *args: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(function(*args))), argnums)
 
-    query = jax.tree.map(lambda a: a[index], data.query)
-    geometry = plan(params).geometry
+    query = jax.tree.map(lambda a: a[index], data.links.query)
+    planned = field.portable(field.plan(params, receiver, run.limits))  # without what the networks make of the Gaussians
+    geometry = planned.geometry
     even = jnp.full((params.gaussians.alive.size, len(index)), 0.3)  # the time does not depend on these values
     splatting = (geometry.splats, geometry.jobs, even, even)
     image, gradients = 0.9 * data.pas(index), params
     calls: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         "plan": (plan, (params,)),
-        "networks": (networks, (params, query)),
-        "networks_fwd_bwd": (with_backward(networks, 0), (params, query)),
+        "networks": (networks, (params, query, planned)),
+        "networks_fwd_bwd": (with_backward(networks, 0), (params, query, planned)),
         "composite": (composite, splatting),
         "composite_fwd_bwd": (with_backward(composite, (0, 2, 3)), splatting),
         "loss": (loss, (image, data)),

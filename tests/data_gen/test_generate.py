@@ -18,9 +18,10 @@ from data_gen.generate import generate
 from data_gen.options import Options, make_job
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.radio.array import planar_array
-from wbgs_jax.data.scene_file import load_scene
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.load import RELEASED
+from wbgs_jax.data.scene_file import load_scene
+from wbgs_jax.radio.array import planar_array
 
 
 def options(folder, **changes):
@@ -40,9 +41,10 @@ def options(folder, **changes):
 
 @pytest.fixture(autouse=True)
 def few_aimed_rays(monkeypatch):
-    """The search is not the subject here."""
+    """The search is not the subject here, and ceilings of a few transmitters are enough."""
     few = functools.partial(SolverSettings, rays_per_face=1, rays_per_mirrored_face=0)
     monkeypatch.setattr("data_gen.options.SolverSettings", few)
+    monkeypatch.setattr("data_gen.options.CEILING_TX", 5)
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +56,12 @@ def uninterrupted(simulator_backend, tmp_path_factory):
 
 def test_the_scene_file_is_complete(uninterrupted):
     scene, spec = load_scene(uninterrupted), get_scene(1)
-    assert scene.snapshots.shape == (20, 2, 16) and (np.abs(scene.snapshots).max(-1) > 0).all()
+    assert scene.snapshots.shape == (20, 1, 2, 16) and (np.abs(scene.snapshots).max(-1) > 0).all()
     assert scene.split.sum() == 4  # 20 % of the transmitters, for all frequencies
     np.testing.assert_array_equal(scene.frequencies_hz, [2.4e9, 60e9])
-    np.testing.assert_array_equal(scene.element_positions, planar_array())
-    np.testing.assert_array_equal(scene.rx_position, spec.rx_position)
+    np.testing.assert_array_equal(scene.element_positions, planar_array()[None])
+    np.testing.assert_array_equal(scene.rx_position, [spec.rx_position])
+    assert (scene.element_unit, scene.element_pattern) == ("wavelengths", "tr38901")
     meta = scene.meta
     assert meta["mesh_sha256"] == spec.mesh_sha256()
     assert [p["material"] for p in meta["parts"]] == [p.material for p in spec.parts]
@@ -104,7 +107,7 @@ def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path):
     """The real thing: SIGKILL in the middle of a run of the command, and the command again."""
     program = (
         "import functools, sys, tyro; import data_gen.options as o; from data_gen.generate import generate;"
-        "o.SolverSettings = functools.partial(o.SolverSettings, rays_per_face=1, rays_per_mirrored_face=0);"
+        "o.SolverSettings = functools.partial(o.SolverSettings, rays_per_face=1, rays_per_mirrored_face=0); o.CEILING_TX = 5;"
         "generate(tyro.cli(o.Options))"
     )
     arguments = ["--frequencies", "2.4", "60", "--samples", "500", "--depth", "1", "--max-paths", "20000", "--max-tx", "20"]
@@ -192,7 +195,7 @@ def test_an_output_that_cannot_be_written_is_told_first(tmp_path):
 
 
 def test_released_files_are_not_replaced_by_others():
-    assert Options().default_out().name == "scene1.npz"
+    assert Options().default_out() == RELEASED / "scene1.npz"
     assert Options(scene="3", frequency_set="21").default_out().name == "scene3_21f.npz"
     assert Options(scene="rooms/office.glb", samples=7).default_out() == Path("office.npz")
     for changes in ({"samples": 7}, {"depth": 2}, {"diffraction": False}, {"array": ArraySettings(rows=8)}, {"max_tx": 3}):
@@ -230,9 +233,9 @@ def test_another_array_is_in_the_file(simulator_backend, tmp_path):
     array = ArraySettings(rows=2, columns=3, plane="xy", pattern="iso", spacing=0.4)
     turned = (0.0, 0.0, 0.0, 2.0)
     scene = load_scene(generate(options(tmp_path, max_tx=8, array=array, rx_orientation=turned)))
-    assert scene.snapshots.shape == (8, 2, 6)
-    np.testing.assert_array_equal(scene.element_positions, array.element_positions())
-    np.testing.assert_array_equal(scene.rx_orientation, [0, 0, 0, 1])
+    assert scene.snapshots.shape == (8, 1, 2, 6) and scene.element_pattern == "iso"
+    np.testing.assert_array_equal(scene.element_positions, array.element_positions()[None])
+    np.testing.assert_array_equal(scene.rx_orientation, [[0, 0, 0, 1]])
 
 
 @pytest.mark.skipif(importlib.util.find_spec("sionna") is None, reason="sionna-rt is not installed")

@@ -14,8 +14,8 @@ from own_room import FREQUENCIES, GRID, ROOM, RX, TOML, load, meshes, refused, t
 
 from data_gen.example.make_room import OBJECTS, obj
 from data_gen.own_scene import describe, own_scene
-from wbgs_jax.data.scene_file import load_scene
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.scene_file import load_scene
 
 ROOT = Path(__file__).parents[2]
 GUIDE = (ROOT / "docs" / "own_scene.md").read_text()
@@ -89,6 +89,7 @@ def test_commands_of_the_guide_are_understood(command, monkeypatch):
 def test_the_whole_command_and_the_checks_of_the_guide(simulator_backend, tmp_path, monkeypatch, capsys):
     from data_gen.generate import Options, generate
 
+    monkeypatch.setattr("data_gen.options.CEILING_TX", 2)
     for name, samples in (("room_trial", 2000), ("room_more_rays", 4000)):
         options = Options(
             scene=str(ROOM), materials=TOML, rx=RX, tx_grid=GRID, frequencies=(2.4, 60.0), work=tmp_path / "work",
@@ -96,7 +97,7 @@ def test_the_whole_command_and_the_checks_of_the_guide(simulator_backend, tmp_pa
             workers=1,
         )  # fmt: skip
         scene = load_scene(generate(options))
-    assert scene.snapshots.shape == (20, 2, 16) and (np.abs(scene.snapshots).max(-1) > 0).all()
+    assert scene.snapshots.shape == (20, 1, 2, 16) and (np.abs(scene.snapshots).max(-1) > 0).all()
     assert {p["name"]: p["material"] for p in scene.meta["parts"]}["table"] == "oiled_oak(2.2, 0, 0.006, 1)"
     monkeypatch.chdir(tmp_path)
     for code in re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL):

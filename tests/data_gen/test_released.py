@@ -1,19 +1,17 @@
 """The released files are what the code in this repository makes: scenes, transmitters, settings, counts."""
 
 import dataclasses
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import data_gen
 from data_gen.scenes import FREQUENCIES_21_HZ, FREQUENCIES_HZ, SCENES, get_scene
 from data_gen.settings import SolverSettings
-from wbgs_jax.radio.array import lag_basis, planar_array, snapshot_to_pas
+from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene_file import TEST, load_scene
+from wbgs_jax.radio.array import lag_basis, planar_array, snapshot_to_pas
 
-RELEASED = Path(data_gen.__file__).parent / "released"
 FILES = {**{f"scene{n}": (n, FREQUENCIES_HZ) for n in SCENES}, "scene1_21f": (1, FREQUENCIES_21_HZ)}
 
 
@@ -23,20 +21,26 @@ def released(request):
     return load_scene(RELEASED / f"{request.param}.npz"), get_scene(number), frequencies
 
 
+@pytest.fixture(scope="module")
+def basis():
+    """Of the squared spectra of the array that all files have."""
+    return lag_basis(planar_array())
+
+
 def test_all_scenes_are_there_and_small():
     assert {path.stem for path in RELEASED.glob("*.npz")} == set(FILES)
     assert sum(path.stat().st_size for path in RELEASED.glob("*.npz")) < 25e6
     scenes = [load_scene(RELEASED / f"scene{n}.npz") for n in SCENES]
-    assert sum(scene.snapshots.shape[0] * scene.snapshots.shape[1] for scene in scenes) >= 50_000
+    assert sum(scene.snapshots[..., 0].size for scene in scenes) >= 50_000
 
 
 def test_a_file_is_of_the_scene_in_the_code(released):
     scene, spec, frequencies = released
     assert scene.meta["mesh_sha256"] == spec.mesh_sha256()
     np.testing.assert_array_equal(scene.tx_positions, spec.accessible_tx())
-    np.testing.assert_array_equal(scene.rx_position, spec.rx_position)
+    np.testing.assert_array_equal(scene.rx_position, [spec.rx_position])
     np.testing.assert_array_equal(scene.frequencies_hz, frequencies)
-    np.testing.assert_array_equal(scene.element_positions, planar_array())
+    np.testing.assert_array_equal(scene.element_positions, planar_array()[None])
     for name, array in spec.mesh_arrays().items():
         np.testing.assert_array_equal(getattr(scene, name), array)
 
@@ -61,12 +65,13 @@ def test_ceilings_are_in_order(released):
         assert all(0.3 < row[name] < row["phase_blind"] for name in ("inverse_distance", "nearest_tx", "line_of_sight"))
 
 
-def test_squared_spectra_lie_in_the_49_dimensions_of_the_array(released, rng):
+def test_squared_spectra_lie_in_the_49_dimensions_of_the_array(released, basis, rng):
     scene, *_ = released
-    chosen = scene.snapshots[rng.integers(len(scene.snapshots), size=4), rng.integers(scene.snapshots.shape[1], size=4)]
-    pas = snapshot_to_pas(jnp.asarray(chosen), jnp.asarray(scene.element_positions))
+    snapshots, elements = scene.snapshots[:, 0], scene.element_positions[0]
+    np.testing.assert_array_equal(elements, planar_array())
+    chosen = snapshots[rng.integers(len(snapshots), size=4), rng.integers(snapshots.shape[1], size=4)]
+    pas = snapshot_to_pas(jnp.asarray(chosen), jnp.asarray(elements))
     squared = np.asarray(pas, np.float64).reshape(4, -1) ** 2
-    basis = lag_basis(scene.element_positions)
     assert basis.shape[1] == 49
     residual = squared - squared @ basis @ basis.T
     assert (np.linalg.norm(residual, axis=1) < 1e-5 * np.linalg.norm(squared, axis=1)).all()

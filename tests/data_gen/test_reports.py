@@ -9,17 +9,18 @@ from synthetic import tiny_scene
 from data_gen import ceilings, report, samples, statistics
 from data_gen.convergence import settings
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.radio.array import planar_array
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.evaluation.baselines import references
+from wbgs_jax.radio.array import planar_array
 
 
 @pytest.fixture
 def found(rng):
     scene = tiny_scene()
-    n_tx, n_freq, _ = scene.snapshots.shape
+    n_tx, _, n_freq, _ = scene.snapshots.shape
     values = rng.random((n_tx, n_freq, len(ceilings.NAMES)))
     values[1::2] = np.nan  # half of them were not measured
     return {
@@ -37,7 +38,7 @@ def test_ceiling_table_is_the_median_of_what_was_measured(found):
             assert row[name] == pytest.approx(np.median(found["ceilings"][::2, i, k]), abs=1e-4)
     dataset = scene_dataset(scene)
     chosen = dataset.test[dataset.frequencies_hz[dataset.test] == scene.frequencies_hz[0]]
-    score = ssim(references(dataset)["inverse_distance"](chosen), np.asarray(dataset.pas(chosen)))
+    score = ssim(baselines(dataset)["inverse_distance"](chosen), np.asarray(dataset.pas(chosen)))
     assert rows[0]["inverse_distance"] == pytest.approx(np.median(score), abs=1e-4)
 
 
@@ -64,7 +65,7 @@ def test_report_and_samples_of_a_file(found, tmp_path):
     meta = {"ceilings": statistics.ceiling_table(scene, found), "channel": statistics.channel_table(scene, found)}
     save_scene(tmp_path / "tiny.npz", dataclasses.replace(scene, meta=scene.meta | meta))
     text = report.report((tmp_path / "tiny.npz",))
-    n_tx, n_freq, _ = scene.snapshots.shape
+    n_tx, _, n_freq, _ = scene.snapshots.shape
     assert f"| tiny.npz | {n_tx} | {n_freq} | {n_tx * n_freq} |" in text
     tables = [block for block in text.split("\n\n") if block.startswith("|")]
     assert [len(table.splitlines()) for table in tables] == [3, 3, 2 + n_freq, 2 + n_freq]
@@ -74,10 +75,25 @@ def test_report_and_samples_of_a_file(found, tmp_path):
     assert pytest.importorskip("PIL.Image").open(tmp_path / "samples.png").width > 500
 
 
+def test_samples_and_report_of_several_receivers(found, tmp_path):
+    scene = tiny_scene(n_rx=3, kind="pas")
+    tables = statistics.ceiling_table(tiny_scene(), found), statistics.channel_table(tiny_scene(), found)
+    meta = dict(zip(("ceilings", "channel"), tables, strict=True))
+    save_scene(tmp_path / "tiny.npz", dataclasses.replace(scene, meta=scene.meta | meta))
+    n_tx, n_rx, n_freq = scene.pas.shape[:3]
+    assert f"| tiny.npz | {n_tx} | {n_freq} | {n_tx * n_rx * n_freq} |" in report.report((tmp_path / "tiny.npz",))
+    samples.draw(scene, tmp_path / "samples.png", receiver=2)
+    with pytest.raises(UserError, match="box has no receiver 3"):
+        samples.draw(scene, tmp_path / "none.png", receiver=3)
+    with pytest.raises(UserError, match="received powers"):
+        samples.draw(tiny_scene(kind="power"), tmp_path / "none.png")
+    assert [p.name for p in tmp_path.iterdir() if p.suffix == ".png"] == ["samples.png"]
+
+
 def test_the_cross_is_the_direction_of_the_transmitter():
     scene = tiny_scene()
-    offset = scene.tx_positions[0] - scene.rx_position
-    azimuth, zenith = samples._direction(scene, 0)
+    offset = scene.tx_positions[0] - scene.rx_position[0]
+    azimuth, zenith = samples._direction(scene_dataset(scene).receiver(), scene.tx_positions[0])
     assert zenith == pytest.approx(np.degrees(np.arccos(offset[2] / np.linalg.norm(offset))), abs=1e-3)
     assert azimuth == pytest.approx(np.degrees(np.arctan2(offset[1], offset[0])), abs=1e-3)
 

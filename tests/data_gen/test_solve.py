@@ -10,8 +10,8 @@ import pytest
 from data_gen.scenes import get_scene
 from data_gen.scenes.base import IDENTITY, SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, lag_basis, pas_directions, planar_array, snapshot_to_pas
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, lag_basis, pas_directions, planar_array, snapshot_to_pas
 
 pytestmark = pytest.mark.usefixtures("simulator_backend")
 

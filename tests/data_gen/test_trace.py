@@ -13,11 +13,22 @@ FREQUENCIES = (10e9, 77e9)
 
 def load(settings):
     """The scene and the tracer of a simulator of scene 1 that holds three transmitters."""
+    import sionna.rt as rt
+
     from data_gen.solve import Simulator
 
     simulator = Simulator(get_scene(1), settings)
-    simulator.paths(get_scene(1).accessible_tx()[[40, 333, 666]], FREQUENCIES[:1])
+    for i, position in enumerate(get_scene(1).accessible_tx()[[40, 333, 666]].tolist()):
+        simulator._scene.add(rt.Transmitter(f"tx{i}", position=position))
     return simulator._scene, simulator._tracer
+
+
+def tune(scene, frequency):
+    """Sets the frequency; opaque to the compiler, which would otherwise compile everything anew for every number."""
+    import drjit as dr
+    import mitsuba as mi
+
+    scene.frequency = dr.opaque(mi.Float, frequency)
 
 
 def solve(scene, settings):
@@ -51,10 +62,10 @@ def test_fields_equal_those_of_the_public_solver(depth, diffraction):
         rays_per_mirrored_face=0, diffraction_probability=SBCandidateGenerator.DIFFRACTION_SAMPLING_PROBABILITY,
     )  # fmt: skip
     scene, tracer = load(settings)
-    scene.frequency = FREQUENCIES[0]
+    tune(scene, FREQUENCIES[0])
     traced = tracer.trace()
     for frequency in FREQUENCIES:
-        scene.frequency = frequency
+        tune(scene, frequency)
         ours, stock = rows(tracer.fields(traced)), rows(solve(scene, settings))
         assert len(ours) > 30 and ours.any(0).all()
         # All paths, not only those in common: the search does not depend on the frequency.
@@ -66,7 +77,7 @@ def test_only_the_search_differs_from_the_itu_material():
 
     settings = SolverSettings(max_depth=3, samples_per_src=20_000, max_paths_per_src=20_000, diffraction=False)
     scene, tracer = load(settings)
-    scene.frequency = 1e9
+    tune(scene, 1e9)
     traced = tracer.trace()
     balanced = rows(tracer.fields(traced))
     for name, item in scene.objects.items():

@@ -1,12 +1,25 @@
 """The array model against closed forms and a plain loop."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.radio.array import PAS_SHAPE, cbf, lag_basis, normalise, pas_directions, planar_array, snapshot_to_pas, steering_vector
+from wbgs_jax.data import load_dataset
+from wbgs_jax.radio import array
+from wbgs_jax.radio.array import PAS_SHAPE, lag_basis, normalise, pas_directions, planar_array
+from wbgs_jax.types import make_receiver
 
 ELEMENTS = jnp.asarray(planar_array(), jnp.float32)
+snapshot_to_pas, steering_vector, cbf, array_response = map(
+    jax.jit, (array.snapshot_to_pas, array.steering_vector, array.cbf, array.array_response)
+)
+
+
+@pytest.fixture(scope="module")
+def basis():
+    """Of all squared spectra of the 4x4 array."""
+    return lag_basis(planar_array())
 
 
 def random_snapshots(rng, *shape):
@@ -38,8 +51,8 @@ def test_element_order_is_that_of_the_ray_tracer(shared_data):
 
 def test_snapshot_to_pas_equals_the_formula_written_as_a_loop(rng):
     elements = planar_array()
-    y = random_snapshots(rng, 16)
-    pas = np.asarray(snapshot_to_pas(y, ELEMENTS))
+    y = random_snapshots(rng, 3, 16)
+    pas, y = np.asarray(snapshot_to_pas(y, ELEMENTS))[1], y[1]
     expected = np.zeros(PAS_SHAPE)
     rows, columns = np.linspace(0, np.pi / 2, 90), np.linspace(-np.pi, np.pi, 360)
     for i, t in enumerate(rows):
@@ -53,7 +66,8 @@ def test_snapshot_to_pas_equals_the_formula_written_as_a_loop(rng):
 def test_a_plane_wave_peaks_where_it_comes_from(rng):
     row, column = rng.integers(5, 85), rng.integers(0, 359)
     k = pas_directions()[row, column]
-    pas = np.asarray(snapshot_to_pas(steering_vector(ELEMENTS, jnp.asarray(k[None], jnp.float32)), ELEMENTS))[0]
+    waves = steering_vector(ELEMENTS, jnp.asarray([k] * 3, jnp.float32))
+    pas = np.asarray(snapshot_to_pas(waves, ELEMENTS))[0]
     assert pas[row, column] == pytest.approx(1, abs=1e-5)
     # Closed form: the product of the array factors of four elements half a wavelength apart along y and along z.
     u = np.pi / 2 * (pas_directions() - k)[..., 1:]
@@ -69,22 +83,18 @@ def test_array_cannot_tell_front_from_back(rng):
     np.testing.assert_allclose(front, back, atol=1e-6)
 
 
-def test_every_squared_pas_lies_in_49_dimensions(rng):
-    basis = lag_basis(planar_array())
+def test_every_squared_pas_lies_in_49_dimensions(rng, basis):
     assert basis.shape == (90 * 360, 49)
     np.testing.assert_allclose(basis.T @ basis, np.eye(49), atol=1e-9)
-    squared = np.asarray(snapshot_to_pas(random_snapshots(rng, 4, 16), ELEMENTS)).astype(np.float64).reshape(4, -1) ** 2
+    squared = np.asarray(snapshot_to_pas(random_snapshots(rng, 3, 16), ELEMENTS)).astype(np.float64).reshape(3, -1) ** 2
     residual = squared - squared @ basis @ basis.T
     assert np.linalg.norm(residual) < 1e-5 * np.linalg.norm(squared)
     foreign = rng.random((4, 90 * 360))  # the space is small: an image that is no PAS does not lie in it
     assert np.linalg.norm(foreign - foreign @ basis @ basis.T) > 0.3 * np.linalg.norm(foreign)
 
 
-def test_published_images_lie_in_that_space_up_to_8_bit_rounding(shared_data):
-    from wbgs_jax.data import load_dataset
-
+def test_published_images_lie_in_that_space_up_to_8_bit_rounding(shared_data, basis):
     images = load_dataset(shared_data("wideband3dgs_example1")).images[::25].astype(np.float64).reshape(20, -1) / 255
-    basis = lag_basis(planar_array())
     residual = images**2 - images**2 @ basis @ basis.T
     assert np.median(np.linalg.norm(residual, axis=1) / np.linalg.norm(images**2, axis=1)) < 0.005
 
@@ -98,13 +108,13 @@ def test_scale_and_global_phase_do_not_matter(rng):
 
 
 def test_first_and_last_column_are_the_same_direction(rng):
-    pas = np.asarray(snapshot_to_pas(random_snapshots(rng, 2, 16), ELEMENTS))
+    pas = np.asarray(snapshot_to_pas(random_snapshots(rng, 3, 16), ELEMENTS))
     np.testing.assert_allclose(pas[..., 0], pas[..., -1], atol=1e-6)
 
 
 def test_zero_snapshot_gives_zero_pas():
-    pas = np.asarray(snapshot_to_pas(jnp.zeros((2, 16), jnp.complex64), ELEMENTS))
-    assert pas.shape == (2, *PAS_SHAPE)
+    pas = np.asarray(snapshot_to_pas(jnp.zeros((3, 16), jnp.complex64), ELEMENTS))
+    assert pas.shape == (3, *PAS_SHAPE)
     np.testing.assert_array_equal(pas, 0)
     np.testing.assert_array_equal(np.asarray(normalise(jnp.zeros((1, *PAS_SHAPE)))), 0)
 
@@ -113,3 +123,34 @@ def test_cbf_takes_any_batch_shapes(rng):
     y, a = random_snapshots(rng, 2, 3, 16), random_snapshots(rng, 5, 16)
     expected = np.abs(np.einsum("bcn,mn->bcm", np.asarray(y), np.asarray(a).conj()))
     np.testing.assert_allclose(np.asarray(cbf(y, a)), expected, rtol=1e-5)
+
+
+def test_the_response_of_an_array_in_two_directions_is_its_beam_there(rng):
+    """Also where every second direction has an array of its own, as those of fixed size have one a frequency."""
+    u, v = (jnp.asarray(k / np.linalg.norm(k, axis=-1, keepdims=True), jnp.float32) for k in rng.normal(size=(2, 4, 3)))
+    scale = rng.uniform(0.5, 3, 4)
+    own = jnp.asarray(scale[:, None, None] * planar_array(), jnp.float32)
+    expected, expected_own = np.zeros((4, 4)), np.zeros((4, 4))
+    for j in range(4):
+        phases = 2 * np.pi * (np.asarray(u, float) - np.asarray(v[j], float)) @ planar_array().T
+        expected[:, j] = np.abs(np.exp(1j * phases).mean(-1))
+        expected_own[:, j] = np.abs(np.exp(1j * scale[j] * phases).mean(-1))
+    np.testing.assert_allclose(array_response(ELEMENTS, u, v), expected, atol=1e-5)
+    np.testing.assert_allclose(array_response(ELEMENTS, u, v, steering_vector(ELEMENTS, u)), expected, atol=1e-5)
+    np.testing.assert_allclose(array_response(own, u, v), expected_own, atol=1e-5)
+
+
+def test_an_array_in_metres_has_more_wavelengths_at_higher_frequencies(rng):
+    elements, frequency = rng.normal(size=(5, 3)), rng.uniform(1e9, 9e10, 3)
+    metres, wavelengths = (make_receiver((0, 0, 0), element_positions=elements, unit=u) for u in ("metres", "wavelengths"))
+    expected = elements * (frequency / 299_792_458.0)[:, None, None]
+    np.testing.assert_allclose(metres.element_wavelengths(jnp.asarray(frequency)), expected, rtol=1e-5)
+    np.testing.assert_array_equal(wavelengths.element_wavelengths(jnp.asarray(frequency)), elements.astype(np.float32))
+
+
+def test_spectra_of_arrays_of_their_own(rng):
+    y, scale = random_snapshots(rng, 3, 16), rng.uniform(0.5, 2, 3)
+    own = jnp.asarray(scale[:, None, None] * planar_array(), jnp.float32)
+    for i in range(3):
+        alone = snapshot_to_pas(jnp.tile(y[i], (3, 1)), own[i])[0]
+        np.testing.assert_allclose(snapshot_to_pas(y, own)[i], alone, atol=1e-5)

@@ -1,20 +1,26 @@
 """Rotations against SciPy; directions, angles and pixels there and back."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wbgs_jax.radio import geometry
 from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.radio.geometry import (
-    angles_to_direction,
-    angles_to_pixel,
-    covariance_factor,
-    direction_to_angles,
-    pixel_to_angles,
-    rotation_matrix,
-    to_local,
+
+rotation_matrix, to_local, covariance_factor, direction_to_angles, angles_to_direction = map(
+    jax.jit,
+    (
+        geometry.rotation_matrix,
+        geometry.to_local,
+        geometry.covariance_factor,
+        geometry.direction_to_angles,
+        geometry.angles_to_direction,
+    ),
 )
+angles_to_pixel = jax.jit(geometry.angles_to_pixel, static_argnames="projection")
+pixel_to_angles = jax.jit(geometry.pixel_to_angles, static_argnames="projection")
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -59,7 +65,9 @@ def test_directions_to_angles_and_back(rng, x64):
 @pytest.mark.parametrize("projection", ["hemisphere", "sphere"])
 def test_angles_to_pixels_and_back(rng, x64, projection):
     pixels = jnp.asarray(rng.uniform(0, [359, 89], (40, 2)))
-    np.testing.assert_allclose(angles_to_pixel(*pixel_to_angles(pixels, projection), projection), pixels, **TIGHT)
+    np.testing.assert_allclose(
+        angles_to_pixel(*pixel_to_angles(pixels, projection=projection), projection=projection), pixels, **TIGHT
+    )
 
 
 def test_pixel_centres_are_the_directions_of_the_pas(x64):
@@ -70,6 +78,6 @@ def test_pixel_centres_are_the_directions_of_the_pas(x64):
 
 @pytest.mark.parametrize(("projection", "last_row"), [("hemisphere", 90), ("sphere", 180)])
 def test_the_rows_span_the_zenith_range(projection, last_row):
-    azimuth, zenith = pixel_to_angles(jnp.array([[0.0, 0.0], [359.0, 89.0], [179.5, 44.5]]), projection)
+    azimuth, zenith = pixel_to_angles(jnp.array([[0.0, 0.0], [359.0, 89.0], [179.5, 44.5]]), projection=projection)
     np.testing.assert_allclose(np.rad2deg(azimuth), [-180, 180, 0], atol=1e-3)
     np.testing.assert_allclose(np.rad2deg(zenith), [0, last_row, last_row / 2], atol=1e-3)

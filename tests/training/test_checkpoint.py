@@ -8,11 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.training import checkpoint
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import with_leaves
+from wbgs_jax.training import checkpoint
 from wbgs_jax.types import Query
 
-METADATA = {"sizes": {"gaussians": 64}, "tile_capacity": {"entries": 4096, "jobs": 1024}, "seconds": 0.1}
+METADATA = {"limits": {"entries": 4096, "jobs": 1024}, "seconds": 0.1}
+FIELD = {"frame": Query(jnp.ones((2, 3)), jnp.zeros(2)), "nothing": jnp.zeros((0, 2))}
+"""Of a field: arrays that are never trained, one of them empty."""
 
 
 @pytest.fixture
@@ -24,31 +27,77 @@ def state(rng):
     }
 
 
+def save(folder, state, step=7, keep=2):
+    checkpoint.save(folder, step, state, FIELD, METADATA, keep)
+
+
 def shapes(state):
     return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), state)
 
 
 def test_round_trip(tmp_path, state):
-    checkpoint.save(tmp_path / "a", 7, state, METADATA, keep=2)
-    again = checkpoint.load(tmp_path / "a", 7, shapes(state))
+    save(tmp_path / "a", state)
+    saved = checkpoint.read(tmp_path / "a", 7)
+    again = checkpoint.fill_like(saved, shapes(state))
     assert jax.tree.structure(again) == jax.tree.structure(state)
     for x, y in zip(jax.tree.leaves(again), jax.tree.leaves(state), strict=True):
         np.testing.assert_array_equal(x, y)
         assert x.dtype == y.dtype
-    assert checkpoint.load_metadata(tmp_path / "a", 7) == METADATA
+    assert saved.metadata == METADATA
+    assert saved.path == tmp_path / "a" / "7"
+
+
+def test_the_field_comes_along_and_is_no_part_of_the_state(tmp_path, state):
+    """Also arrays without elements, which Orbax would refuse."""
+    save(tmp_path, state)
+    saved = checkpoint.read(tmp_path, 7)
+    expected = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(FIELD)}
+    assert saved.field.keys() == expected.keys() and not saved.field.keys() & saved.state.keys()
+    for key, leaf in expected.items():
+        np.testing.assert_array_equal(saved.field[key], leaf)
+        assert (saved.field[key].shape, saved.field[key].dtype) == (leaf.shape, leaf.dtype)
 
 
 def test_a_part_of_the_state_can_be_read_alone(tmp_path, state):
-    checkpoint.save(tmp_path, 7, state, METADATA, keep=2)
-    params = checkpoint.load(tmp_path, 7, shapes(state["params"]), prefix="['params']")
+    save(tmp_path, state)
+    params = checkpoint.fill_like(checkpoint.read(tmp_path, 7), shapes(state["params"]), prefix="['params']")
     np.testing.assert_array_equal(params.tx_position, state["params"].tx_position)
+
+
+def init(rows):
+    """A function as `Field.init`: what it returns matters by its structure alone."""
+    return lambda key: Query(jax.random.normal(key, (rows, 3)), jnp.zeros(rows))
+
+
+@pytest.mark.parametrize("rows", [2, 5, 9])
+def test_parameters_have_as_many_rows_as_were_saved(tmp_path, state, rows):
+    """Density control changes their number; `init` knows the first one only."""
+    save(tmp_path, state)
+    params = checkpoint.fill(checkpoint.read(tmp_path, 7), init(rows), jax.random.key(0), prefix="['params']")
+    assert jax.tree.structure(params) == jax.tree.structure(state["params"])
+    np.testing.assert_array_equal(params.tx_position, state["params"].tx_position)
+    np.testing.assert_array_equal(params.frequency_hz, state["params"].frequency_hz)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda key: with_leaves(init(5)(key), jnp.zeros((5, 2)), jnp.zeros(5)),
+        lambda key: init(5)(key).tx_position,
+        lambda key: {"more": init(5)(key)},
+    ],
+)
+def test_parameters_of_another_structure_do_not_fit(tmp_path, state, other):
+    save(tmp_path, state)
+    with pytest.raises(UserError, match="does not fit this configuration"):
+        checkpoint.fill(checkpoint.read(tmp_path, 7), other, jax.random.key(0), prefix="['params']")
 
 
 def test_the_oldest_go_and_equal_steps_are_replaced(tmp_path, state):
     for step in (5, 10, 100, 100):
-        checkpoint.save(tmp_path, step, state | {"step": jnp.asarray(step, jnp.int32)}, METADATA, keep=2)
+        save(tmp_path, state | {"step": jnp.asarray(step, jnp.int32)}, step)
     assert checkpoint.checkpoint_steps(tmp_path) == [10, 100]
-    assert int(checkpoint.load(tmp_path, 100, shapes(state))["step"]) == 100
+    assert int(checkpoint.fill_like(checkpoint.read(tmp_path, 100), shapes(state))["step"]) == 100
 
 
 def test_steps_are_numbers_and_nothing_else(tmp_path):
@@ -60,7 +109,7 @@ def test_steps_are_numbers_and_nothing_else(tmp_path):
 
 @pytest.mark.parametrize("change", ["shape", "more", "fewer Gaussians"])
 def test_another_structure_does_not_fit(tmp_path, state, change):
-    checkpoint.save(tmp_path, 7, state, METADATA, keep=2)
+    save(tmp_path, state)
     like = shapes(state)
     if change == "shape":
         like["step"] = jax.ShapeDtypeStruct((1,), jnp.int32)
@@ -69,14 +118,14 @@ def test_another_structure_does_not_fit(tmp_path, state, change):
     else:
         like["params"] = jax.eval_shape(lambda: Query(jnp.zeros((4, 3)), jnp.zeros(4)))
     with pytest.raises(UserError, match="does not fit this configuration"):
-        checkpoint.load(tmp_path, 7, like)
+        checkpoint.fill_like(checkpoint.read(tmp_path, 7), like)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # reads that Orbax gave up
 @pytest.mark.parametrize("damage", ["gone", "empty", "cut", "garbage"])
 def test_damage_is_an_error_for_people_or_harmless(tmp_path, state, damage):
-    """Every file of a checkpoint in turn: both reads give what was written, or one line that names the folder."""
-    checkpoint.save(tmp_path / "good", 7, state, METADATA, keep=2)
+    """Every file of a checkpoint in turn: a read gives what was written, or one line that names the folder."""
+    save(tmp_path / "good", state)
     files = [path.relative_to(tmp_path / "good") for path in sorted((tmp_path / "good").rglob("*")) if path.is_file()]
     noticed = 0
     for i, name in enumerate(files):
@@ -88,8 +137,9 @@ def test_damage_is_an_error_for_people_or_harmless(tmp_path, state, damage):
         else:
             (folder / name).write_bytes({"empty": b"", "cut": content[: len(content) // 2], "garbage": os.urandom(99)}[damage])
         try:
-            assert checkpoint.load_metadata(folder, 7) == METADATA
-            again = checkpoint.load(folder, 7, shapes(state))
+            saved = checkpoint.read(folder, 7)
+            again = checkpoint.fill_like(saved, shapes(state))
+            assert saved.metadata == METADATA
         except UserError as error:
             noticed += 1
             assert "\n" not in str(error) and str(folder / "7") in str(error)
@@ -102,13 +152,11 @@ def test_a_missing_or_empty_folder(tmp_path, state):
     (tmp_path / "3").mkdir()
     for step in (3, 4):
         with pytest.raises(UserError, match="damaged or incomplete"):
-            checkpoint.load_metadata(tmp_path, step)
-        with pytest.raises(UserError, match="damaged or incomplete"):
-            checkpoint.load(tmp_path, step, shapes(state))
+            checkpoint.read(tmp_path, step)
 
 
 def test_a_place_that_cannot_be_written(tmp_path, state):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UserError, match="cannot write checkpoint"):
-        checkpoint.save(tmp_path / "file" / "checkpoints", 7, state, METADATA, keep=2)
+        save(tmp_path / "file" / "checkpoints", state)
     assert (tmp_path / "file").read_text() == "mine"

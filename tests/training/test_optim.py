@@ -1,51 +1,99 @@
 """Which parameter learns how fast."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
+from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax.config import OptimConfig
-from wbgs_jax.data.surface import surface_from_points
-from wbgs_jax.fields import wideband
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import get_field
 from wbgs_jax.training.optim import make_optimizer
 
-RATES = {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity_logits": 0.4, "networks": 0.5, "alive": 0, "frame": 0}
-CONFIG = OptimConfig(steps=6, means_lr=0.1, log_scales_lr=0.2, quats_lr=0.3, opacity_lr=0.4, network_lr=0.5, final_fraction=0.1)
+OPTIM = OptimConfig(steps=6, final_fraction=0.1)
+RATES = {
+    "wideband": {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity": 0.4, "network": 0.5},
+    "wave": {"materials": 0.1, "thickness": 0.2, "corrections": 0.3},
+    "nerf2": {"network": 0.1},
+}
+"""The settings that hold a learning rate, NAME_lr, by field."""
+PLACES = {
+    "wideband": {
+        ".gaussians.means": "means",
+        ".gaussians.log_scales": "log_scales",
+        ".gaussians.quats": "quats",
+        ".gaussians.opacity_logits": "opacity",
+        ".networks": "network",
+    },
+    "wave": {
+        ".materials.log_thickness": "thickness",
+        ".materials": "materials",
+        ".facet_correction": "corrections",
+        ".excess_loss": "corrections",
+        ".log_gain": "corrections",
+    },
+    "nerf2": {"[": "network"},
+}
+"""Which rate belongs to a place in the parameters: the first that fits."""
 
 
-@pytest.fixture
-def params(rng):
-    surface = jax.tree.map(jnp.asarray, surface_from_points(rng.normal(size=(6, 3))))
-    return wideband.init(jax.random.key(0), surface, tiny_settings().wideband, 8)
+def config_of(name, **changes):
+    rates = {f"{rate}_lr": value for rate, value in RATES[name].items()}
+    return dataclasses.replace(tiny_settings(name).field, **rates, **changes)
 
 
-def updates_of(params, config, steps):
+@pytest.fixture(scope="module")
+def params():
+    """Parameters by field: their shapes, and made-up values."""
+    rng, made = np.random.default_rng(0), {}
+    for name in RATES:
+        field = get_field(name).make(config_of(name), DatasetScene(tiny_dataset()), 0)
+        shapes = jax.eval_shape(field.init, jax.random.key(0))
+        made[name] = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), shapes)
+    return made
+
+
+def by_place(tree):
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def updates_of(name, params, config, steps):
     """The updates of some steps under a constant gradient of one, for which Adam moves by the learning rate itself."""
-    optimizer = make_optimizer(config)
-    state, ones = optimizer.init(params), jax.tree.map(jnp.ones_like, params)
+    optimizer = make_optimizer(get_field(name), config, OPTIM)
+    update = jax.jit(optimizer.update)
+    state, ones = jax.jit(optimizer.init)(params), jax.tree.map(jnp.ones_like, params)
     for _ in range(steps):
-        updates, state = optimizer.update(ones, state, params)
-        yield {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(updates)}
+        updates, state = update(ones, state, params)
+        yield by_place(updates)
 
 
-def rate_of(path):
-    (name,) = [name for name in RATES if f".{name}" in path]
-    return RATES[name]
-
-
-def test_every_parameter_has_its_groups_rate_and_decays_by_a_cosine(params):
-    for step, updates in enumerate(updates_of(params, CONFIG, 8)):
+@pytest.mark.parametrize("name", RATES)
+def test_every_parameter_has_its_groups_rate_and_decays_by_a_cosine(params, name):
+    found = set()
+    for step, updates in enumerate(updates_of(name, params[name], config_of(name), 8)):
         cosine = 0.5 * (1 + np.cos(np.pi * min(step / 6, 1)))
         for path, update in updates.items():
-            np.testing.assert_allclose(update, -rate_of(path) * (0.9 * cosine + 0.1), rtol=1e-4, err_msg=path)
+            rate = next(rate for place, rate in PLACES[name].items() if path.startswith(place))
+            np.testing.assert_allclose(update, -RATES[name][rate] * (0.9 * cosine + 0.1), rtol=1e-4, err_msg=path)
+            found.add(rate)
+    assert found == set(RATES[name])
 
 
 def test_weight_decay_is_decoupled_and_for_the_networks_only(params):
-    (plain,) = updates_of(params, CONFIG, 1)
-    (decayed,) = updates_of(params, OptimConfig(**{**vars(CONFIG), "network_weight_decay": 0.01}), 1)
-    values = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
+    (plain,) = updates_of("wideband", params["wideband"], config_of("wideband"), 1)
+    (decayed,) = updates_of("wideband", params["wideband"], config_of("wideband", network_weight_decay=0.01), 1)
+    values = by_place(params["wideband"])
     for path, update in decayed.items():
         shrink = 0.5 * 0.01 * values[path] if "networks" in path else 0
         np.testing.assert_allclose(update, plain[path] - shrink, atol=1e-6, err_msg=path)
+
+
+def test_equal_settings_share_one_optimiser():
+    """And with it the compiled epoch."""
+    field = get_field("wideband")
+    assert make_optimizer(field, config_of("wideband"), OPTIM) is make_optimizer(field, config_of("wideband"), OPTIM)
+    other = dataclasses.replace(OPTIM, final_fraction=0.2)
+    assert make_optimizer(field, config_of("wideband"), OPTIM) is not make_optimizer(field, config_of("wideband"), other)

@@ -4,25 +4,45 @@ import dataclasses
 import json
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_settings
+from synthetic import tiny_settings
+from untrained import STEP, make_field, make_params, make_run
 
-from wbgs_jax.config import PRESETS, Settings, from_dict, to_dict
-from wbgs_jax.data.surface import make_surface
+import wbgs_jax
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.fields import wideband
-from wbgs_jax.training.run_folder import RunConfig, difference, load_trained, read_config, write_config
+from wbgs_jax.config import PRESETS, changed, sections
+from wbgs_jax.fields import field_names, get_field
+from wbgs_jax.training.run_folder import (
+    RunConfig,
+    difference,
+    load_trained,
+    prepare_folder,
+    read_config,
+    write_config,
+)
 
-CONFIG = RunConfig("scene.npz", "wideband", "smoke", 3, 2.4, PRESETS["smoke"])
+CONFIG = RunConfig("scene.npz", "wideband", "smoke", 3, 2.4, get_field("wideband").presets["smoke"])
 
 
+@pytest.mark.parametrize("field", field_names())
 @pytest.mark.parametrize("preset", PRESETS)
-def test_round_trip_through_the_folder(tmp_path, preset):
-    config = dataclasses.replace(CONFIG, preset=preset, settings=PRESETS[preset], frequency_ghz=None)
+def test_round_trip_through_the_folder(tmp_path, preset, field):
+    settings = get_field(field).presets[preset]
+    config = dataclasses.replace(CONFIG, preset=preset, field=field, settings=settings, frequency_ghz=None)
+    write_config(tmp_path / "run", config)
+    again = read_config(tmp_path / "run")
+    assert again == config
+    assert type(again.settings.field) is type(settings.field)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["version"] == wbgs_jax.__version__
+
+
+def test_what_is_not_a_default_comes_back_too(tmp_path):
+    config = dataclasses.replace(CONFIG, train_ghz=(1.0, 94.0), train_tx=3, validation=0.25, receiver=1)
     write_config(tmp_path / "run", config)
     assert read_config(tmp_path / "run") == config
-    assert isinstance(read_config(tmp_path / "run").settings.wideband.radiance_widths, tuple)
+    assert isinstance(read_config(tmp_path / "run").train_ghz, tuple)
+    assert isinstance(read_config(tmp_path / "run").settings.field.radiance_widths, tuple)
 
 
 def edited(tmp_path, edit):
@@ -75,44 +95,69 @@ def test_no_checkpoint_yet(tmp_path):
 def test_difference_names_the_first_setting():
     assert difference(CONFIG, CONFIG) == ""
     assert difference(CONFIG, dataclasses.replace(CONFIG, seed=4)) == "seed: 3, not 4"
-    settings = dataclasses.replace(CONFIG.settings, optim=dataclasses.replace(CONFIG.settings.optim, batch=99))
-    changed = difference(CONFIG, dataclasses.replace(CONFIG, settings=settings))
-    assert changed == f"settings.optim.batch: {CONFIG.settings.optim.batch}, not 99"
+    assert difference(CONFIG, dataclasses.replace(CONFIG, validation=0.1)) == "validation: 0.0, not 0.1"
+    settings = changed(CONFIG.settings, {"optim": {"batch": 99}})
+    changed_batch = difference(CONFIG, dataclasses.replace(CONFIG, settings=settings))
+    assert changed_batch == f"settings.optim.batch: {CONFIG.settings.optim.batch}, not 99"
 
 
-def test_every_setting_counts_in_a_difference():
+@pytest.mark.parametrize("field", field_names())
+def test_every_setting_counts_in_a_difference(field):
     """A resumed run must not silently go on with other settings, whichever they are."""
-    values = to_dict(CONFIG.settings)
-    for section, fields in values.items():
-        for name, value in fields.items():
-            other = {**values, section: {**fields, name: not value if isinstance(value, bool) else (value, "other")}}
-            changed = dataclasses.replace(CONFIG, settings=unchecked(other))
-            assert difference(CONFIG, changed).startswith(f"settings.{section}.{name}: "), (section, name)
+    config = dataclasses.replace(CONFIG, field=field, settings=get_field(field).presets["smoke"])
+    for section, part in sections(config.settings, field).items():
+        for setting in dataclasses.fields(part):
+            value = getattr(part, setting.name)
+            other = not value if isinstance(value, bool) else (value, "other")
+            attribute = "field" if section == field else section
+            settings = unchecked(config.settings, **{attribute: unchecked(part, **{setting.name: other})})
+            found = difference(config, dataclasses.replace(config, settings=settings))
+            assert found.startswith(f"settings.{section}.{setting.name}: "), (section, setting.name)
 
 
-def unchecked(values):
-    """`from_dict` without looking at types."""
-    sections = {name: object.__new__(type(getattr(Settings(), name))) for name in values}
-    for name, section in sections.items():
-        for key, value in values[name].items():
-            object.__setattr__(section, key, value)
-    settings = object.__new__(Settings)
-    for name, section in sections.items():
-        object.__setattr__(settings, name, section)
-    return settings
+def unchecked(value, **changes):
+    """`dataclasses.replace` without looking at types."""
+    made = object.__new__(type(value))
+    for field in dataclasses.fields(value):
+        object.__setattr__(made, field.name, changes.get(field.name, getattr(value, field.name)))
+    return made
 
 
-def test_settings_survive_a_dictionary():
-    settings = tiny_settings(wideband={"relative": False}, optim={"means_lr": 1 / 3})
-    assert from_dict(json.loads(json.dumps(to_dict(settings)))) == settings
+def test_a_folder_belongs_to_one_run(tmp_path):
+    """It is made, or it is the run's own and to be resumed; anything else in it stays as it is."""
+    prepare_folder(tmp_path / "run", CONFIG, resume=False)
+    assert read_config(tmp_path / "run") == CONFIG
+    prepare_folder(tmp_path / "run", CONFIG, resume=True)
+    with pytest.raises(UserError, match="already holds this run; add --resume"):
+        prepare_folder(tmp_path / "run", CONFIG, resume=False)
+    with pytest.raises(UserError, match=r"another configuration \(seed: 3, not 4\)"):
+        prepare_folder(tmp_path / "run", dataclasses.replace(CONFIG, seed=4), resume=True)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="holds other files"):
+        prepare_folder(tmp_path / "other", CONFIG, resume=True)
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["notes.txt"]
 
 
-def test_the_skeleton_of_parameters_has_the_shapes_of_real_ones():
-    settings = tiny_settings()
-    surface = jax.tree.map(jnp.asarray, make_surface(tiny_dataset(), 20, seed=0))
-    params = jax.jit(wideband.init, static_argnums=(2, 3))(jax.random.key(0), surface, settings.wideband, 32)
-    assert wideband.sizes(params) == {"gaussians": 32}
-    abstract = wideband.skeleton(settings.wideband, {"gaussians": 32})
-    assert jax.tree.structure(abstract) == jax.tree.structure(params)
-    for a, b in zip(jax.tree.leaves(abstract), jax.tree.leaves(params), strict=True):
-        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+def test_a_trained_field_is_the_one_that_was_saved(tmp_path):
+    """Parameters and what never changes, without the data: they may be gone."""
+    folder = make_run(tmp_path / "box")
+    folder.with_suffix(".npz").unlink()
+    trained = load_trained(folder)
+    assert (trained.step, trained.seconds) == (STEP, 1.0)
+    assert trained.origin() == {"field": "wideband", "preset": "smoke", "seed": 0, "step": STEP}
+    for own, expected in ((trained.params, make_params()), (trained.field, make_field())):
+        assert jax.tree.structure(own) == jax.tree.structure(expected)
+        for x, y in zip(jax.tree.leaves(own), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(x, y)
+            assert x.dtype == y.dtype
+    with pytest.raises(UserError, match=r"box\.npz"):
+        trained.dataset()
+
+
+def test_a_checkpoint_of_other_settings_does_not_fit(tmp_path):
+    folder = make_run(tmp_path / "box")
+    settings = tiny_settings(field={"width": 16})
+    write_config(folder, dataclasses.replace(read_config(folder), settings=settings))
+    with pytest.raises(UserError, match="does not fit this configuration"):
+        load_trained(folder)

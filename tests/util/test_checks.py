@@ -8,12 +8,22 @@ import pytest
 
 import wbgs_jax as wb
 
+CONFIG = wb.WidebandConfig(width=8, depth=2)
+LIMITS = wb.TileLimits(entries=4096, jobs=1024)
+
 
 @pytest.fixture(scope="module")
 def field():
     points = np.random.default_rng(0).uniform([-3, -3, 0], [3, 3, 3], (60, 3))
-    params = wb.wideband.init(jax.random.key(0), wb.surface_from_points(points), wb.WidebandConfig(width=8, depth=2))
-    return params, wb.wideband.plan(params, wb.make_receiver([0.0, 0.0, 1.0]))
+    return wb.wideband.make_field(wb.surface_from_points(points), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def planned(field):
+    """Parameters of 64 slots and their plan, by their shapes alone: the door is in front of everything that computes."""
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    receiver = wb.make_receiver([0.0, 0.0, 1.0])
+    return params, jax.eval_shape(lambda params: field.plan(params, receiver, LIMITS), params)
 
 
 @pytest.fixture(autouse=True)
@@ -48,30 +58,49 @@ def no_type_checks():
         (np.full((1, 3), np.nan, np.float32), np.full(1, 1e9, np.float32), ValueError, "in metres"),
     ],
 )
-def test_a_wrong_query_is_refused(field, tx, frequency, error, message):
+def test_a_wrong_query_is_refused(planned, tx, frequency, error, message):
     with pytest.raises(error, match=message):
-        wb.wideband.render(*field, wb.Query(jnp.asarray(tx), jnp.asarray(frequency)))
+        wb.wideband.render(*planned, wb.Query(jnp.asarray(tx), jnp.asarray(frequency)))
 
 
-def test_shapes_are_checked_under_jit_too(field):
+def test_the_other_fields_have_the_same_door(planned):
+    """A wrong query is refused before anything of the field is looked at."""
+    query = wb.Query(jnp.zeros((2, 3)), jnp.full(2, 2.4))
+    for field in (wb.wave, wb.nerf2):
+        with pytest.raises(ValueError, match="in hertz"):
+            field.render(None, None, query)
+
+
+def test_shapes_are_checked_under_jit_too(planned):
     with pytest.raises(ValueError, match="tx_position has shape"):
-        jax.jit(wb.wideband.render)(*field, wb.Query(jnp.zeros((4, 2)), jnp.full(4, 1e9)))
+        jax.eval_shape(jax.jit(wb.wideband.render), *planned, wb.Query(jnp.zeros((4, 2)), jnp.full(4, 1e9)))
 
 
-def test_a_wrong_receiver_is_refused(field):
+def test_a_wrong_receiver_is_refused(field, planned):
+    params, _ = planned
+    elements, isotropic = jnp.zeros((1, 3)), jnp.zeros(())
     with pytest.raises(ValueError, match=r"receiver.position has shape \(2,\)"):
-        wb.wideband.plan(field[0], wb.Receiver(jnp.zeros(2), jnp.ones(4), jnp.zeros((1, 3))))
-    zero = wb.Receiver(jnp.zeros(3), jnp.zeros(4), jnp.zeros((1, 3)))
+        field.plan(params, wb.Receiver(jnp.zeros(2), jnp.ones(4), elements, isotropic))
     with pytest.raises(ValueError, match="zero length"):
-        wb.wideband.plan(field[0], zero)
+        field.plan(params, wb.Receiver(jnp.zeros(3), jnp.zeros(4), elements, isotropic))
+    three = wb.Receiver(jnp.zeros((3, 3)), jnp.ones((3, 4)), jnp.zeros((3, 1, 3)), jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"receiver.position has shape \(3, 3\); expected \(3,\)"):
+        field.plan(params, three)
 
 
-def test_wrong_attenuation_is_refused(field):
-    _, plan = field
-    with pytest.raises(ValueError, match=r"attenuation has shape \(59, 1\); expected \(60, b\)"):
+def test_a_wrong_surface_is_refused():
+    with pytest.raises(ValueError, match=r"surface.points has shape \(5, 2\)"):
+        wb.wideband.make_field(wb.Surface(jnp.zeros((5, 2)), jnp.ones(5)), CONFIG)
+    with pytest.raises(ValueError, match=r"surface.spacing has shape \(4,\); expected \(5,\)"):
+        wb.wideband.make_field(wb.Surface(jnp.zeros((5, 3)), jnp.ones(4)), CONFIG)
+
+
+def test_wrong_attenuation_is_refused(planned):
+    _, plan = planned
+    with pytest.raises(ValueError, match=r"attenuation has shape \(59, 1\); expected \(64, b\)"):
         wb.render_splats(plan.geometry, jnp.zeros((59, 1)), jnp.zeros((59, 1)))
     with pytest.raises(ValueError, match="signal has shape"):
-        wb.render_splats(plan.geometry, jnp.zeros((60, 2)), jnp.zeros((60, 1)))
+        wb.render_splats(plan.geometry, jnp.zeros((64, 2)), jnp.zeros((64, 1)))
 
 
 def test_make_query_broadcasts_one_frequency():

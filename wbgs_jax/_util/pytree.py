@@ -71,7 +71,7 @@ def with_leaves(tree: T, *leaves: Any) -> T:
 
 
 def replaced(tree: T, **values: Any) -> T:
-    """Returns a `pytree` with other values in some fields, like `dataclasses.replace` but of any kind: names, masks, markers."""
+    """Returns a `pytree` with other values in some fields, as `dataclasses.replace` does, but of any kind: names, markers."""
     new = object.__new__(type(tree))
     for f in dataclasses.fields(tree):  # type: ignore[arg-type]
         object.__setattr__(new, f.name, values.get(f.name, getattr(tree, f.name)))

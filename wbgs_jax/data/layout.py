@@ -4,8 +4,7 @@
     tx_pos.csv                   header x,y,z; row k belongs to image k, both counted from 1; metres
     gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]
     freq.txt                     optional: one frequency (GHz) a spectrum
-    train_index.txt, test_index.txt   optional: image names without .png, zero-padded or not
-    validation_index.txt         optional, beside the two others
+    train_, test_index.txt       optional: image names without .png, zero-padded or not; beside them validation_index.txt
     point_cloud.ply              optional: the surface
 
 Frames: transmitters and receiver share the world frame. The mesh is z-up while that frame is y-up: a mesh point (x, y, z)
@@ -64,9 +63,8 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
     positions = _read_positions(folder / POSITIONS, len(images))
     name, receiver, gateway_hz = _read_gateway(folder / GATEWAY)
     tx_index = group_transmitters(positions)
-    vertices, faces = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-    if (folder / MESH).exists():
-        vertices, faces = read_ply(folder / MESH)
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
+    vertices, faces = read_ply(folder / MESH) if (folder / MESH).exists() else nothing
     if any((folder / name).exists() for name in INDEX.values()):
         split = _read_split(folder, tx_index)
     else:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas, steering_vector
-from wbgs_jax.data.dataset import Dataset
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas, steering_vector
 from wbgs_jax.radio.geometry import to_local
 
 Baseline = Callable[[Int[np.ndarray, "b"]], Float[np.ndarray, "b 90 360"]]

@@ -67,7 +67,9 @@ def score_power(
         raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
     error = np.abs(predicted.astype(np.float64) - truth)
     if not np.isfinite(error).all():
-        raise UserError(f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged")
+        raise UserError(
+            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged"
+        )
 
     def summary(chosen: np.ndarray) -> dict[str, Any]:
         return {"n": len(chosen), "power_error_db": float(np.median(chosen))}

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
-from wbgs_jax.evaluation import metrics
-from wbgs_jax.data.dataset import Dataset
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.evaluation import metrics
 
 SHOWN = 6
 """Spectra in a picture."""

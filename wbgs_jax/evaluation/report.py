@@ -10,7 +10,6 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax.config import to_dict
-from wbgs_jax.inference.predictor import Trained
 
 
 def environment() -> dict[str, Any]:

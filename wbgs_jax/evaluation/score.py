@@ -1,10 +1,10 @@
 """How good a trained field is on held-out links: figures of every kind that field and data have, beside the baselines."""
 
 import time
-from collections.abc import Mapping
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
@@ -20,9 +20,7 @@ Part = Literal["test", "validation"]
 """What is held out: for the final figures, or for choices."""
 
 
-def evaluate(
-    trained: Trained, dataset: Dataset, part: Part = "test"
-) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
+def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
     Raises:
@@ -49,7 +47,7 @@ def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
 
 
 def figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any]:
-    """Returns the figures of observed links: of spectra, of snapshots where both have them, of power where it is all there is."""
+    """Returns the figures of observed links: of spectra, snapshots where both have them, power where it is all there is."""
     frequencies = dataset.frequencies_hz[index]
     if dataset.kind == "power":
         if seen.power_db is None or dataset.power_db is None:
@@ -61,18 +59,17 @@ def figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) ->
     return report
 
 
-def score_snapshots(
-    predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]
-) -> dict[str, float]:
+def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
     """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB)."""
-    error = np.abs(np.asarray(channel.received_power_db(predicted)) - np.asarray(channel.received_power_db(truth)))
+    a, b = jnp.asarray(truth), jnp.asarray(predicted)
+    error = jnp.abs(channel.received_power_db(b) - channel.received_power_db(a))
     return {
-        "snapshot_correlation": float(np.median(np.asarray(channel.correlation(truth, predicted)))),
-        "power_error_db": float(np.median(error)),
+        "snapshot_correlation": float(jnp.median(channel.correlation(a, b))),
+        "power_error_db": float(jnp.median(error)),
     }
 
 
-def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Mapping[str, float]:
+def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     if dataset.kind == "power":

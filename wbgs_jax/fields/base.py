@@ -75,6 +75,7 @@ class Field(ABC):
     @classmethod
     def check(cls, config: Any) -> None:
         """Raises a `UserError` for settings that cannot work."""
+        return
 
     @classmethod
     def make(cls, config: Any, scene: Scene, seed: int) -> "Field":
@@ -110,16 +111,15 @@ class Field(ABC):
         """Returns zeros that `loss` adds where a host control wants to know the gradient; nothing by default."""
         return ()
 
-    def loss(
-        self, params: Any, cache: Any, batch: Batch, limits: Any = None, probe: Any = ()
-    ) -> tuple[Float[Array, ""], Aux]:
+    def loss(self, params: Any, cache: Any, batch: Batch, limits: Any = None, probe: Any = ()) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of a batch. By default it compares spectra, and power where the data have nothing else."""
         plan = self.plan(params, batch.receiver, limits, cache)
         seen = self.render_links(params, plan, cache, batch.links)
         return compare(seen, batch)
 
     def limits(self, params: Any, receivers: Receiver) -> Any:
-        """Returns the static sizes that planning needs under jit, hashable, with room to grow (host); None if it needs none."""
+        """Returns the static sizes that planning needs under jit, with room to grow (host): a frozen dataclass of numbers, which
+        checkpoints keep; None if it needs none."""
         return None
 
     def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:
@@ -207,7 +207,9 @@ def default_field() -> str:
     return "wideband"
 
 
-def with_field(presets: Mapping[str, Settings], configs: Mapping[str, Any], **sections: Mapping[str, Any]) -> dict[str, Settings]:
+def with_field(
+    presets: Mapping[str, Settings], configs: Mapping[str, Any], **sections: Mapping[str, Any]
+) -> dict[str, Settings]:
     """Returns presets with a field's settings in them, and other sections where given, by preset."""
     return {
         name: dataclasses.replace(base, field=configs[name], **{key: values[name] for key, values in sections.items()})

@@ -14,14 +14,14 @@ FrequencyScale = Literal["log", "ghz"]
 
 
 def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "*n d_out"]:
-    """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), the input included: d_out = d (1 + 2 octaves)  (NeRF, equation 4)."""
+    """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), input included: d_out = d (1 + 2 octaves)  (NeRF, equation 4)."""
     scaled = x[..., None, :] * (2.0 ** jnp.arange(octaves, dtype=x.dtype))[:, None]
     waves = jnp.concatenate([jnp.sin(scaled), jnp.cos(scaled)], -2)
     return jnp.concatenate([x, waves.reshape((*x.shape[:-1], -1))], -1)
 
 
 def scale_frequency(frequency_hz: Float[Array, "*n"], scale: FrequencyScale = "log") -> Float[Array, "*n"]:
-    """Returns a frequency as a network input: "log" maps 1..100 GHz to -1..1 on a logarithmic scale, "ghz" is the raw number of GHz."""
+    """Returns a frequency as a network input: "log" maps 1..100 GHz to -1..1 by its logarithm, "ghz" gives raw gigahertz."""
     if scale == "ghz":
         return frequency_hz / 1e9
     middle = 0.5 * (math.log(MIN_FREQUENCY_HZ) + math.log(MAX_FREQUENCY_HZ))

@@ -31,14 +31,14 @@ def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
 
 
 def _blur(images: Float[Array, "*n h w"]) -> Float[Array, "*n h_valid w_valid"]:
-    """Returns the separable Gaussian blur as two matrix products: forward and backward 16-30 times faster than convolutions or shifted
-    sums on a CPU. Full precision: variances are differences of large numbers."""
+    """Returns the separable Gaussian blur as two matrix products: forward and backward 16-30 times faster than convolutions or
+    shifted sums on a CPU. Full precision: variances are differences of large numbers."""
     rows, columns = (jnp.asarray(_blur_matrix(n), images.dtype) for n in images.shape[-2:])
     return jnp.matmul(jnp.matmul(rows, images, precision=EXACT), columns.T, precision=EXACT)
 
 
 def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"]) -> Float[Array, "*n"]:
-    """Returns the differentiable mean SSIM of images with a data range of 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
+    """Returns the differentiable mean SSIM of images, data range 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
     mean_a, mean_b = _blur(a), _blur(b)
     var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
     covariance = _blur(a * b) - mean_a * mean_b
@@ -59,9 +59,7 @@ def snapshot_losses(
     return jnp.mean(1 - squared_correlation), jnp.mean((0.5 * jnp.log(power)) ** 2)
 
 
-def log_decorrelation(
-    predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
-) -> Float[Array, "*n"]:
+def log_decorrelation(predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]) -> Float[Array, "*n"]:
     """Returns log(1 - correlation^2): the log-likelihood, up to its sign, where every snapshot has a noise of its own, unknown
     level. No match is perfect (`GOOD_MATCH`)."""
     squared_correlation, _ = _correlation_and_power(predicted, truth)

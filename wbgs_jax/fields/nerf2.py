@@ -68,9 +68,7 @@ class Nerf2Config:
 CONFIGS = {
     "smoke": Nerf2Config(samples=8, directions=64, width=32, depth=3, radiance_widths=(32,)),
     "cpu": Nerf2Config(),
-    "gpu": Nerf2Config(
-        samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128), network_lr=8e-4
-    ),
+    "gpu": Nerf2Config(samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128), network_lr=8e-4),
 }
 Weights = dict[str, Any]
 """What is trained: the two networks."""

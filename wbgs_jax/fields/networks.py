@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Parts = Sequence[Float[Array, "... _"]]
@@ -36,7 +37,7 @@ class PartwiseDense(nn.Module):
         """
         init = nn.initializers.normal(stddev=(2.0 / sum(part.shape[-1] for part in parts)) ** 0.5)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
-        total = bias if total is None else total
+        total = bias if total is None else jnp.asarray(total)
         for i, part in enumerate(parts, first):
             kernel = self.param(f"kernel_{i}", init, (part.shape[-1], self.features))
             # On two axes: XLA's CPU backend takes the kernel's gradient three times faster than on three.

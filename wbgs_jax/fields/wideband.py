@@ -1,114 +1,50 @@
 """The paper's model: frequency-embedded 3D Gaussians splatted onto the receiver's hemisphere (paper, section 4).
 
-    delta, Sig = F(P(G), P(TX), f)      the EM feature networks (networks.py), one pair a Gaussian and query
+    delta, Sig = F(P(G), P(TX), f)      the EM feature networks (em_features.py), one pair a Gaussian and query
     PAS(p)     = sum_i T_i delta_i G_i(p) Sig_i    the splatting of splat/
 
 Neither the geometry nor what the networks make of a Gaussian alone depends on the query: both are planned once.
 """
 
 import dataclasses
-from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
-from wbgs_jax.config import PRESETS, DensityConfig, check_positive, check_share
+from wbgs_jax.config import PRESETS, check_positive, check_share
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, with_field
-from wbgs_jax.fields.encoding import FrequencyScale, check_octaves, frequency_encoding, positional_encoding
-from wbgs_jax.fields.networks import (
-    AttenuationNetwork,
-    GaussianSums,
-    RadianceNetwork,
-    attenuation_activation,
-    signal_activation,
+from wbgs_jax.fields.em_features import (
+    MAX_ATTENUATION,
+    RELATIVE_FEATURES,
+    Frame,
+    GaussianFeatures,
+    gaussian_features,
+    make_networks,
+    query_features,
 )
-from wbgs_jax.radio.array import EXACT, array_response, steering_vector
-from wbgs_jax.radio.geometry import Projection, smooth_length, to_local
+from wbgs_jax.fields.encoding import check_octaves, frequency_encoding, positional_encoding
+from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
-from wbgs_jax.types import Batch, Gaussians, Query, Receiver, Scene, Surface, SurfaceSampling, check_query, check_receiver, check_surface
+from wbgs_jax.types import (
+    Batch,
+    Gaussians,
+    Query,
+    Receiver,
+    Scene,
+    Surface,
+    check_query,
+    check_receiver,
+    check_surface,
+)
 
-MAX_ATTENUATION = 0.99
 INITIAL_ATTENUATION = 0.3
 TILE_SLACK = 1.4
 """Room in the tile lists for footprints that grow during training."""
-
-
-@dataclasses.dataclass(frozen=True)
-class WidebandConfig:
-    """Settings of the paper's field."""
-
-    gaussians: int = 2000
-    """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
-    sampling: SurfaceSampling = "solid_angle"
-    """Spread them evenly over the receiver's directions, or over the area of the surface."""
-    width: int = 64
-    """Units of the attenuation network's layers (authors: 128)."""
-    depth: int = 4
-    """Layers of the attenuation network (authors: 8)."""
-    skip: int = 2
-    """The layer at which the inputs enter again (authors: 4)."""
-    fusion: int = 1
-    """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
-    all queries. 0: the paper's form."""
-    radiance_widths: tuple[int, ...] = (64, 32)
-    """Units of the radiance network's layers (authors: 128, 64)."""
-    gaussian_octaves: int = 6
-    """Octaves of P(G) (authors: 10)."""
-    tx_octaves: int = 4
-    """Octaves of P(TX) (authors: 10)."""
-    frequency_octaves: int = 0
-    """Octaves of the frequency encoding, beyond the scaled frequency itself (authors: 10; more than none fail between the
-    frequencies that were trained)."""
-    frequency_scale: FrequencyScale = "log"
-    """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
-    relative: bool = True
-    """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
-    attenuation_frequency: bool = True
-    """Frequency embedding of the attenuation network (paper, Table 3)."""
-    radiance_frequency: bool = True
-    """Frequency embedding of the radiance network (paper, Table 3)."""
-    projection: Projection = "hemisphere"
-    """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
-    ssim_weight: float = 0.2
-    """lambda of the paper's equation 5."""
-    network_lr: float = 4e-3
-    """Learning rate of the networks (authors: 8e-4)."""
-    network_weight_decay: float = 0.0
-    """Decoupled weight decay of the networks."""
-    means_lr: float = 1e-3
-    """Learning rate of the centres: metres a step, about. (Authors: 0 in effect; their spatial scale multiplies it away.)"""
-    log_scales_lr: float = 5e-3
-    """Learning rate of the logarithms of the standard deviations."""
-    quats_lr: float = 1e-3
-    """Learning rate of the rotations."""
-    opacity_lr: float = 2.5e-2
-    """Learning rate of delta_o."""
-
-
-CONFIGS = {
-    "smoke": WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
-    "cpu": WidebandConfig(),
-    # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
-    "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64), network_lr=8e-4),
-}
-DENSITY = {
-    "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
-    "cpu": DensityConfig(),
-    "gpu": DensityConfig(max_gaussians=100_000, reset_every=3000),
-}
-
-
-@pytree
-class Frame:
-    """Maps world positions to network inputs of about unit size. Set once from the surface, never trained."""
-
-    centre: Float[Array, "3"]
-    half_extent: Float[Array, ""]
 
 
 @pytree
@@ -117,20 +53,6 @@ class WidebandParams:
 
     gaussians: Gaussians
     networks: dict[str, Any]
-
-
-@pytree
-class GaussianFeatures:
-    """What the networks' inputs need of every Gaussian, whatever is asked."""
-
-    sums: GaussianSums
-    """What the attenuation network's layers make of P(G)."""
-    direction: Float[Array, "n 3"]
-    """Unit vectors from the receiver to the Gaussians, receiver's frame."""
-    back: Float[Array, "n 3"]
-    """Unit vectors from the Gaussians to the receiver, world frame."""
-    steering: Complex[Array, "n elements"] | None
-    """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
 
 
 @pytree
@@ -181,7 +103,9 @@ class WidebandField(Field):
         neighbours, in slots that leave density control some room, and random networks."""
         return _init(self, key)
 
-    def plan(self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None) -> WidebandPlan:
+    def plan(
+        self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None
+    ) -> WidebandPlan:
         """Returns the projected and sorted Gaussians, and what the networks make of them alone.
 
         Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
@@ -195,7 +119,8 @@ class WidebandField(Field):
         check_receiver(receiver)
         geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
-        return WidebandPlan(geometry, gaussian_features(params, frame, receiver, self.config), frame, receiver, self.config)
+        features = gaussian_features(params.gaussians.means, params.networks, frame, receiver, self.config)
+        return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
         """Returns the spectra of B queries."""
@@ -222,11 +147,11 @@ class WidebandField(Field):
             receiver = jax.tree.map(lambda leaf, i=i: leaf[i], receivers)
             jobs = geometry_plan(params.gaussians, receiver, None, self.config.projection).jobs
             required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
-        return fit_limits(*required.tolist(), TILE_SLACK)
+        return fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
 
     def grow(self, limits: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
         """Returns limits that hold the required entries and jobs, and no less than before."""
-        grown = fit_limits(*(int(n) for n in required), TILE_SLACK)
+        grown = fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
         return TileLimits(max(grown.entries, limits.entries), max(grown.jobs, limits.jobs))
 
     def portable(self, plan: WidebandPlan) -> WidebandPlan:
@@ -255,7 +180,9 @@ class WidebandField(Field):
         return with_leaves(params, "means", "log_scales", "quats", "opacity_logits", *networks)
 
 
-def make_field(surface: Surface, config: WidebandConfig | None = None, cls: type[WidebandField] = WidebandField) -> WidebandField:
+def make_field(
+    surface: Surface, config: WidebandConfig | None = None, cls: type[WidebandField] = WidebandField
+) -> WidebandField:
     """Returns the field whose Gaussians start on surface points; raises for points of another shape."""
     check_surface(surface)
     low, high = surface.points.min(0), surface.points.max(0)
@@ -313,69 +240,6 @@ def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Ar
 def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
     4.5)."""
-    attenuation, radiance = make_networks(plan.config)
-    features = plan.features or gaussian_features(params, plan.frame, plan.receiver, plan.config)
-    both, frequency = _query_inputs(params.gaussians.means, features, plan, query)
-    outputs: Any = attenuation.apply(params.networks["attenuation"], features.sums, both, method="of_queries")
-    hidden, delta_f = outputs
-    signal: Any = radiance.apply(params.networks["radiance"], [hidden, *frequency])
-    delta = attenuation_activation(params.gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
-    return delta, signal_activation(signal)
-
-
-def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
-    """Returns the EM feature networks."""
-    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion)
-    return attenuation, RadianceNetwork(config.radiance_widths)
-
-
-def gaussian_features(params: WidebandParams, frame: Frame, receiver: Receiver, config: WidebandConfig) -> GaussianFeatures:
-    """Returns what the networks' inputs need of every Gaussian, whatever is asked."""
-    means = params.gaussians.means
-    encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)[:, None, :]
-    sums: Any = make_networks(config)[0].apply(params.networks["attenuation"], [encoded], method="gaussian_sums")
-    direction = to_local(means - receiver.position, receiver.orientation)
-    direction = direction / smooth_length(direction)
-    back = receiver.position - means
-    fixed = receiver.unit == "wavelengths"
-    steering = steering_vector(receiver.element_positions, direction) if fixed else None
-    return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
-
-
-def _query_inputs(
-    means: Float[Array, "n 3"], features: GaussianFeatures, plan: WidebandPlan, query: Query
-) -> tuple[list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
-    """Returns the encoded inputs that depend on the query: those of the attenuation network, and the frequency for the radiance
-    network (nothing if it is switched off)."""
-    config, frame = plan.config, plan.frame
-    scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
-    both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
-    if config.relative:
-        both.append(_relative_features(means, features, plan.receiver, query, frame.half_extent))
-    encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
-    if config.attenuation_frequency:
-        both.append(encoded)
-    return both, [encoded] if config.radiance_frequency else []
-
-
-RELATIVE_FEATURES = 7
-
-
-def _relative_features(
-    means: Float[Array, "n 3"], features: GaussianFeatures, receiver: Receiver, query: Query, size: Float[Array, ""]
-) -> Float[Array, "n b 7"]:
-    """Returns functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
-
-    The angle between Gaussian and TX as the receiver sees it, the array's response to the TX in the Gaussian's direction (the
-    line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
-    """
-    to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
-    to_tx = to_tx / smooth_length(to_tx)
-    elements = receiver.element_wavelengths(query.frequency_hz)
-    response = array_response(elements, features.direction, to_tx, features.steering)
-    leg = query.tx_position[None] - means[:, None]
-    distance = smooth_length(leg)
-    direction = leg / distance
-    bounce = jnp.sum(direction * features.back[:, None], -1)
-    scalars = jnp.stack([jnp.matmul(features.direction, to_tx.T, precision=EXACT), response, bounce], -1)
-    return jnp.concatenate([scalars, distance / size, direction], -1)
+    known = plan.frame, plan.receiver, plan.config
+    features = plan.features or gaussian_features(params.gaussians.means, params.networks, *known)
+    return query_features(params.gaussians, params.networks, features, *known, query)

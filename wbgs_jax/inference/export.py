@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import wbgs_jax
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.predictor import Predictor, Trained, on_any_shape, trained_band
 from wbgs_jax.types import Query, Receiver
 

@@ -24,8 +24,15 @@ Predictor = Callable[[Any, Any], Array]
 class Trained(Protocol):
     """A field with parameters, and the data it was trained on (`training.run_folder.TrainedField`)."""
 
-    field: Field
-    params: Any
+    @property
+    def field(self) -> Field:
+        """The field."""
+        ...
+
+    @property
+    def params(self) -> Any:
+        """Its parameters."""
+        ...
 
     def dataset(self) -> Dataset:
         """Returns the data."""
@@ -94,7 +101,7 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
             seen = _observe(field, params, plan, cache, jax.tree.map(lambda leaf, i=filled: leaf[i], links))
             total = _like(seen, len(index)) if total is None else total
             _put(total, block, seen)
-    return total if total is not None else Observation(np.zeros((0, *PAS_SHAPE), np.float32))
+    return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
 
 
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:

@@ -92,21 +92,29 @@ def areas(facets: Facets) -> Float[np.ndarray, "f"]:
 
 def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "v"]]:
     """Returns the corners without duplicates, and the new index of every vertex."""
-    pairs = cKDTree(vertices).query_pairs(WELD, output_type="ndarray")
-    index = _components(len(vertices), pairs[:, 0], pairs[:, 1])
+    different, which = np.unique(vertices, axis=0, return_inverse=True)  # at once: pairs of equal ones may be many
+    pairs = cKDTree(different).query_pairs(WELD, output_type="ndarray")
+    index = _components(len(different), pairs[:, 0], pairs[:, 1])[which.reshape(-1)]
     _, first = np.unique(index, return_index=True)
     return vertices[first], index
 
 
 def _components(count: int, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"]) -> Int[np.ndarray, "nodes"]:
     """Returns which connected component each of `count` nodes is in; components are numbered by their first nodes."""
-    joined = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    ends = first.astype(np.int32), second.astype(np.int32)  # wider indices are not for every SciPy's graphs
+    joined = coo_array((np.ones(len(first), bool), ends), shape=(count, count))
     return connected_components(joined, directed=False)[1]
 
 
 def _sides(triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "sides 2"]:
     """Returns the three sides of every triangle, the smaller corner first."""
     return np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+
+
+def _names(owner: Int[np.ndarray, "n"], sides: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+    """Returns one integer for every side of an owner: equal for equal ones."""
+    corners = int(sides.max(initial=0)) + 1
+    return (owner.astype(np.int64) * corners + sides[:, 0]) * corners + sides[:, 1]
 
 
 def _bodies(
@@ -119,10 +127,10 @@ def _bodies(
     """
     pieces, piece = np.unique(np.stack([part, material], 1), axis=0, return_inverse=True)
     piece, sides = piece.reshape(-1), _sides(triangles)
-    proper = sides[:, 0] != sides[:, 1]
-    rows, count = np.unique(np.column_stack([np.repeat(piece, 3), sides])[proper], axis=0, return_counts=True)
-    border = rows[count % 2 == 1]
-    owner, corner = np.repeat(border[:, 0], 2), border[:, 1:].reshape(-1)
+    owner = np.repeat(piece, 3)
+    _, first, count = np.unique(_names(owner, sides), return_index=True, return_counts=True)
+    border = first[(count % 2 == 1) & (sides[first, 0] != sides[first, 1])]
+    owner, corner = np.repeat(owner[border], 2), sides[border].reshape(-1)
     _, shared = np.unique(np.column_stack([pieces[owner, 1], corner]), axis=0, return_inverse=True)
     # A graph whose nodes are the parts, and behind them the corners of borders, one for each material that meets there.
     label = _components(len(pieces) + len(owner), owner, len(pieces) + shared.reshape(-1))
@@ -155,10 +163,9 @@ def _coplanar(
     triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]
 ) -> list[Int[np.ndarray, "k"]]:
     """Returns the triangles of one body that share sides and a plane, as groups of indices."""
-    named = np.column_stack([np.repeat(body, 3), _sides(triangles)])
-    _, first, which = np.unique(named, axis=0, return_index=True, return_inverse=True)
+    _, first, which = np.unique(_names(np.repeat(body, 3), _sides(triangles)), return_index=True, return_inverse=True)
     owner = np.repeat(np.arange(len(triangles)), 3)
-    other = owner[first[which.reshape(-1)]]
+    other = owner[first[which]]
     flat = _parallel(normal[owner], normal[other])
     label = _components(len(triangles), owner[flat], other[flat])
     by_group = np.argsort(label, kind="stable")

@@ -78,15 +78,14 @@ def array_response(
 
 
 def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m elements"]) -> Float[Array, "*nm"]:
-    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and every steering vector: shape (*n, *m)."""
+    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and steering vector: shape (*n, *m)."""
     return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]], precision=EXACT))
 
 
 def snapshot_to_pas(
     snapshot: Complex[Array, "*n elements"], element_positions: Float[Array, "elements 3"] | Float[Array, "n elements 3"]
 ) -> Float[Array, "*n 90 360"]:
-    """Returns the power angular spectra, each scaled to a maximum of 1, of complex array snapshots. A zero snapshot gives a zero
-    PAS.
+    """Returns the power angular spectra, each scaled to a maximum of 1, of complex array snapshots; zeros for a zero snapshot.
 
     Element positions are in wavelengths: the same for all snapshots, or those of each of n (an array of fixed size in metres).
     """

@@ -44,7 +44,7 @@ def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "
 
 
 def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the power of the best conventional beam over that of one element (dB, at most 10 log10 of the number of elements).
+    """Returns the power of the best conventional beam over that of one element (dB, at most 10 log10 of the elements' number).
 
     `peak` is the largest |a^H y| over all directions.
     """
@@ -69,7 +69,7 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
 
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for a snapshot of nothing."""
+    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for one of nothing."""
     norm_a, norm_b = (jnp.sqrt(jnp.sum(squared_magnitude(v), -1)) for v in (a, b))
     product = jnp.sqrt(squared_magnitude(jnp.sum(a.conj() * b, -1)))
     return product / jnp.where(norm_a * norm_b > 0, norm_a * norm_b, 1)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.footprint import footprint, mahalanobis2, windowed_exponential
+from wbgs_jax.splat.reverse_mode import not_differentiable, reverse_mode_only, reworded
 from wbgs_jax.splat.tiles import CHUNK, N_TILES, TILE_COLUMNS, TILE_HEIGHT, TILE_ROWS, TILE_WIDTH, TileJobs
 
 TILE_PIXELS = TILE_HEIGHT * TILE_WIDTH
@@ -44,18 +45,12 @@ def composite(
     Differentiable once, in reverse mode, with respect to the four float arguments.
 
     Raises:
-        TypeError: forward-mode differentiation, which the hand-written backward pass does not allow.
+        TypeError: forward-mode differentiation or a second derivative, which the hand-written backward pass does not allow;
+            of a jitted function when it is compiled, from `jax.linearize` when its result is called.
     """
-    geometry = jnp.concatenate([means2d, conics], -1)
-    try:
-        tiles = lax.platform_dependent(geometry, attenuation, signal, jobs, cpu=_by_tiles, default=_by_jobs)
-    except TypeError as error:
-        if "custom_vjp" not in str(error):
-            raise
-        raise TypeError(
-            "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, "
-            "jax.jacfwd or jax.linearize, and no second derivatives"
-        ) from error
+    own = map(reverse_mode_only, (jnp.concatenate([means2d, conics], -1), attenuation, signal))
+    with reworded():
+        tiles = lax.platform_dependent(*own, jobs, cpu=_by_tiles, default=_by_jobs)
     grid = tiles.reshape(TILE_ROWS, TILE_COLUMNS, -1, TILE_HEIGHT, TILE_WIDTH)
     return grid.transpose(2, 0, 3, 1, 4).reshape(-1, PAS_HEIGHT, PAS_WIDTH)
 
@@ -200,7 +195,8 @@ def _by_tiles_fwd(geometry, attenuation, signal, jobs):
 
 
 def _by_tiles_bwd(residuals, cotangent):
-    geometry, attenuation, signal, jobs, image = residuals
+    jobs, image = residuals[3:]
+    geometry, attenuation, signal = map(not_differentiable, residuals[:3])
 
     def group_bwd(total, tiles):
         own = cotangent[tiles]
@@ -281,7 +277,8 @@ def _by_jobs_fwd(geometry, attenuation, signal, jobs):
 
 
 def _by_jobs_bwd(residuals, cotangent):
-    geometry, attenuation, signal, jobs, image, (prefix_t, prefix_image) = residuals
+    jobs, image, (prefix_t, prefix_image) = residuals[3:]
+    geometry, attenuation, signal = map(not_differentiable, residuals[:3])
 
     def group_bwd(gaussian, tile, transmittance, front):
         slots = _gather(geometry, attenuation, signal, gaussian, tile)

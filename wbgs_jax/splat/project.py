@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.geometry import (
     AZIMUTH_PERIOD,
@@ -25,7 +26,6 @@ from wbgs_jax.radio.geometry import (
     pixels_per_radian,
     to_local,
 )
-from wbgs_jax._util.pytree import pytree
 from wbgs_jax.types import Gaussians, Receiver
 
 SUPPORT = 3.0

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wbgs_jax._util.checks import check_array
-from wbgs_jax.radio.geometry import Projection
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.splat.composite import composite
 from wbgs_jax.splat.project import Splats, project
 from wbgs_jax.splat.tiles import TileJobs, TileLimits, build_tile_jobs, fit_limits
@@ -35,8 +35,8 @@ def geometry_plan(
     """Returns the projected and sorted Gaussians.
 
     Gradients reach the Gaussians through a plan only where it is made inside the differentiated function; order and tile lists
-    carry none. Without `limits` the tile lists are sized on the host (not under jit). With it the call is pure and jittable, and the
-    caller must look at `plan.jobs.overflow`.
+    carry none. Without `limits` the tile lists are sized on the host (not under jit). With them the call is pure and jittable,
+    and the caller must look at `plan.jobs.overflow`.
     """
     splats = project(gaussians, receiver, projection, means2d_offset)
     if limits is None:

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
-from wbgs_jax._util.pytree import pytree
 from wbgs_jax.splat.footprint import CUT
 from wbgs_jax.splat.project import Splats
 

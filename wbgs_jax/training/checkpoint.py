@@ -1,7 +1,7 @@
 """Checkpoints with Orbax: the training state, the field it belongs to, and metadata.
 
-A tree is saved as a flat dictionary of arrays named by their place in it; those of the field begin with "field". Orbax writes to
-a temporary folder and renames it, so a checkpoint is whole or absent (one that is written again is absent for a moment).
+A tree is saved as a flat dictionary of arrays named by their place in it; those of the field begin with "field". Orbax writes
+to a temporary folder and renames it, so a checkpoint is whole or absent (one that is written again is absent for a moment).
 """
 
 import contextlib

@@ -6,7 +6,7 @@ on the host). It says how whatever is stored beside the parameters, such as opti
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Context(NamedTuple):
     """Indices of the training links."""
 
 
+@runtime_checkable
 class Control(Protocol):
     """A host control: a frozen, hashable object."""
 
@@ -56,8 +57,6 @@ class Control(Protocol):
         """Returns whether something is to be done after this step of so many."""
         ...
 
-    def apply(
-        self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator
-    ) -> Edit:
+    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
         """Returns the changed parameters."""
         ...

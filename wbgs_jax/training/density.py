@@ -100,9 +100,7 @@ class DensityControl:
         return reset_attenuation(edit, self.config) if self._resets(step) else edit
 
 
-def control_density(
-    params: Any, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator
-) -> Edit:
+def control_density(params: Any, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator) -> Edit:
     """Returns parameters with Gaussians cloned, split and pruned; the number of slots may change."""
     gaussians = jax.tree.map(np.asarray, params.gaussians)
     statistics = jax.tree.map(np.asarray, statistics)
@@ -144,7 +142,10 @@ def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:
 def choose(
     gaussians: Gaussians, statistics: DensityStatistics, config: DensityConfig
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Returns masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is. Never grows beyond the maximum."""
+    """Returns masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is.
+
+    There are never more than the maximum.
+    """
     alive = np.asarray(gaussians.alive)
     attenuation = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits)))
     useful = alive & (attenuation >= config.prune_attenuation)
@@ -169,7 +170,9 @@ def _sources(keep, clone, split) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray,
     return source, np.arange(len(source)) >= len(kept)
 
 
-def _edit(gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator) -> Gaussians:
+def _edit(
+    gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator
+) -> Gaussians:
     """Returns the new Gaussians, without empty slots: clones stepped downhill, halves drawn from the Gaussian they replace."""
     means, log_scales, quats, logits = (
         np.asarray(a)[source].copy() for a in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits)

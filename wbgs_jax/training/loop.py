@@ -4,7 +4,6 @@ A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.
 made of is the field's business; the loop knows the seam alone (`fields.base.Field`).
 """
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Int
 
 from wbgs_jax._util.errors import UserError
@@ -162,6 +162,7 @@ class Run:
         old, statistics = self.state, list(self.state.statistics)
         if _shapes(edit.params) != _shapes(old.params):
             self.compilations += 1
+            statistics = [control.statistics(edit.params) for control in self.controls]  # what others saw is of other shapes
         moments = self.optimizer.init(edit.params) if edit.moments is None else _map_like(old, edit.moments)
         statistics[number] = edit.statistics
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
@@ -203,12 +204,20 @@ def _shapes(tree: Any) -> list[tuple[int, ...]]:
 
 
 def _map_like(state: TrainState, function: Callable[[Any], Any]) -> Any:
-    """Returns the optimiser's state with every tree in it that is like the parameters transformed."""
+    """Returns the optimiser's state with every tree in it that is like the parameters transformed. In the tree of a group the
+    leaves of all others are masked."""
+    leaves, structure = jax.tree.flatten(state.params)
 
     def alike(value: Any) -> bool:
-        return type(value) is type(state.params) and (not isinstance(value, dict) or value.keys() == state.params.keys())
+        own, found = jax.tree.flatten(value, is_leaf=_is_masked)
+        same = (_is_masked(a) or (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in zip(own, leaves, strict=False))
+        return found == structure and not _is_masked(value) and all(same)
 
     return jax.tree.map(lambda leaf: function(leaf) if alike(leaf) else leaf, state.optimizer, is_leaf=alike)
+
+
+def _is_masked(node: Any) -> bool:
+    return isinstance(node, optax.MaskedNode)
 
 
 def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:

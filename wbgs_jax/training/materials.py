@@ -125,6 +125,7 @@ def _score(field: Field, params: Any, candidates: Any, cache: Any, data: Trainin
         seen = field.render_links(dataclasses.replace(params, materials=materials), plan, cache, batch.links)
         if seen.snapshots is not None and batch.snapshots is not None:
             return log_decorrelation(seen.snapshots, batch.snapshots)
+        assert batch.pas is not None, "materials are searched in spectra or snapshots"
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
 
     return jax.lax.map(one, candidates)

@@ -1,4 +1,4 @@
-"""What a person sees of long work: a live bar on a terminal, a plain line now and then in a log."""
+"""What a person sees of a training: a live bar on a terminal, a plain line now and then in a log."""
 
 import sys
 import time
@@ -7,7 +7,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     SpinnerColumn,
     TextColumn,
@@ -15,8 +14,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-LOG_INTERVAL = 20.0
-"""Seconds between two lines when the output is no terminal."""
+from wbgs_jax._util.progress import LOG_INTERVAL
+
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
 """Figures that are measured now and then, and shown until they are measured again."""
 LABELS = {"batch_ssim": "SSIM", "held_out_ssim": "held-out SSIM", "held_out_power_error_db": "held-out power error dB"}
@@ -65,34 +64,3 @@ class TrainingProgress:
             self.last_line = time.monotonic()
             left = (self.total - step) / max(rate, 1e-9)
             print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)
-
-
-class CountProgress:
-    """Shows how many of equal pieces of work are done and the time left, on stderr."""
-
-    def __init__(self, label: str, total: int, done: int = 0):
-        self.label, self.total, self.done, self.start_done = label, total, done, done
-        self.started = self.last_line = time.monotonic()
-        self.console = Console(file=sys.stderr)
-        columns = (TextColumn(label), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
-        self.bar = Progress(
-            *columns, TextColumn("left"), TimeRemainingColumn(), console=self.console, disable=not self.console.is_terminal
-        )
-        self.task = self.bar.add_task(label, total=total, completed=done)
-
-    def __enter__(self) -> "CountProgress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self.bar.stop()
-
-    def advance(self) -> None:
-        """One more piece is done."""
-        self.done += 1
-        self.bar.update(self.task, completed=self.done)
-        now = time.monotonic()
-        if not self.console.is_terminal and (now - self.last_line > LOG_INTERVAL or self.done == self.total):
-            self.last_line = now
-            left = (self.total - self.done) * (now - self.started) / (self.done - self.start_done)
-            print(f"{self.label}: {self.done}/{self.total}  {left:.0f} s left", file=sys.stderr, flush=True)

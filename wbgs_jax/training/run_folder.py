@@ -138,4 +138,3 @@ def load_trained(folder: Path | str) -> TrainedField:
     field = from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     return TrainedField(config, field, params, steps[-1], float(saved.metadata["seconds"]))
-

@@ -1,0 +1,30 @@
+"""Names that settings had in version 0.1: results of that time count as run, and stay as they were written."""
+
+from typing import Any
+
+from experiments.settings import HOUSEKEEPING
+
+MOVED = {
+    # Until 0.2 learning rates and weights of all fields were settings of the optimiser.
+    **{f"optim.{name}": f"{{field}}.{name}" for name in ("network_lr", "network_weight_decay", "ssim_weight", "pixel_loss")},
+    **{f"optim.{name}": f"{{field}}.{name}" for name in ("means_lr", "log_scales_lr", "quats_lr", "opacity_lr")},
+    **{f"optim.{name}": f"{{field}}.{name}" for name in ("materials_lr", "thickness_lr", "power_weight")},
+    "optim.residual_lr": "wave.corrections_lr",
+    "optim.snapshot_weight": "wave.correlation_weight",
+    "wave.residual_weight": "wave.correction_weight",
+    "wave.plain_tried": "wave.specular_tried",
+    "wave.plain_kept": "wave.specular_kept",
+    "wave.survival": "wave.excess_amplitude",
+}
+NOT_OF = {"density": ("wave", "nerf2"), "search": ("wideband", "wrfgs", "nerf2")}
+"""Sections that all fields had, and the fields that took no notice."""
+
+
+def todays(settings: dict[str, Any], field: str) -> dict[str, Any]:
+    """Returns a result's settings by today's names, without those that changed nothing."""
+    named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
+    return {
+        name: value
+        for name, value in named.items()
+        if name not in HOUSEKEEPING and field not in NOT_OF.get(name.split(".")[0], ())
+    }

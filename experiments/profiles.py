@@ -1,0 +1,54 @@
+"""How large everything is: a `Profile` gives a job its preset, its steps and what else is smaller than in the preset."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+Changes = Mapping[str, Mapping[str, Any]]
+"""Section of the settings ("field", "optim", "density", "search", "loop"): what differs."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A size of jobs."""
+
+    preset: str
+    steps: int
+    """Of a field for all frequencies. Models of one frequency share as many between them."""
+    wave_steps: int
+    changes: Changes = field(default_factory=dict)
+    """What differs from the preset, whatever the field ..."""
+    fields: Changes = field(default_factory=dict)
+    """... and by field, of its own settings."""
+    scored_tx: int | None = None
+    """Transmitters that are scored; None: all that are held out."""
+
+
+SCORED_SLOW = 24
+"""Transmitters that are scored with a slow field, and wherever it is compared with; drawn once for all."""
+GAUSSIANS = {"gaussians": 1000}
+TINY = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance_widths": (8,)}
+QUICK: dict[str, Any] = {
+    "changes": {"loop": {"epoch_steps": 25}},
+    "fields": {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS},
+}
+BEFORE = {"network_lr": 1e-3, "fusion": 0}
+"""What the `cpu` preset had when its settings were chosen."""
+PROFILES = {
+    # Of the tables, whose jobs can have any of these.
+    "quick": Profile("cpu", 1000, 600, **QUICK),
+    "paper": Profile("gpu", 14_000, 4000),
+    # Proves within minutes that everything works.
+    "smoke": Profile(
+        "smoke",
+        8,
+        4,
+        changes={"optim": {"batch": 2}, "loop": {"epoch_steps": 2}},
+        fields={"wideband": TINY, "wrfgs": TINY},
+    ),
+    # Of the series, each its own.
+    "tuning": Profile("cpu", 1000, 600, **QUICK, scored_tx=SCORED_SLOW),
+    "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
+    "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
+}
+TABLE_PROFILES = ("quick", "paper", "smoke")

@@ -1,0 +1,78 @@
+"""All results as one table, results.csv, which any table tool reads: a row a job and frequency.
+
+    pandas.read_csv("experiments/results/results.csv").query("profile == 'quick' and current")
+
+Where only the scores of all frequencies together were kept there is one row, without a frequency. The predictors that learn
+nothing have `baselines` for their field and their name for the variant.
+"""
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.jobs import BASELINES, Job
+from experiments.profiles import PROFILES
+from experiments.results import FOLDER, Result
+from experiments.variants import VARIANTS
+from wbgs_jax._util.files import atomic_write, read_json
+
+NAME = "results.csv"
+OF_JOB = ("profile", "job", "scene", "field", "variant", "combination", "all_tx", "seed", "current")
+"""`current`: the settings are those that the job has today; others count as not run."""
+OF_FREQUENCY = ("ghz", "n", "median_ssim", "mean_ssim", "psnr_db")
+"""`n`: spectra, of as many transmitters. `psnr_db`: the median."""
+OF_RUN = ("models", "steps", "samples", "gaussians", "training_seconds", "version", "commit", "device", "jax")
+"""Of the whole job."""
+COLUMNS = OF_JOB + OF_FREQUENCY + OF_RUN
+DIGITS = 4
+
+
+def rows(folder: Path = FOLDER) -> Iterator[dict[str, Any]]:
+    """Yields the rows of all results but those of the profile `smoke`, which mean nothing; what is not known is missing."""
+    for path in sorted(folder.glob("*/*.json")):
+        if path.parent.name != "smoke":
+            yield from rows_of(path)
+
+
+def rows_of(path: Path) -> Iterator[dict[str, Any]]:
+    """Yields the rows of a result file."""
+    values = read_json(path)
+    known = values["job"] | {"profile": path.parent.name}
+    own = {name: value for name, value in known.items() if name in OF_JOB} | {"job": path.stem}
+    own |= {"current": is_current(Result(values), Job(**known))}
+    run = {name: value for name, value in (values | values["environment"]).items() if name in OF_RUN}
+    for scores in by_frequency(values):
+        yield own | scores | run
+
+
+def is_current(result: Result, job: Job) -> bool:
+    """Whether a result counts as run."""
+    return job.profile in PROFILES and job.variant in VARIANTS and result.belongs_to(job)
+
+
+def by_frequency(values: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yields the scores of a result."""
+    for name, medians in values.get(BASELINES, {}).items():
+        for ghz, median in medians.items():
+            yield {"variant": name, "ghz": ghz, "median_ssim": median}
+    for ghz, scores in values.get("ssim", {}).items():
+        middle, mean = np.round([np.median(scores), np.mean(scores)], DIGITS).tolist()
+        both = {"median_ssim": middle, "mean_ssim": mean}
+        yield {"ghz": ghz, "n": len(scores), **both, "psnr_db": values.get("psnr_db", {}).get(ghz)}
+    if not values.keys() & {"ssim", BASELINES}:
+        yield {name: value for name, value in values.items() if name in OF_FREQUENCY}
+
+
+def write(folder: Path = FOLDER) -> Path:
+    """Write the table; returns where it is."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows(folder))
+    with atomic_write(folder / NAME) as stream:
+        stream.write(text.getvalue().encode())
+    return folder / NAME

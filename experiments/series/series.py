@@ -1,0 +1,59 @@
+"""What all series share: a field, its changes, where and how often each is trained, and the table of their scores."""
+
+import statistics
+from dataclasses import dataclass
+
+from experiments.jobs import Job
+from experiments.markdown import markdown
+from experiments.results import Results
+
+NOT_RUN = "not run"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Changes that are compared with each other."""
+
+    title: str
+    field: str
+    variants: tuple[str, ...]
+    """Names in `variants.VARIANTS`; none: as the profile has it."""
+    profile: str
+    scenes: tuple[str, ...] = ("1",)
+    combination: str = ""
+    seeds: tuple[int, ...] = (0,)
+
+    def jobs_of(self, scene: str, variant: str) -> list[Job]:
+        """Returns one row of the table: a job a seed."""
+        other = {"variant": variant, "profile": self.profile, "combination": self.combination}
+        return [Job(scene, self.field, seed=seed, **other) for seed in self.seeds]
+
+    def jobs(self) -> list[Job]:
+        """Returns all jobs."""
+        return [job for scene in self.scenes for variant in self.variants for job in self.jobs_of(scene, variant)]
+
+    def render(self, results: Results) -> str:
+        """Returns the table: the median SSIM of every seed, their median, and the median of the mean SSIM."""
+        rows = []
+        for scene in self.scenes:
+            for variant in self.variants:
+                found = [results.get(job) for job in self.jobs_of(scene, variant)]
+                known = [result.values for result in found if result]
+                medians, means = ([values[name] for values in known] for name in ("median_ssim", "mean_ssim"))
+                each = [f"{result.values['median_ssim']:.3f}" if result else NOT_RUN for result in found]
+                summary = [f"**{statistics.median(medians):.3f}**", f"{statistics.median(means):.3f}"] if known else ["", ""]
+                steps = f"{known[0]['steps']:,}" if known else ""
+                rows.append([scene, variant or "(no change)", *each, *summary, steps])
+        head = ["scene", "change", *(f"seed {seed}" for seed in self.seeds), "median", "mean SSIM", "steps"]
+        where = f"profile `{self.profile}`" + (f", combination {self.combination}" if self.combination else "")
+        return f"{self.title} ({self.field}, {where}):\n\n{markdown(head, rows)}"
+
+
+def jobs_of_all(series: tuple[Series, ...]) -> list[Job]:
+    """Returns the jobs of several series."""
+    return [job for one in series for job in one.jobs()]
+
+
+def render_all(series: tuple[Series, ...], results: Results) -> str:
+    """Returns their tables."""
+    return "\n\n".join(one.render(results) for one in series)

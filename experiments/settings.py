@@ -1,0 +1,66 @@
+"""The settings of a job: the preset of its profile, what profile and variant change, schedules in proportion to the steps."""
+
+from typing import Any
+
+from experiments.jobs import BASELINES, ONE_FREQUENCY, Job
+from experiments.profiles import PROFILES
+from experiments.variants import VARIANTS
+from wbgs_jax.config import Settings, changed, to_dict
+from wbgs_jax.fields import get_field
+
+HOUSEKEEPING = ("loop.evaluate_every", "loop.evaluate_spectra", "loop.checkpoint_every", "loop.keep_checkpoints")
+"""Settings that change no result."""
+
+
+def settings(job: Job) -> Settings:
+    """Returns the settings of every model of a job."""
+    profile, variant, preset = PROFILES[job.profile], VARIANTS[job.variant], preset_of(job)
+    base = changed(preset, profile.changes | {"field": profile.fields.get(job.field, {})})
+    block = base.loop.epoch_steps
+    steps = variant.steps or whole(wanted_steps(job), block)
+    rates = {name: variant.rates * value for name, value in vars(base.field).items() if name.endswith("_lr")}
+    changes: dict[str, dict[str, Any]] = {
+        "field": rates,
+        "optim": {"steps": steps, "min_steps": steps},
+        "loop": {"evaluate_spectra": 0, "checkpoint_every": max(steps // 5, 100), "keep_checkpoints": 1},
+    }
+    if base.density:
+        control = {name: getattr(base.density, name) for name in ("every", "start", "reset_every")}
+        share = steps / preset.optim.steps
+        changes["density"] = {name: whole(count * share, block) for name, count in control.items() if count}
+    return changed(changed(base, changes), variant.changes)
+
+
+def preset_of(job: Job) -> Settings:
+    """Returns the preset that a job's settings start from."""
+    return get_field(job.field).presets[PROFILES[job.profile].preset]
+
+
+def wanted_steps(job: Job) -> float:
+    """Returns the steps of one model of a job, by its profile."""
+    profile = PROFILES[job.profile]
+    if job.field == "wave":
+        return profile.wave_steps
+    steps = profile.steps * job.budget
+    return steps / len(job.test_ghz) if job.field in ONE_FREQUENCY else steps
+
+
+def whole(count: float, block: int) -> int:
+    """Returns the nearest multiple of `block`, at least one."""
+    return max(1, round(count / block)) * block
+
+
+def differences(job: Job) -> dict[str, Any]:
+    """Returns what determines a job's result and is not the preset's, as JSON has it."""
+    if job.field == BASELINES:
+        return {}
+    chosen, base = to_dict(settings(job), job.field), to_dict(preset_of(job), job.field)
+    found = {
+        f"{section}.{name}": list(value) if isinstance(value, tuple) else value
+        for section, values in chosen.items()
+        for name, value in values.items()
+        if value != base[section][name]
+    }
+    if displacement := VARIANTS[job.variant].displacement:
+        found["mesh.displacement"] = displacement
+    return {name: value for name, value in found.items() if name not in HOUSEKEEPING}

@@ -1,0 +1,44 @@
+"""Write the page of results and the table of all results: `python -m experiments.tables [--profile quick]`.
+
+docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick), and
+experiments/results/results.csv.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from experiments import result_table
+from experiments.results import FOLDER, Results
+from experiments.tables.page import page
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.files import atomic_write
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Write the page of results, and all results as one table."""
+
+    profile: Literal["quick", "paper", "smoke"] = "quick"
+    results: Path = FOLDER
+    docs: Path = DOCS
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, prog="python -m experiments.tables", args=arguments)
+    suffix = "" if command.profile == "quick" else f"_{command.profile}"
+    text = page(Results(command.profile, command.results), command.docs / f"images{suffix}")
+    path = command.docs / f"results{suffix}.md"
+    with atomic_write(path) as stream:
+        stream.write(text.encode())
+    print(path)
+    print(result_table.write(command.results))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,55 @@
+"""Table 1: six scenes at ten frequencies, one field for all of them against a WRF-GS model for each."""
+
+from pathlib import Path
+
+from experiments.jobs import BASELINES, SEEDS, Job
+from experiments.markdown import markdown
+from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
+from experiments.results import Results
+from experiments.tables.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells
+
+TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"
+MODELS = (
+    ("wideband", ""),
+    ("wideband", "long"),
+    ("wrfgs", ""),
+    ("wrfgs", "long"),
+    ("wrfgs", "longest"),
+    ("wave", ""),
+)
+
+
+def jobs() -> list[Job]:
+    """Ours and WRF-GS with several budgets, the coherent field and what learns nothing."""
+    trained = [job for scene in SCENES for model in MODELS for job in jobs_of(scene, *model)]
+    return trained + [Job(scene, BASELINES) for scene in SCENES]
+
+
+def jobs_of(scene: str, field: str, variant: str = "") -> list[Job]:
+    """One row of the table: a job a seed; the costliest has one."""
+    seeds = SEEDS[:1] if variant == "longest" else SEEDS
+    return [Job(scene, field, variant=variant, seed=seed) for seed in seeds]
+
+
+def render(results: Results, images: Path) -> str:
+    """A table a scene."""
+    note = (
+        "Median SSIM by frequency (GHz); in parentheses the paper's. 95 %: bootstrap interval of the average over the scene's"
+        " held-out transmitters and the seeds; seeds: how many, and the range of their averages."
+    )
+    return "\n\n".join([note, *(scene_table(results, scene) for scene in SCENES)])
+
+
+def scene_table(results: Results, scene: str) -> str:
+    """One scene: a row a model, the ceiling below."""
+    rows = []
+    for field, variant in MODELS:
+        jobs, paper = jobs_of(scene, field, variant), None if variant else TABLE_1[scene].get(field)
+        values = scores(results, jobs, GHZ_10)
+        by_frequency = [None if values is None else values[..., i : i + 1] for i in range(len(GHZ_10))]
+        each = [median_cell(v, paper[i] if paper else None) for i, v in enumerate(by_frequency)]
+        average = summary_cells(values, TABLE_1_AVERAGE[scene][field] if paper else None)
+        rows.append([NAMES[field, variant], *each, *average])
+    best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
+    rows.append(["phase-blind ceiling", *best])
+    return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)

@@ -1,0 +1,95 @@
+"""Named changes of a job's settings: those of the tables, and those that the series try one at a time."""
+
+from dataclasses import dataclass, field
+
+from experiments.profiles import Changes
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What differs from the profile's settings."""
+
+    changes: Changes = field(default_factory=dict)
+    """Section of the settings, "field" for the field's own: what differs."""
+    budget: float = 1
+    """How many times the usual number of spectra is seen."""
+    steps: int | None = None
+    """Steps, instead of the profile's."""
+    rates: float = 1
+    """Factor of all learning rates of the field."""
+    displacement: float = 0
+    """Metres by which every part of the mesh stands in a wrong place (standard deviation along each axis)."""
+
+
+def _of_field(**values: object) -> Variant:
+    return Variant({"field": values})
+
+
+def _batch(size: int, steps: int) -> Variant:
+    """Another batch: learning rates follow its square root, and the steps take as long as 1,050 of 8 spectra did
+    (docs/performance.md)."""
+    return Variant({"optim": {"batch": size}}, steps=steps, rates=(size / 8) ** 0.5)
+
+
+RATES = ("1e-3", "2e-3", "3e-3", "8e-3", "1.6e-2", "3.2e-2")
+"""Learning rates of the networks; the presets' is 4e-3."""
+HIGHER_RATE = 1.6e-2
+TABLES = {
+    "": Variant(),
+    "long": Variant(budget=5),
+    "longest": Variant(budget=10),
+    "fast": _of_field(network_lr=HIGHER_RATE),
+    "no_attenuation": _of_field(attenuation_frequency=False),
+    "no_radiance": _of_field(radiance_frequency=False),
+    "no_frequency": _of_field(attenuation_frequency=False, radiance_frequency=False),
+}
+GAUSSIANS_AND_NETWORKS = {
+    "paper_inputs": _of_field(relative=False),
+    "raw_gigahertz": _of_field(frequency_scale="ghz"),
+    "sphere": _of_field(projection="sphere"),
+    "area": _of_field(sampling="area"),
+    "no_density_control": Variant({"density": {"every": 0, "reset_every": 0}}),
+    "density_with_reset": Variant({"density": {"reset_every": 300}}),
+    "octaves_10": _of_field(gaussian_octaves=10, tx_octaves=10, frequency_octaves=10),
+    "frequency_octaves_0": _of_field(frequency_octaves=0),
+    "frequency_octaves_1": _of_field(frequency_octaves=1),
+    "frequency_octaves_4": _of_field(frequency_octaves=4),
+    "octaves_3_2": _of_field(gaussian_octaves=3, tx_octaves=2),
+    "gaussians_1000": _of_field(gaussians=1000),
+    "gaussians_4000": _of_field(gaussians=4000),
+    "width_128": _of_field(width=128, radiance_widths=(128, 64)),
+    **{f"fusion_{layer}": _of_field(fusion=layer) for layer in range(4)},
+    "batch_4": _batch(4, 1450),
+    "batch_8": _batch(8, 1050),
+    "batch_16": _batch(16, 600),
+    **{f"lr_{rate}": _of_field(network_lr=float(rate)) for rate in RATES},
+    "weight_decay_0.1": _of_field(network_weight_decay=0.1),
+    "fixed_means": _of_field(means_lr=0.0),
+}
+VOLUME = {
+    "l2": _of_field(pixel_loss="l2"),
+    "directions_384": _of_field(directions=384),
+}
+_NO_EDGES = {"diffracted_tried": 1, "diffracted_kept": 1}
+_NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
+_UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
+_NO_SEARCH = {"search": {"rounds": 0}}
+COHERENT = {
+    "phase_blind": Variant({"field": {"coherent": False}} | _NO_SEARCH),  # phases would name the materials
+    "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
+    "order_1": _of_field(mirror_areas=(0.0,), **_NO_EDGES),
+    "order_2": _of_field(mirror_areas=(0.0, 0.05), **_NO_EDGES),
+    "order_3": _of_field(**_NO_EDGES),
+    "no_search": Variant(_NO_SEARCH),
+    "no_search_low_frequencies_first": Variant({"optim": {"curriculum": 0.5}} | _NO_SEARCH),
+    "search_alone": _of_field(**_UNTRAINED),
+    "no_corrections": _of_field(corrections_lr=0.0),
+    "free_reflectivity": Variant({"field": _NO_MATERIALS} | _NO_SEARCH),
+    "untrained": Variant({"field": _UNTRAINED} | _NO_SEARCH),
+    "no_snapshot_loss": _of_field(correlation_weight=0.0, power_weight=0.0),
+    "more_candidates": _of_field(diffracted_tried=4096, diffracted_kept=512, mirror_areas=(0.0, 0.02, 0.3)),
+    "mesh_moved_3mm": Variant(displacement=0.003),
+    "mesh_moved_3cm": Variant(displacement=0.03),
+    "mesh_moved_1m": Variant(displacement=1.0),
+}
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | VOLUME | COHERENT

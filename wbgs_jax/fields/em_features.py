@@ -1,0 +1,128 @@
+"""What the EM feature networks say of every Gaussian and query (paper, sections 4.2 and 4.5), in two steps: what depends on the
+Gaussian alone, once for all queries, and the rest."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.fields.encoding import frequency_encoding, positional_encoding
+from wbgs_jax.fields.networks import (
+    AttenuationNetwork,
+    GaussianSums,
+    RadianceNetwork,
+    attenuation_activation,
+    signal_activation,
+)
+from wbgs_jax.fields.wideband_settings import WidebandConfig
+from wbgs_jax.radio.array import EXACT, array_response, steering_vector
+from wbgs_jax.radio.geometry import smooth_length, to_local
+from wbgs_jax.types import Gaussians, Query, Receiver
+
+MAX_ATTENUATION = 0.99
+RELATIVE_FEATURES = 7
+Weights = dict[str, Any]
+"""Of both networks, by name."""
+
+
+@pytree
+class Frame:
+    """Maps world positions to network inputs of about unit size. Set once from the surface, never trained."""
+
+    centre: Float[Array, "3"]
+    half_extent: Float[Array, ""]
+
+
+@pytree
+class GaussianFeatures:
+    """What the networks' inputs need of every Gaussian, whatever is asked."""
+
+    sums: GaussianSums
+    """What the attenuation network's layers make of P(G)."""
+    direction: Float[Array, "n 3"]
+    """Unit vectors from the receiver to the Gaussians, receiver's frame."""
+    back: Float[Array, "n 3"]
+    """Unit vectors from the Gaussians to the receiver, world frame."""
+    steering: Complex[Array, "n elements"] | None
+    """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
+
+
+def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
+    """Returns the EM feature networks."""
+    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion)
+    return attenuation, RadianceNetwork(config.radiance_widths)
+
+
+def gaussian_features(
+    means: Float[Array, "n 3"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
+) -> GaussianFeatures:
+    """Returns what the networks' inputs need of every Gaussian, whatever is asked."""
+    encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)[:, None, :]
+    sums: Any = make_networks(config)[0].apply(weights["attenuation"], [encoded], method="gaussian_sums")
+    direction = to_local(means - receiver.position, receiver.orientation)
+    direction = direction / smooth_length(direction)
+    back = receiver.position - means
+    fixed = receiver.unit == "wavelengths"
+    steering = steering_vector(receiver.element_positions, direction) if fixed else None
+    return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
+
+
+def query_features(
+    gaussians: Gaussians,
+    weights: Weights,
+    features: GaussianFeatures,
+    frame: Frame,
+    receiver: Receiver,
+    config: WidebandConfig,
+    query: Query,
+) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
+    """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
+    4.5)."""
+    attenuation, radiance = make_networks(config)
+    both, frequency = _query_inputs(gaussians.means, features, frame, receiver, config, query)
+    outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both, method="of_queries")
+    hidden, delta_f = outputs
+    signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency])
+    delta = attenuation_activation(gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
+    return delta, signal_activation(signal)
+
+
+def _query_inputs(
+    means: Float[Array, "n 3"],
+    features: GaussianFeatures,
+    frame: Frame,
+    receiver: Receiver,
+    config: WidebandConfig,
+    query: Query,
+) -> tuple[list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
+    """Returns the encoded inputs that depend on the query: those of the attenuation network, and the frequency for the radiance
+    network (nothing if it is switched off)."""
+    scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
+    both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
+    if config.relative:
+        both.append(_relative_features(means, features, receiver, query, frame.half_extent))
+    encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
+    if config.attenuation_frequency:
+        both.append(encoded)
+    return both, [encoded] if config.radiance_frequency else []
+
+
+def _relative_features(
+    means: Float[Array, "n 3"], features: GaussianFeatures, receiver: Receiver, query: Query, size: Float[Array, ""]
+) -> Float[Array, "n b 7"]:
+    """Returns functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
+
+    The angle between Gaussian and TX as the receiver sees it, the array's response to the TX in the Gaussian's direction (the
+    line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
+    """
+    to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
+    to_tx = to_tx / smooth_length(to_tx)
+    elements = receiver.element_wavelengths(query.frequency_hz)
+    response = array_response(elements, features.direction, to_tx, features.steering)
+    leg = query.tx_position[None] - means[:, None]
+    distance = smooth_length(leg)
+    direction = leg / distance
+    bounce = jnp.sum(direction * features.back[:, None], -1)
+    scalars = jnp.stack([jnp.matmul(features.direction, to_tx.T, precision=EXACT), response, bounce], -1)
+    return jnp.concatenate([scalars, distance / size, direction], -1)

@@ -1,0 +1,73 @@
+"""Settings of the paper's field, and its presets."""
+
+from dataclasses import dataclass
+
+from wbgs_jax.config import DensityConfig
+from wbgs_jax.fields.encoding import FrequencyScale
+from wbgs_jax.radio.geometry import Projection
+from wbgs_jax.types import SurfaceSampling
+
+
+@dataclass(frozen=True)
+class WidebandConfig:
+    """Settings of the paper's field."""
+
+    gaussians: int = 2000
+    """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
+    sampling: SurfaceSampling = "solid_angle"
+    """Spread them evenly over the receiver's directions, or over the area of the surface."""
+    width: int = 64
+    """Units of the attenuation network's layers (authors: 128)."""
+    depth: int = 4
+    """Layers of the attenuation network (authors: 8)."""
+    skip: int = 2
+    """The layer at which the inputs enter again (authors: 4)."""
+    fusion: int = 1
+    """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
+    all queries. 0: the paper's form."""
+    radiance_widths: tuple[int, ...] = (64, 32)
+    """Units of the radiance network's layers (authors: 128, 64)."""
+    gaussian_octaves: int = 6
+    """Octaves of P(G) (authors: 10)."""
+    tx_octaves: int = 4
+    """Octaves of P(TX) (authors: 10)."""
+    frequency_octaves: int = 0
+    """Octaves of the frequency encoding, beyond the scaled frequency itself (authors: 10; more than none fail between the
+    frequencies that were trained)."""
+    frequency_scale: FrequencyScale = "log"
+    """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
+    relative: bool = True
+    """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
+    attenuation_frequency: bool = True
+    """Frequency embedding of the attenuation network (paper, Table 3)."""
+    radiance_frequency: bool = True
+    """Frequency embedding of the radiance network (paper, Table 3)."""
+    projection: Projection = "hemisphere"
+    """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
+    ssim_weight: float = 0.2
+    """lambda of the paper's equation 5."""
+    network_lr: float = 4e-3
+    """Learning rate of the networks (authors: 8e-4)."""
+    network_weight_decay: float = 0.0
+    """Decoupled weight decay of the networks."""
+    means_lr: float = 1e-3
+    """Learning rate of the centres: metres a step, about. (Authors: 0 in effect; their spatial scale multiplies it away.)"""
+    log_scales_lr: float = 5e-3
+    """Learning rate of the logarithms of the standard deviations."""
+    quats_lr: float = 1e-3
+    """Learning rate of the rotations."""
+    opacity_lr: float = 2.5e-2
+    """Learning rate of delta_o."""
+
+
+CONFIGS = {
+    "smoke": WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
+    "cpu": WidebandConfig(),
+    # The paper's size: a Gaussian for every vertex of the mesh, 8x128 and 128-64 networks.
+    "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64), network_lr=8e-4),
+}
+DENSITY = {
+    "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
+    "cpu": DensityConfig(),
+    "gpu": DensityConfig(max_gaussians=100_000, reset_every=3000),
+}
