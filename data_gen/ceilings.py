@@ -25,7 +25,10 @@ PHASE_SEED = 0
 
 
 def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "ceilings"]:
-    """SSIM of every ceiling in `NAMES` for one transmitter at one frequency; NaN without a path. Positions in wavelengths."""
+    """Returns the SSIM of every ceiling in `NAMES` for one transmitter at one frequency; NaN without a path.
+
+    Element positions are in wavelengths.
+    """
     if not len(paths.delays):
         return np.full(len(NAMES), np.nan)
     partial = [paths.coefficients[paths.order <= order].sum(0) for order in range(MAX_ORDER + 1)]
@@ -35,7 +38,7 @@ def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]
 
 
 def phase_blind_image(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "90 360"]:
-    """Mean PAS over `PHASE_DRAWS` draws of random path phases (always the same draws)."""
+    """Returns the mean PAS over `PHASE_DRAWS` draws of random path phases (always the same draws)."""
     phases = np.random.default_rng(PHASE_SEED).uniform(0, 2 * np.pi, (PHASE_DRAWS, len(paths.delays)))
     return _images(np.exp(1j * phases) @ paths.coefficients, element_positions).mean(0)
 

@@ -44,7 +44,7 @@ class Options:
 
 
 def settings(effort: float, diffraction: bool = True, depth: int = SolverSettings.max_depth) -> SolverSettings:
-    """The solver's settings with all numbers of rays times `effort`."""
+    """Returns the solver's settings with all numbers of rays times `effort`."""
     usual = SolverSettings(diffraction=diffraction, max_depth=depth)
     rays = ("samples_per_src", "rays_per_face", "rays_per_mirrored_face")
     more = {name: max(1, round(getattr(usual, name) * effort)) for name in rays}
@@ -54,7 +54,7 @@ def settings(effort: float, diffraction: bool = True, depth: int = SolverSetting
 
 
 def convergence(options: Options) -> list[str]:
-    """The lines of the table: one for every number of rays at every frequency."""
+    """Returns the lines of the table: one for every number of rays at every frequency."""
     from data_gen.solve import Simulator
 
     spec = get_scene(options.scene)
@@ -96,7 +96,7 @@ def _scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n e
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     options = tyro.cli(Options)
     if not options.effort or min(options.effort) <= 0 or options.tx < 1:
         raise UserError("--effort and --tx must be positive")

@@ -34,7 +34,7 @@ MAX_WORKERS = 4
 
 
 def generate(options: Options) -> Path:
-    """Compute or continue a scene and write its file.
+    """Computes or continues a scene and writes its file.
 
     Returns:
         the scene file's path.
@@ -60,7 +60,7 @@ def _writable(out: Path) -> Path:
 
 
 def _processes(options: Options, backend: str) -> tuple[int, int | None]:
-    """Processes and threads of each (None: as many as Dr.Jit likes)."""
+    """Returns the numbers of processes and threads of each (None: as many as Dr.Jit likes)."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or (1 if backend == CUDA else min(max(cores // 2, 1), MAX_WORKERS))
     return workers, options.threads or (None if workers == 1 else -(-cores // workers))
@@ -121,7 +121,7 @@ def _provenance(job: jobs.Job, backend: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     options = tyro.cli(Options)
     try:
         print(f"wrote {generate(options)}")

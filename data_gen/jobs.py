@@ -52,7 +52,7 @@ class Job:
     """Which transmitters the ceilings are measured on."""
 
     def batch(self, index: int) -> range:
-        """Indices of the transmitters of one batch."""
+        """Returns the indices of the transmitters of one batch."""
         size = self.settings.tx_per_call
         return range(index * size, min((index + 1) * size, len(self.tx_positions)))
 
@@ -62,7 +62,7 @@ class Job:
         return -(-len(self.tx_positions) // self.settings.tx_per_call)
 
     def digest(self, backend: str) -> str:
-        """Checksum of the scene, the transmitters, the array, the frequencies, the settings and the versions."""
+        """Returns a checksum of the scene, the transmitters, the array, the frequencies, the settings and the versions."""
         decides = {
             "mesh": self.spec.mesh_sha256(), "rx": self.spec.rx_position, "orientation": self.spec.rx_orientation,
             "settings": asdict(self.settings), "array": asdict(self.array), "frequencies": self.frequencies_hz,
@@ -72,17 +72,17 @@ class Job:
 
 
 def batch_file(folder: Path, batch: int) -> Path:
-    """Where the result of a batch lies."""
+    """Returns where the result of a batch lies."""
     return folder / f"{batch:04d}.npz"
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that may change a result."""
+    """Returns the versions of the packages that may change a result."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def run(job: Job, todo: list[int], folder: Path, workers: int, threads: int | None) -> Iterator[int]:
-    """Compute batches in `workers` processes with `threads` threads each, and yield every one when its file is written."""
+    """Computes batches in `workers` processes with `threads` threads each, and yields every one when its file is written."""
     backend = find_backend()
     if workers == 1:
         _start(job, backend, threads)
@@ -138,7 +138,7 @@ def _work(batch: int, folder: Path) -> int:
 
 
 def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
-    """The arrays of `Results` for one transmitter, of its paths at every frequency."""
+    """Returns the arrays of `Results` for one transmitter, of its paths at every frequency."""
     from data_gen import ceilings
 
     elements, nothing = job.array.element_positions(), np.full(len(ceilings.NAMES), np.nan)
@@ -152,7 +152,7 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
 
 
 def collect(job: Job, folder: Path) -> Results:
-    """Put the finished batches together; `read_back_hz` (freq,) beside the arrays of `Results`."""
+    """Puts the finished batches together: the arrays of `Results`, and `read_back_hz` (freq,)."""
     batches = [_load(batch_file(folder, b)) for b in range(job.n_batches)]
     read_back = [b.pop("read_back_hz") for b in batches]
     return {"read_back_hz": read_back[0], **{key: np.concatenate([b[key] for b in batches]) for key in batches[0]}}

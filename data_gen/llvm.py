@@ -39,7 +39,7 @@ _PROBE_SECONDS = 300
 
 
 def ensure_backend() -> str:
-    """Make `import sionna.rt` safe in this process: probe what there is (some seconds, once a process), then choose.
+    """Makes `import sionna.rt` safe in this process: probes what there is (some seconds, once a process), then chooses.
 
     Returns:
         "cuda", or "llvm" with DRJIT_LIBLLVM_PATH set.
@@ -53,7 +53,7 @@ def ensure_backend() -> str:
 
 
 def use_backend(backend: tuple[str, str]) -> None:
-    """Select a backend, a result of `find_backend`, without probing again."""
+    """Selects a backend, a result of `find_backend`, without probing again."""
     kind, library = backend
     if kind == LLVM:
         os.environ[VARIABLE] = library
@@ -64,7 +64,10 @@ def use_backend(backend: tuple[str, str]) -> None:
 
 
 def find_backend() -> tuple[str, str]:
-    """The backend to use: ("cuda", "") or ("llvm", library file). If DRJIT_LIBLLVM_PATH is set, no other library is tried."""
+    """Returns the backend to use: ("cuda", "") or ("llvm", library file).
+
+    If DRJIT_LIBLLVM_PATH is set, no other library is tried.
+    """
     try:
         importlib.metadata.version("sionna-rt")
     except importlib.metadata.PackageNotFoundError:
@@ -82,7 +85,7 @@ def find_backend() -> tuple[str, str]:
 
 
 def find_libraries() -> list[Path]:
-    """Files that look like a libLLVM that is new enough, in the usual folders, newest first, unknown versions last."""
+    """Returns files that look like a libLLVM that is new enough, in the usual folders, newest first, unknown versions last."""
     found: dict[Path, int] = {}
     for folder in _FOLDERS:
         for pattern in _PATTERNS:
@@ -94,14 +97,14 @@ def find_libraries() -> list[Path]:
 
 
 def library_version(path: Path) -> int | None:
-    """Major version in the name of a libLLVM file (libLLVM.so.19.1, libLLVM-17.so.1), links followed; None if it has none."""
+    """Returns the major version in the name of a libLLVM file (libLLVM.so.19.1, libLLVM-17.so.1), links followed; or None."""
     match = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", path.resolve().name)
     return int(match.group(1)) if match else None
 
 
 @functools.cache
 def probe(kind: str, library: str = "") -> bool:
-    """Whether a small solve in a child process survives (seconds; up to a minute the first time, when it compiles)."""
+    """Returns whether a small solve in a child process survives (seconds; up to a minute the first time, when it compiles)."""
     environment = {VARIABLE: library} if library else {}
     return _succeeds([sys.executable, "-c", _PROBE.format(variant=kind)], environment)
 

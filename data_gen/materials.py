@@ -70,7 +70,7 @@ _OWN = re.compile(rf"[\w-]+\(({_NUMBER}), ({_NUMBER}), ({_NUMBER}), ({_NUMBER})\
 
 
 def own_material(name: str, law: Law) -> str:
-    """The name under which a part of a material of a user's own carries its law, as in `clay(3.9, 0, 0.024, 0.16)`.
+    """Returns the name under which a part of a material of a user's own carries its law, as in `clay(3.9, 0, 0.024, 0.16)`.
 
     Raises:
         UserError: the name is taken or has odd characters, or no passive medium follows the law from 1 to 100 GHz.
@@ -84,20 +84,20 @@ def own_material(name: str, law: Law) -> str:
 
 
 def own_law(material: str) -> Law | None:
-    """The law in the name of a part's material; None for one of ITU-R P.2040, whose law the simulator knows."""
+    """Returns the law in the name of a part's material; None for one of ITU-R P.2040, whose law the simulator knows."""
     found = _OWN.fullmatch(material)
     return Law(*map(float, found.groups())) if found else None
 
 
 def check_material(name: str) -> str:
-    """Return `name`, or raise a `UserError` that lists the materials there are over all of `VALID_HZ`."""
+    """Returns `name`, or raises a `UserError` that lists the materials there are over all of `VALID_HZ`."""
     if name not in THICKNESS:
         raise UserError(f"unknown material {name!r}; choose among {', '.join(sorted(THICKNESS))}")
     return name
 
 
 def check_frequency(frequency_hz: float) -> float:
-    """Return `frequency_hz`, or raise a `UserError` when the materials are not defined there."""
+    """Returns `frequency_hz`, or raises a `UserError` when the materials are not defined there."""
     low, high = VALID_HZ
     if not low <= frequency_hz <= high:
         band = f"{low / 1e9:g}-{high / 1e9:g} GHz"
@@ -106,7 +106,7 @@ def check_frequency(frequency_hz: float) -> float:
 
 
 def check_material_frequencies(materials: Iterable[str], frequencies_hz: Iterable[float]) -> None:
-    """Raise a `UserError` when a material (one of `ITU` or of a user's own) is not defined at one of the frequencies."""
+    """Raises a `UserError` when a material (one of `ITU` or of a user's own) is not defined at one of the frequencies."""
     frequencies = [check_frequency(frequency) for frequency in frequencies_hz]
     for name in sorted(name for name in set(materials) if own_law(name) is None):
         _, low, high = ITU[name]

@@ -26,13 +26,13 @@ LARGEST = 300
 
 
 def is_solid(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> bool:
-    """Whether a mesh is a closed body. One as large as the scene (`bounds`) is the room itself, hence a sheet around it."""
+    """Returns whether a mesh is a closed body; one as large as the scene (`bounds`) is the room itself, hence a sheet."""
     is_room = (mesh.extents > ROOM_SHARE * np.ptp(bounds, axis=0)).all()
     return bool(mesh.is_watertight and abs(mesh.volume) > MIN_VOLUME and not is_room)
 
 
 def kind(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> str:
-    """What a part of this mesh is (`KINDS`) in a scene of these bounds; sheets in one of their six sides are the shell."""
+    """Returns the kind (`KINDS`) of a part of this mesh in a scene of these bounds, in whose six sides sheets are the shell."""
     if is_solid(mesh, bounds):
         return "solid"
     in_side = (np.abs(mesh.bounds - bounds[:, None]) < FLAT).all(1)
@@ -40,14 +40,14 @@ def kind(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> str:
 
 
 def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A solid with its normals outward, whichever way a mirrored or careless export turned them."""
+    """Returns a solid with its normals outward, whichever way a mirrored or careless export turned them."""
     mesh = mesh.copy()
     trimesh.repair.fix_normals(mesh, multibody=True)
     return mesh
 
 
 def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, "edges"]:
-    """At which of its `face_adjacency_edges` a mesh turns back onto itself, so that two triangles lie on each other."""
+    """Returns at which of its `face_adjacency_edges` a mesh turns back onto itself, so that two triangles lie on each other."""
     vertices = np.asarray(mesh.vertices)
     start, end = vertices[mesh.face_adjacency_edges].swapaxes(0, 1)
     along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
@@ -58,7 +58,7 @@ def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, "edges"]:
 
 
 def check_surfaces(parts: Sequence[Part]) -> None:
-    """Raise a `UserError` when a part folds back onto itself or two sheets lie on each other.
+    """Raises a `UserError` when a part folds back onto itself or two sheets lie on each other.
 
     A solid may touch a sheet, as furniture does that stands on the floor: the face in between is seen from nowhere.
     """
@@ -76,7 +76,7 @@ def check_surfaces(parts: Sequence[Part]) -> None:
 
 
 def _common(first: trimesh.Trimesh, second: trimesh.Trimesh) -> Float[np.ndarray, "points 3"]:
-    """Places on the first mesh where the second is, too, and parallel to it."""
+    """Returns the places on the first mesh where the second is, too, and parallel to it."""
     largest = np.argsort(-first.area_faces, kind="stable")[:LARGEST]
     points = (PLACES @ first.triangles[largest]).reshape(-1, 3)
     normals = np.repeat(first.face_normals[largest], len(PLACES), axis=0)
@@ -87,5 +87,5 @@ def _common(first: trimesh.Trimesh, second: trimesh.Trimesh) -> Float[np.ndarray
 
 
 def place(point: Sequence[float] | np.ndarray) -> str:
-    """A point for people, in metres."""
+    """Returns a point as text for people, in metres."""
     return f"({', '.join(f'{value:.4g}' for value in point)})"

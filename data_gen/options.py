@@ -47,7 +47,7 @@ class SceneOptions:
         return not self.scene.isdecimal()
 
     def spec(self, frequencies_hz: tuple[float, ...] = ()) -> SceneSpec:
-        """The scene, checked, at these frequencies (hertz) or at its own.
+        """Returns the scene, checked, at these frequencies (hertz) or at its own.
 
         Raises:
             UserError: a mistake in the scene, the receiver, the transmitters or the materials.
@@ -104,7 +104,7 @@ class Options(SceneOptions):
     """Folder for unfinished work."""
 
     def default_out(self) -> Path:
-        """Where the scene file goes unless told. A part of a released scene must not replace it."""
+        """Returns where the scene file goes unless told. A part of a released scene must not replace it."""
         if self.own:
             return Path(f"{Path(self.scene).stem}.npz")
         usual = Options()
@@ -116,7 +116,7 @@ class Options(SceneOptions):
 
 
 def make_job(options: Options) -> Job:
-    """Everything that decides the result, checked before hours are spent.
+    """Returns everything that decides the result, checked before hours are spent.
 
     Raises:
         UserError: a mistake in the scene, the receiver, the transmitters, the materials, the array or the frequencies.

@@ -43,12 +43,12 @@ class OwnScene(SceneSpec):
     """A scene from a file. Its walls need not close a room: being in it means being in the box around everything."""
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points are in the box around all objects."""
+        """Returns which points are in the box around all objects."""
         low, high = self.bounds()
         return ((points > low) & (points < high)).all(1)
 
     def check_receiver(self) -> None:
-        """Raise a `UserError` when the receiver is outside the scene, inside a solid or too near to a surface."""
+        """Raises a `UserError` when the receiver is outside the scene, inside a solid or too near to a surface."""
         point = np.asarray([self.rx_position], np.float64)
         where = f"the receiver at {place(point[0])} m"
         if not self.in_room(point)[0]:
@@ -65,7 +65,7 @@ def own_scene(
     file: Path, materials: Path | None, *, rx: str, tx_grid: str, frequencies_hz: Sequence[float] = (),
     up: str | None = None, scale: float = 1.0,
 ) -> OwnScene:  # fmt: skip
-    """Read and check a scene file.
+    """Reads and checks a scene file.
 
     Args:
         file: .glb, .gltf, .obj, .ply or .xml.
@@ -96,7 +96,7 @@ def own_scene(
 
 
 def describe(spec: SceneSpec) -> str:
-    """How the objects were understood, a line each: name, material, thickness (m), solid or sheet, number of triangles."""
+    """Returns how objects were understood, a line each: name, material, thickness (m), solid or sheet, number of triangles."""
     sort = {True: "solid", False: "sheet"}
     rows = [(p.name, p.material, f"{p.thickness:g} m", sort[p.closed], f"{len(p.mesh.faces)} triangles") for p in spec.parts]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -133,7 +133,7 @@ def _parts(objects: Sequence[FileObject], slabs: Sequence[Slab]) -> tuple[Part, 
 
 
 def _slabs(file: Path, objects: Sequence[FileObject], materials: Path | None) -> list[Slab]:
-    """The material of every object: by its name in the .toml, then by a pattern there, then what the file itself says."""
+    """Returns the material of every object: by its name in the .toml, by a pattern there, or what the file itself says."""
     tables = _read_toml(materials) if materials is not None else {}
     own = {name: _own_slab(name, table, f"{materials}") for name, table in tables.get("materials", {}).items()}
     chosen = {pattern: _slab(value, own, f"{materials}: {pattern!r}") for pattern, value in tables.get("objects", {}).items()}
@@ -178,7 +178,10 @@ def _read_toml(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _own_slab(name: str, table: Any, where: str) -> Slab:
-    """A user's own material: relative permittivity and conductivity (S/m), each a number or [a, b] for a f^b with f in GHz."""
+    """Returns a user's own material.
+
+    Its relative permittivity and conductivity (S/m) are each a number, or [a, b] for a f^b with f in GHz.
+    """
     keys = ("relative_permittivity", "conductivity", "thickness")
     if not isinstance(table, dict) or set(table) != set(keys):
         raise UserError(f"{where}: [materials.{name}] needs {', '.join(keys)} and nothing else; {HELP}")
@@ -189,7 +192,7 @@ def _own_slab(name: str, table: Any, where: str) -> Slab:
 
 
 def _slab(value: Any, own: dict[str, Slab], where: str) -> Slab:
-    """The slab that `"name"` or `{material = "name", thickness = metres}` stands for."""
+    """Returns the slab that `"name"` or `{material = "name", thickness = metres}` stands for."""
     table = {"material": value} if isinstance(value, str) else value
     if not isinstance(table, dict) or not isinstance(table.get("material"), str) or not set(table) <= {"material", "thickness"}:
         raise UserError(f'{where} needs "material" or {{material = "...", thickness = metres}}; quote names that have a dot')

@@ -61,7 +61,7 @@ class Options(SceneOptions):
 
 
 def draw(spec: SceneSpec, out: Path) -> None:
-    """Write the picture of a scene: plan on the left, view without ceiling and near walls on the right."""
+    """Writes the picture of a scene: plan on the left, view without ceiling and near walls on the right."""
     size = np.ptp(spec.bounds(), axis=0)
     beside = size[0] < 2.2 * size[1]  # a long floor has the view below the plan
     figure, (plan, view) = plt.subplots(
@@ -118,7 +118,7 @@ def _plan(axes: Axes, spec: SceneSpec, tx: Float[np.ndarray, "tx 3"], seen: Bool
 
 
 def _plan_solid(axes: Axes, part: Part) -> None:
-    """The outlines of a solid's bodies, the higher over the lower."""
+    """Draws the outlines of a solid's bodies, the higher over the lower."""
     bodies = [body for body in part.mesh.split() if body.bounds[0, 2] < PLAN_CUT]
     for body in bodies:
         outline = np.asarray(body.vertices)[ConvexHull(body.vertices[:, :2]).vertices, :2]  # every body is a box or a prism
@@ -129,7 +129,7 @@ def _plan_solid(axes: Axes, part: Part) -> None:
 
 
 def _plan_sheet(axes: Axes, part: Part) -> None:
-    """Where a wall is at the height of the cut; a doorway is a gap."""
+    """Draws where a wall is at the height of the cut; a doorway is a gap."""
     lines = trimesh.intersections.mesh_plane(part.mesh, (0, 0, 1), (0, 0, PLAN_CUT))
     width, color = (5 if part.kind == "shell" else 3), WALL_COLORS.get(part.material, _color(part.material))
     axes.add_collection(LineCollection(list(lines[:, :, :2]), colors=color, linewidths=width, capstyle="butt", zorder=3))
@@ -179,7 +179,7 @@ class _Raster:
         self._plane = np.zeros((2, *shape, 4))  # of what is drawn, opaque and glassy: where it changes there is an edge
 
     def fill(self, triangle: np.ndarray, normal: np.ndarray, color: np.ndarray, alpha: float) -> None:
-        """Draw a triangle where nothing is nearer; one with alpha < 1 lets through what lies behind it."""
+        """Draws a triangle where nothing is nearer; one with alpha < 1 lets through what lies behind it."""
         for rows, columns, depth in self._pixels(triangle):
             window = (rows, columns)
             front = depth > self._depth[window] + 1e-6
@@ -189,7 +189,7 @@ class _Raster:
                 self._depth[window][front] = depth[front]
 
     def _pixels(self, triangle: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
-        """The pixels around a triangle and its depth there, -inf beside it; nothing when it is seen edge-on."""
+        """Yields the pixels around a triangle and its depth there, -inf beside it; nothing when it is seen edge-on."""
         points = (triangle @ self._axes.T - self._low) * self._scale
         (x0, y0), (x1, y1) = np.floor(points[:, :2].min(0)).astype(int), np.ceil(points[:, :2].max(0)).astype(int)
         a, b, c = points
@@ -203,7 +203,7 @@ class _Raster:
         yield slice(y0, y1 + 1), slice(x0, x1 + 1), np.where(inside, a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2]), -np.inf)
 
     def mark(self, point: np.ndarray, color: np.ndarray) -> None:
-        """A disc with a white rim, drawn over everything."""
+        """Draws a disc with a white rim, drawn over everything."""
         x, y, _ = (self._axes @ point - self._low) * self._scale
         rows, columns = np.indices(self._depth.shape)
         away = np.hypot(columns - x, rows - y)
@@ -211,7 +211,7 @@ class _Raster:
         self._color[away < 15] = color
 
     def finish(self) -> Float[np.ndarray, "height width 3"]:
-        """The picture with an edge drawn wherever two planes meet, at half the size."""
+        """Returns the picture with an edge drawn wherever two planes meet, at half the size."""
         edge = np.zeros(self._depth.shape, bool)
         edge[1:] |= (np.abs(np.diff(self._plane, axis=1)) > 1e-6).any((0, -1))
         edge[:, 1:] |= (np.abs(np.diff(self._plane, axis=2)) > 1e-6).any((0, -1))
@@ -221,7 +221,7 @@ class _Raster:
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     options = tyro.cli(Options)
     draw(options.spec(), options.out)
     print(f"wrote {options.out}")

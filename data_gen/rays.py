@@ -49,7 +49,7 @@ class RayLauncher:
         return self._evenly + len(self._points)
 
     def aimed(self, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
-        """Unit directions (float32, world) of the aimed rays from a point (metres)."""
+        """Returns the unit directions (float32, world) of the aimed rays from a point (metres)."""
         through = self._mirror >= 0
         normals = self._normals[self._mirror[through]]
         height = (self._points[through] * normals).sum(-1) - self._offsets[self._mirror[through]]
@@ -59,7 +59,7 @@ class RayLauncher:
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
 
     def spawn(self, lattice: Callable[[int], Any], samples_per_src: int, src_positions: Any) -> Any:
-        """In place of `sionna.rt.utils.spawn_ray_from_sources`: the rays of one transmitter after another."""
+        """Returns, in place of `sionna.rt.utils.spawn_ray_from_sources`, the rays of one transmitter after another."""
         if samples_per_src != self.count:
             raise RuntimeError(f"asked for {samples_per_src} rays a transmitter instead of {self.count}")
         evenly = np.array(mi.warp.square_to_uniform_sphere(lattice(self._evenly))).T
@@ -71,7 +71,7 @@ class RayLauncher:
 
 
 def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, "planes"]]:
-    """Unit normals and offsets (n.x = offset, metres) of the planes of all single sheets, the largest first."""
+    """Returns unit normals and offsets (n.x = offset, metres) of the planes of all single sheets, the largest first."""
     area: dict[tuple[float, ...], float] = {}
     for part in spec.parts:
         if part.closed:
@@ -88,7 +88,7 @@ def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.nd
 
 
 def _points_on(faces: Float[np.ndarray, "faces 3 3"], count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """`count` points on every triangle, evenly distributed."""
+    """Returns `count` points on every triangle, evenly distributed."""
     u = rng.random((count, len(faces), 2))
     outside = u.sum(-1) > 1
     u[outside] = 1 - u[outside]

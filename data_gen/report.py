@@ -35,7 +35,7 @@ class Options:
 
 
 def report(files: tuple[Path, ...]) -> str:
-    """All tables: one row a file, then for every file one row a frequency."""
+    """Returns all tables: one row a file, then for every file one row a frequency."""
     scenes = {file: load_scene(file) for file in files}
     parts = [
         "### Files",
@@ -74,7 +74,7 @@ def _table(heading: list[str], rows: Any) -> str:
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     print(report(tyro.cli(Options).files))
 
 

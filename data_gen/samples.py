@@ -42,7 +42,7 @@ class Options:
 
 
 def draw(scene: SceneFile, out: Path, receiver: int = 0) -> None:
-    """Write the picture: one row a transmitter, one column a frequency; a cross is the transmitter's own direction.
+    """Writes the picture: one row a transmitter, one column a frequency; a cross is the transmitter's own direction.
 
     Raises:
         UserError: there is no such receiver, or the scene holds no spectra.
@@ -89,7 +89,7 @@ def _direction(receiver: Receiver, tx_position: Float[np.ndarray, "3"]) -> Float
 
 
 def main() -> None:
-    """Command line."""
+    """Runs the command line."""
     options = tyro.cli(Options)
     draw(load_scene(options.file), options.out, options.receiver)
     print(f"wrote {options.out}")

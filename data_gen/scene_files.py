@@ -39,7 +39,7 @@ class FileObject:
 
 
 def read_objects(file: Path, up: str | None = None, scale: float = 1.0) -> list[FileObject]:
-    """The objects of a file in order of their names, in metres and z-up.
+    """Returns the objects of a file in order of their names, in metres and z-up.
 
     Args:
         up: "y" or "z"; the axis that points up in the file. Unless given, y for GLB and glTF and z for all others.
@@ -137,7 +137,7 @@ def _xml_object(shape: ET.Element, number: int, materials: dict, file: Path) -> 
 
 
 def _xml_transform(transform: ET.Element | None, name: str, file: Path) -> Float[np.ndarray, "4 4"]:
-    """Mitsuba applies the steps of a transform in the order in which they are written."""
+    """Returns the matrix of a transform; Mitsuba applies its steps in the order in which they are written."""
     result = np.eye(4)
     for step in transform if transform is not None else ():
         match step.tag:
@@ -166,7 +166,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _xml_material(bsdf: ET.Element) -> tuple[str, float] | None:
-    """Material and thickness as Sionna RT understands a bsdf; None for one that says nothing about radio."""
+    """Returns the material and thickness as Sionna RT understands a bsdf; None for one that says nothing about radio."""
 
     def value(kind: str, name: str, missing: float | str) -> Any:
         found = bsdf.find(f"{kind}[@name='{name}']")

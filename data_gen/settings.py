@@ -49,7 +49,7 @@ class ArraySettings:
     polarization: Literal["V", "H"] = "V"
 
     def element_positions(self) -> Float[np.ndarray, "elements 3"]:
-        """Local positions in wavelengths, centred on the origin.
+        """Returns the local positions in wavelengths, centred on the origin.
 
         In the y-z plane columns run along +y and rows down -z; in the x-y plane rows run along -x, in the x-z plane columns
         along +x instead.

@@ -46,11 +46,11 @@ class TxPaths:
     """Number of interactions; 0 is the line of sight."""
 
     def snapshot(self) -> Complex[np.ndarray, "elements"]:
-        """Coherent sum of the paths, complex64."""
+        """Returns the coherent sum of the paths, complex64."""
         return self.coefficients.sum(0).astype(np.complex64)
 
     def delay_spread(self) -> float:
-        """R.m.s. delay spread in seconds, weighted by power; 0 without a path."""
+        """Returns the r.m.s. delay spread in seconds, weighted by power; 0 without a path."""
         power = (np.abs(self.coefficients) ** 2).sum(-1)
         if not power.sum() > 0:
             return 0.0
@@ -70,7 +70,7 @@ class Simulator:
         self._tracer = PathTracer(self._scene, RayLauncher(spec, settings), settings)
 
     def paths(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]) -> list[list[TxPaths]]:
-        """All paths from every transmitter (world frame, metres) to the receiver: a list of transmitters a frequency (hertz).
+        """Returns all paths from every transmitter (world frame, metres) to the receiver: by frequency, then by transmitter.
 
         Random numbers belong to the place in the batch: the same batch gives the same bits, another grouping almost the same.
 
@@ -122,7 +122,7 @@ def _load(spec: SceneSpec, array: ArraySettings) -> rt.Scene:
 
 
 def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
-    """Sionna's orientation (radians; R = Rz Ry Rx) of a unit quaternion (wxyz, local to world)."""
+    """Returns Sionna's orientation (radians; R = Rz Ry Rx) of a unit quaternion (wxyz, local to world)."""
     w, x, y, z = quaternion
     if np.hypot(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) < 1e-6:  # straight up or down: yaw and roll are one
         return [float(2 * np.arctan2(z, w)), float(np.copysign(np.pi / 2, w * y - z * x)), 0.0]

@@ -94,7 +94,7 @@ class PathTracer:
         self._scene, self._rays, self._settings = scene, rays, settings
 
     def trace(self) -> PathsBuffer:
-        """The geometry of all paths, for `fields`. The transmitters must stay where they are between the two.
+        """Returns the geometry of all paths, for `fields`. The transmitters must stay where they are between the two.
 
         Raises:
             UserError: a transmitter has more candidate paths than the buffer holds.
@@ -123,7 +123,7 @@ class PathTracer:
         return paths
 
     def fields(self, traced: PathsBuffer) -> rt.Paths:
-        """The traced paths with the coefficients they have at the scene's present frequency."""
+        """Returns the traced paths with the coefficients they have at the scene's present frequency."""
         scene = self._scene
         # Not those of `trace`: the distances between antenna elements follow the wavelength.
         sources, targets = self._ends()
@@ -139,7 +139,7 @@ class PathTracer:
         return rt.Paths(scene, sources[0], targets[0], sources[3], targets[3], True, paths, sources[2], targets[2])
 
     def _ends(self) -> tuple[Any, Any]:
-        """Positions, orientations, element positions and velocities of the transmitters and of the receiver."""
+        """Returns positions, orientations, element positions and velocities of the transmitters and of the receiver."""
         return self._scene.sources(True, True), self._scene.targets(True, True)
 
     def _check_room(self, source_indices: np.ndarray) -> None:

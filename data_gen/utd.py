@@ -27,7 +27,7 @@ from sionna.rt.utils.wedges import wedge_interior_angle
 
 
 def diffraction_matrix(thickness: Any, to_world: Any, ki: Any, ko: Any, si: Any, eta: Any, wavenumber: Any) -> Any:
-    """Jones matrix (4x4 real, implicit world basis) of a diffracted ray.
+    """Returns the Jones matrix (4x4 real, implicit world basis) of a diffracted ray.
 
     Args:
         thickness: of the slab on both faces, metres.
@@ -53,7 +53,8 @@ def diffraction_matrix(thickness: Any, to_world: Any, ki: Any, ko: Any, si: Any,
         a = 2 * dr.square(dr.cos(exterior * turns - beta / 2))
         return factor * cot_times_f_utd((dr.pi + sign * beta) * dr.rcp(2 * n), kl * a, n, kl)
 
-    factor: Any = -dr.exp(mi.Complex2f(0, -dr.pi / 4)) * dr.rcp(2 * n * dr.sqrt(dr.two_pi * wavenumber) * sin_beta)  # type: ignore[operator]
+    complex_number: Any = mi.Complex2f  # to type checkers an object of no type
+    factor = -dr.exp(complex_number(0, -dr.pi / 4)) * dr.rcp(2 * n * dr.sqrt(dr.two_pi * wavenumber) * sin_beta)
     minus, plus = phi_out - phi_in, phi_out + phi_in
     incident = -(coefficient(1, minus) + coefficient(-1, minus))
     real, imaginary = _diagonal(incident.real, incident.real), _diagonal(incident.imag, incident.imag)
@@ -75,7 +76,7 @@ def diffraction_matrix(thickness: Any, to_world: Any, ki: Any, ko: Any, si: Any,
 
 
 def end_unused_vertices(paths: PathsBuffer, receivers: Any) -> None:
-    """Put the vertices beyond a path's last interaction at its receiver, in place.
+    """Puts the vertices beyond a path's last interaction at its receiver, in place.
 
     Sionna RT 2.2.0 takes the path length after the edge (`FieldCalculator._diffraction_compute_s_s_prime`) through the first
     vertex that is not used, wherever that is; with the vertex at the receiver the length is right.
@@ -96,5 +97,5 @@ def _diagonal(first: Any, second: Any) -> Any:
 
 
 def _implicit(to_world: Any, direction: Any) -> Any:
-    """Sionna's implicit basis vector of a direction, in the local frame."""
+    """Returns Sionna's implicit basis vector of a direction, in the local frame."""
     return to_world.T @ implicit_basis_vector(to_world @ direction)

@@ -226,7 +226,7 @@ def listing(jobs: list[Job], command: Command) -> str:
         begun = folder_of(job, command).exists()
         state = "done" if results.get(job) else "begun" if begun else "open"
         seconds = durations.expect(job)
-        lines.append(f"{state:6} {'?' if seconds is None else f'{seconds:.0f}':>6} s  {job.name}")
+        lines.append(f"{state:6} {'?' if seconds is None else f'{seconds:.0f}':>6} s  {job.profile}/{job.name}")
     open_jobs = [job for job in jobs if results.get(job) is None]
     return "\n".join([*lines, f"{len(jobs)} jobs: {durations.left(open_jobs)}"])
 

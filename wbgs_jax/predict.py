@@ -97,7 +97,7 @@ def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, "freq"]:
 
 
 def check(command: Command) -> None:
-    """A command line that asks for nothing, or for half of something, is a `UserError`."""
+    """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
     for name, suffix in SUFFIXES.items():
         path = getattr(command, name)
         if path is not None and path.suffix != suffix:

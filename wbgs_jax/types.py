@@ -47,7 +47,7 @@ class Gaussians:
     @property
     def alive(self) -> Bool[Array, "n"]:
         """Which slots hold a Gaussian."""
-        return self.opacity_logits > -jnp.inf
+        return jnp.greater(self.opacity_logits, -jnp.inf)
 
 
 @pytree

@@ -22,13 +22,13 @@ Corners = list[tuple[float, ...]]
 
 
 def panel(axis: int, at: float, low: tuple[float, float], high: tuple[float, float]) -> Corners:
-    """The corners of a rectangle across an axis (0, 1 or 2 for x, y or z), in order around it."""
+    """Returns the corners of a rectangle across an axis (0, 1 or 2 for x, y or z), in order around it."""
     (a, b), (c, d) = low, high
     return [(*uv[:axis], at, *uv[axis:]) for uv in ((a, b), (c, b), (c, d), (a, d))]
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> list[Corners]:
-    """The six faces of a box; those on the low side are turned, so that all normals point outward."""
+    """Returns the six faces of a box; those on the low side are turned, so that all normals point outward."""
     faces = []
     for axis, (i, j) in enumerate(((1, 2), (0, 2), (0, 1))):
         for at, outward in ((low[axis], axis == 1), (high[axis], axis != 1)):
@@ -38,14 +38,14 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> li
 
 
 def wall_with_hole(at: float, hole: tuple[float, float, float, float]) -> list[Corners]:
-    """A wall across y, cut into panels left, right, above and below a hole."""
+    """Returns a wall across y, cut into panels left, right, above and below a hole."""
     left, bottom, right, top = hole
     pieces = [((0, 0), (left, Z)), ((right, 0), (X, Z)), ((left, top), (right, Z)), ((left, 0), (right, bottom))]
     return [panel(1, at, low, high) for low, high in pieces if low[1] < high[1]]
 
 
 def table(x: float, y: float, length: float = 1.6, depth: float = 0.8, height: float = 0.75) -> list[Corners]:
-    """A board on four legs, centred on (x, y)."""
+    """Returns a board on four legs, centred on (x, y)."""
     half, under = (length / 2, depth / 2), height - 0.04
     faces = box((x - half[0], y - half[1], under), (x + half[0], y + half[1], height))
     for dx, dy in itertools.product((-1, 1), repeat=2):
@@ -69,7 +69,7 @@ OBJECTS: dict[str, list[Corners]] = {
 
 
 def obj(objects: dict[str, list[Corners]]) -> str:
-    """The text of an OBJ file: for every object its name, its corners and its rectangles, which count corners from 1."""
+    """Returns the text of an OBJ file: for every object its name, corners and rectangles, which count corners from 1."""
     lines, first = ["# python -m data_gen.example.make_room"], 1
     for name, faces in objects.items():
         lines.append(f"o {name}")
@@ -80,7 +80,7 @@ def obj(objects: dict[str, list[Corners]]) -> str:
 
 
 def main(folder: Path = HERE) -> None:
-    """Write the file."""
+    """Writes the file."""
     (folder / "room.obj").write_text(obj(OBJECTS))
 
 

@@ -17,7 +17,7 @@ __all__ = ["FREQUENCIES_21_HZ", "FREQUENCIES_HZ", "SCENES", "Part", "SceneSpec",
 
 
 def get_scene(number: int) -> SceneSpec:
-    """Build a scene by number; an unknown one is a `UserError` that lists those there are."""
+    """Builds a scene by number; an unknown one is a `UserError` that lists those there are."""
     if number not in SCENES:
         raise UserError(f"there is no scene {number}; choose among {', '.join(map(str, sorted(SCENES)))}")
     return SCENES[number]()

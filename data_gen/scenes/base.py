@@ -53,7 +53,7 @@ class Part:
 
 
 def part(name: str, mesh: trimesh.Trimesh, material: str, thickness: float | None = None, kind: str = "solid") -> Part:
-    """A part with a checked material and, unless given, that material's default thickness (metres)."""
+    """Returns a part with a checked material and, unless given, that material's default thickness (metres)."""
     check_material(material)
     if kind not in KINDS:
         raise ValueError(f"a part is one of {KINDS}, not {kind!r}")
@@ -79,31 +79,31 @@ class SceneSpec:
         return tuple(p for p in self.parts if p.closed)
 
     def triangles(self, *kinds: str) -> Float[np.ndarray, "m 3 3"]:
-        """Corners of all triangles of the parts of some kinds, of all kinds unless given."""
+        """Returns the corners of all triangles of the parts of some kinds, of all kinds unless given."""
         found = [np.asarray(p.mesh.triangles) for p in self.parts if p.kind in (kinds or KINDS)]
         return np.concatenate([np.zeros((0, 3, 3)), *found])
 
     def mesh(self, *kinds: str) -> trimesh.Trimesh:
-        """The same triangles as one mesh."""
+        """Returns the same triangles as one mesh."""
         return trimesh.Trimesh(**trimesh.triangles.to_kwargs(self.triangles(*kinds)), process=False)
 
     def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Lowest and highest corner of the room."""
+        """Returns the lowest and highest corner of the room."""
         corners = np.concatenate([p.mesh.bounds for p in self.parts])
         return np.stack([corners.min(0), corners.max(0)])
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
+        """Returns which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
         low, high = self.bounds()
         outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # askew, to meet no edge of a wall
         return crossings(self.mesh("shell"), points, outside) % 2 == 1
 
     def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """From which points nothing, not even glass, hides the receiver."""
+        """Returns from which points nothing, not even glass, hides the receiver."""
         return crossings(self.mesh(), points, np.asarray(self.rx_position)) == 0
 
     def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points are inside a solid."""
+        """Returns which points are inside a solid."""
         inside = np.zeros(len(points), bool)
         for p in self.solids:
             near = trimesh.bounds.contains(p.mesh.bounds, points)  # the others need no look at the triangles
@@ -111,11 +111,11 @@ class SceneSpec:
         return inside
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Distance (metres) of every point to the nearest surface."""
+        """Returns the distance (metres) of every point to the nearest surface."""
         return distance(self.mesh(), points)
 
     def accessible_tx(self) -> Float[np.ndarray, "tx 3"]:
-        """The candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.
+        """Returns the candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.
 
         Raises:
             UserError: the receiver is inside or too near to something, or no candidate is left.
@@ -129,13 +129,13 @@ class SceneSpec:
         return grid[keep]
 
     def check_receiver(self) -> None:
-        """Raise a `UserError` when the receiver is outside the room, inside an object or too near to a surface."""
+        """Raises a `UserError` when the receiver is outside the room, inside an object or too near to a surface."""
         point = np.asarray([self.rx_position], np.float64)
         if not self.in_room(point)[0] or self.inside_objects(point)[0] or self.distance(point)[0] < RX_CLEARANCE:
             raise UserError(f"the receiver of scene {self.name} at {self.rx_position} is not {RX_CLEARANCE} m clear; move it")
 
     def mesh_arrays(self) -> dict[str, np.ndarray]:
-        """All surfaces as one mesh: vertices (n, 3) float32, faces (m, 3) int32, face_part (m,) int32 index into `parts`."""
+        """Returns all surfaces as one mesh: vertices (n, 3), faces (m, 3), and face_part (m,), the index into `parts`."""
         offsets = np.cumsum([0, *(len(p.mesh.vertices) for p in self.parts)])
         vertices = np.concatenate([np.asarray(p.mesh.vertices, np.float32) for p in self.parts])
         faces = np.concatenate([np.asarray(p.mesh.faces) + start for p, start in zip(self.parts, offsets, strict=False)])
@@ -143,18 +143,18 @@ class SceneSpec:
         return {"vertices": vertices, "faces": faces.astype(np.int32), "face_part": face_part.astype(np.int32)}
 
     def mesh_sha256(self) -> str:
-        """Checksum of the surfaces and their materials."""
+        """Returns the checksum of the surfaces and their materials."""
         digest = hashlib.sha256(repr(self.part_table()).encode())
         for array in self.mesh_arrays().values():
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
     def part_table(self) -> list[dict[str, Any]]:
-        """Name, material and thickness (metres) of every part, as in a scene file's meta."""
+        """Returns name, material and thickness (metres) of every part, as in a scene file's meta."""
         return [{"name": p.name, "material": p.material, "thickness": p.thickness} for p in self.parts]
 
 
 def grid_3d(low: Vec3, high: Vec3, counts: tuple[int, int, int]) -> Float[np.ndarray, "n 3"]:
-    """A uniform grid with both ends included, x slowest, z fastest."""
+    """Returns a uniform grid with both ends included, x slowest, z fastest."""
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -22,14 +22,14 @@ CHUNK = 1_000_000
 
 
 def box(low: Vec3, high: Vec3) -> trimesh.Trimesh:
-    """A closed axis-aligned box."""
+    """Returns a closed axis-aligned box."""
     mesh = trimesh.creation.box(extents=np.subtract(high, low))
     mesh.apply_translation(np.add(low, high) / 2)
     return mesh
 
 
 def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several bodies as one mesh."""
+    """Returns several bodies as one mesh."""
     meshes = list(meshes)
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = [np.asarray(m.faces) + start for m, start in zip(meshes, offsets, strict=False)]
@@ -37,7 +37,7 @@ def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """How often a closed mesh goes around every point: 0 outside, 1 or -1 inside (sum of the triangles' solid angles)."""
+    """Returns how often a closed mesh goes around every point: 0 outside, 1 or -1 inside (from its triangles' solid angles)."""
     step = max(1, CHUNK // max(1, len(mesh.faces)))
     each = [_solid_angles(mesh, points[i : i + step]).sum(1) for i in range(0, len(points), step)]
     return np.concatenate([np.zeros(0), *each]) / (4 * np.pi)
@@ -52,7 +52,7 @@ def _solid_angles(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Fl
 
 
 def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, "n"]:
-    """How many triangles of a mesh the straight segment from every start to the one end goes through."""
+    """Returns how many triangles of a mesh the straight segment from every start to the one end goes through."""
     if not len(start) or not len(mesh.faces):
         return np.zeros(len(start), int)
     _demand_rtree()
@@ -64,7 +64,7 @@ def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float
 
 
 def distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Distance of every point to the nearest place on a mesh."""
+    """Returns the distance of every point to the nearest place on a mesh."""
     _demand_rtree()
     return trimesh.proximity.closest_point(mesh, points)[1] if len(points) else np.zeros(0)
 

@@ -32,7 +32,7 @@ DINING = (2.4, 0.6)
 
 
 def scene1() -> SceneSpec:
-    """The room, its furniture, the receiver and the candidate transmitters."""
+    """Returns the room, its furniture, the receiver and the candidate transmitters."""
     return SceneSpec(
         name="scene1",
         description="sparsely furnished living room, 10 x 7.5 x 3 m",

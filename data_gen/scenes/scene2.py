@@ -48,7 +48,7 @@ BEARING_Y = 0.85
 
 
 def scene2() -> SceneSpec:
-    """The flat, its furniture, the receiver and the candidate transmitters."""
+    """Returns the flat, its furniture, the receiver and the candidate transmitters."""
     return SceneSpec(
         name="scene2",
         description="densely furnished two-bedroom flat, 11 x 8.5 x 2.7 m",

@@ -50,7 +50,7 @@ TX_LOW, TX_HIGH = (-5.41, -4.37, 0.6), (5.64, 4.31, 2.45)
 
 
 def scene3() -> SceneSpec:
-    """The flat, its furniture, the receiver and the candidate transmitters."""
+    """Returns the flat, its furniture, the receiver and the candidate transmitters."""
     grid = grid_3d(TX_LOW, TX_HIGH, TX_COUNTS)
     return SceneSpec(
         name="scene3",

@@ -44,7 +44,7 @@ CORRIDOR_Y = -1.15
 
 
 def scene4() -> SceneSpec:
-    """The floor, its furniture, the receiver and the candidate transmitters."""
+    """Returns the floor, its furniture, the receiver and the candidate transmitters."""
     return SceneSpec(
         name="scene4",
         description="densely furnished office floor along a corridor, 18 x 6 x 2.8 m",
@@ -116,7 +116,7 @@ def _offices() -> list[Part]:
 
 
 def _work_place(number: int, x: float, y: float, facing: int) -> list[Part]:
-    """A desk with a display and, in front of it, a chair that looks at it."""
+    """Returns a desk with a display and, in front of it, a chair that looks at it."""
     ahead = {1: (-1, 0), 2: (0, -1)}[facing]
     chair_at = (x + 0.68 * ahead[0], y + 0.68 * ahead[1])
     display_at = (x - 0.15 * ahead[0], y - 0.15 * ahead[1])

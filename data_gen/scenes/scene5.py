@@ -52,12 +52,12 @@ TX_BELOW_ROOF = 0.2
 
 
 def roof(y: float) -> float:
-    """Height of the ceiling in metres."""
+    """Returns the height of the ceiling in metres."""
     return LOW + RISE * (y + DEPTH / 2)
 
 
 def scene5() -> SceneSpec:
-    """The flat, its furniture, the receiver and the candidate transmitters."""
+    """Returns the flat, its furniture, the receiver and the candidate transmitters."""
     grid = grid_3d(TX_LOW, TX_HIGH, TX_COUNTS)
     return SceneSpec(
         name="scene5",

@@ -28,7 +28,7 @@ TX_LOW, TX_HIGH = (-3.34, -2.46, 0.6), (3.11, 2.46, 2.4)
 
 
 def scene6() -> SceneSpec:
-    """The room, its furniture, the receiver and the candidate transmitters."""
+    """Returns the room, its furniture, the receiver and the candidate transmitters."""
     return SceneSpec(
         name="scene6",
         description="sparsely furnished bedroom with a chimney breast, 7 x 5.5 x 2.6 m",

@@ -39,7 +39,7 @@ def wall(
     openings: Mapping[str, tuple[Rectangle, str | None]] | None = None,
     thickness: float | None = None, rise: float = 0.0, kind: str = "shell",
 ) -> list[Part]:  # fmt: skip
-    """A rectangular surface with doors or windows flush in it.
+    """Returns a rectangular surface with doors or windows flush in it.
 
     The rectangle is cut along the lines of all openings; a cell belongs to the opening that covers it, otherwise to the wall.
     The parts meet at shared vertices, without a hole and without overlap.
@@ -74,7 +74,7 @@ def wall(
 def box_room(
     size: Vec3, materials: Mapping[str, str], openings: Mapping[str, Mapping[str, tuple[Rectangle, str | None]]] | None = None
 ) -> list[Part]:
-    """Floor, ceiling and four walls of a room whose floor is centred on the origin.
+    """Returns floor, ceiling and four walls of a room whose floor is centred on the origin.
 
     Args:
         size: along x, y and z in metres.
@@ -105,7 +105,7 @@ def _owner(openings: Mapping[str, tuple[Rectangle, str | None]], u: float, v: fl
 
 
 def _sheet(uv: np.ndarray, corner: Vec3, along: Vec3, up: Vec3) -> trimesh.Trimesh:
-    """Quadrilaterals, four rows of `uv` each, as one mesh."""
+    """Returns quadrilaterals, four rows of `uv` each, as one mesh."""
     vertices = np.asarray(corner) + uv[:, :1] * np.asarray(along) + uv[:, 1:] * np.asarray(up)
     faces = (4 * np.arange(len(uv) // 4)[:, None] + np.array([[[0, 1, 2]], [[0, 2, 3]]])).reshape(-1, 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -145,7 +145,7 @@ class _Line:
         return float(np.max(np.subtract(self.end, self.start)))
 
     def box(self, u: Vec2, v: Vec2, z: Vec2) -> trimesh.Trimesh:
-        """A box from ranges along, across and above the line."""
+        """Returns a box from ranges along, across and above the line."""
         (ax, ay), (x, y) = self.along, self.start
         xs = sorted(x + ax * a - ay * b for a, b in zip(u, v, strict=True))
         ys = sorted(y + ay * a + ax * b for a, b in zip(u, v, strict=True))
@@ -156,7 +156,7 @@ def inner_wall(
     name: str, start: Vec2, end: Vec2, height: float, material: str = "plasterboard", thickness: float | None = None,
     doors: Sequence[Door] = (), free: tuple[bool, bool] = (False, False), rise: float = 0.0,
 ) -> list[Part]:  # fmt: skip
-    """A wall between rooms: the sheet, and in wood the door frames, the open leaves and the posts at free ends.
+    """Returns a wall between rooms: the sheet, and in wood the door frames, the open leaves and the posts at free ends.
 
     Args:
         start, end: its foot, along +x or +y, in metres; it touches what it ends at unless that end is free.
@@ -191,7 +191,7 @@ def _upright(line: _Line, u0: float, u1: float, top: float) -> trimesh.Trimesh:
 
 
 def _frame(line: _Line, door: Door) -> list[trimesh.Trimesh]:
-    """Two jambs and a head on them."""
+    """Returns two jambs and a head on them."""
     half, depth = door.width / 2, FRAME_DEPTH / 2
     head = (door.height + JOINT, door.height + JOINT + FRAME)
     return [
@@ -202,7 +202,7 @@ def _frame(line: _Line, door: Door) -> list[trimesh.Trimesh]:
 
 
 def _leaf(line: _Line, door: Door, jamb: int, side: int) -> trimesh.Trimesh:
-    """A leaf opened by a quarter turn: it stands across the wall in front of its jamb."""
+    """Returns a leaf opened by a quarter turn: it stands across the wall in front of its jamb."""
     hinge = door.at + jamb * (door.width / 2 + FRAME / 2)
     near = FRAME_DEPTH / 2 + GAP
     return line.box(

@@ -43,7 +43,7 @@ class Size:
 
 
 SIZES = (Size(2000, dense=True, torch=True), Size(10_000, torch=True), Size(70_000))
-QUICK_SIZE = Size(300, (2,), dense=True, torch=True)
+QUICK_SIZE = Size(64, (2,), dense=True, torch=True)
 MEMORY_SIZE = Size(70_000, (8,))
 GPU_SIZE = Size(10_000, (64,))
 
@@ -97,11 +97,11 @@ def jax_calls(report: Report, effort: Effort, size: Size, scene: Scene, b: int) 
     """The tiled renderer, and the dense one where it fits."""
     inputs = scene.inputs(b)
     compiled = {
-        "render_fwd": scene.compile_forward(scene.tiled, b),
-        "render_fwd_bwd": scene.compile_gradient(scene.tiled, b),
+        "render_fwd": scene.lower_forward(scene.tiled, b).compile(),
+        "render_fwd_bwd": scene.lower_gradient(scene.tiled, b).compile(),
     }
     if size.dense and b <= OTHERS_LARGEST:
-        dense = scene.compile_gradient_one_by_one(scene.dense, b)  # as fast as all at once
+        dense = scene.lower_gradient_one_by_one(scene.dense, b).compile()  # as fast as all at once
         if (needed := temporary_gb(dense)) > effort.memory_limit_gb:
             report.skip(f"dense_fwd_bwd_{size.tag(b)}", f"it needs {needed:.0f} GB")
         else:
@@ -160,7 +160,7 @@ def measure_throughput(report: Report, effort: Effort, size: Size) -> None:
     """Spectra a second of a large batch, forward."""
     (b,) = size.batches
     scene = random_scene(size.n, b, effort.seed)
-    forward = functools.partial(scene.compile_forward(scene.tiled, b), *scene.inputs(b))
+    forward = functools.partial(scene.lower_forward(scene.tiled, b).compile(), *scene.inputs(b))
     seconds = interleaved({"forward": forward}, effort)["forward"]
     report.add_sample(f"pas_per_s_{size.tag(b)}", b / seconds, "1/s", "higher")
 
@@ -172,6 +172,6 @@ def measure_memory(report: Report, effort: Effort) -> None:
     say(f"memory: {size.n} Gaussians, batches of {b}")
     scene = random_scene(size.n, b, effort.seed)
     begin = time.perf_counter()
-    compiled = scene.compile_gradient(scene.tiled, b)
+    compiled = scene.lower_gradient(scene.tiled, b).compile()
     report.add(f"compile_s_{size.tag(b)}", time.perf_counter() - begin, "s", "lower")
     report.add(f"temp_gb_{size.tag(b)}", temporary_gb(compiled), "GB", "lower")

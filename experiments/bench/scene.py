@@ -35,27 +35,28 @@ class Scene:
     limits: TileLimits
 
     def inputs(self, b: int) -> tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"], Float[Array, "b 90 360"]]:
-        """Inputs of compiled functions, for the first b queries."""
+        """Returns the inputs of compiled functions, for the first b queries."""
         return self.gaussians, self.attenuation[:, :b], self.signal[:, :b], self.cotangent[:b]
 
     def tiled(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
-        """The project's renderer, geometry included."""
+        """Returns what the project's renderer draws, geometry included."""
         return render_splats(geometry_plan(gaussians, self.receiver, self.limits), attenuation, signal)
 
     def dense(self, gaussians: Gaussians, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]):
-        """The reference."""
+        """Returns what the reference draws."""
         return render_dense(project(gaussians, self.receiver), attenuation, signal)
 
-    def compile_forward(self, render: Render, b: int) -> jax.stages.Compiled:
-        """A renderer."""
-        return jax.jit(lambda *inputs: render(*inputs[:3])).lower(*self.inputs(b)).compile()
+    def lower_forward(self, render: Render, b: int) -> jax.stages.Lowered:
+        """Returns a renderer, ready to be compiled."""
+        return jax.jit(lambda *inputs: render(*inputs[:3])).lower(*self.inputs(b))
 
-    def compile_gradient(self, render: Render, b: int) -> jax.stages.Compiled:
-        """A renderer's forward and backward."""
-        return jax.jit(_gradient(render)).lower(*self.inputs(b)).compile()
+    def lower_gradient(self, render: Render, b: int) -> jax.stages.Lowered:
+        """Returns a renderer's forward and backward, ready to be compiled."""
+        return jax.jit(_gradient(render)).lower(*self.inputs(b))
 
-    def compile_gradient_one_by_one(self, render: Render, b: int) -> jax.stages.Compiled:
-        """The same, query after query: for a renderer that keeps every (Gaussian, pixel, query) for its backward pass."""
+    def lower_gradient_one_by_one(self, render: Render, b: int) -> jax.stages.Lowered:
+        """Returns the same, query after query: for a renderer that keeps every (Gaussian, pixel, query) for its backward
+        pass."""
         gradient = _gradient(render)
 
         def gradients(gaussians, *queries):
@@ -67,7 +68,7 @@ class Scene:
             total, others = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, gaussians), (attenuation.T, signal.T, cotangent))
             return total, *(a.T for a in others)
 
-        return jax.jit(gradients).lower(*self.inputs(b)).compile()
+        return jax.jit(gradients).lower(*self.inputs(b))
 
 
 def _gradient(render: Render) -> Callable[..., tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"]]]:
@@ -78,7 +79,7 @@ def _gradient(render: Render) -> Callable[..., tuple[Gaussians, Float[Array, "n 
 
 
 def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:
-    """Directions even over the hemisphere, footprints of 2-10 degrees (3 sigma), distances of 1-6 m."""
+    """Returns Gaussians with directions even over the hemisphere, footprints of 2-10 degrees (3 sigma), distances of 1-6 m."""
     cosine, azimuth, distance = rng.uniform(0, 1, n), rng.uniform(-np.pi, np.pi, n), rng.uniform(1, 6, n)
     sine = np.sqrt(1 - cosine**2)
     means = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], -1) * distance[:, None]
@@ -89,7 +90,7 @@ def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:
 
 
 def random_scene(n: int, b: int, seed: int) -> Scene:
-    """A scene for up to b queries."""
+    """Returns a scene for up to b queries."""
     rng = np.random.default_rng([seed, n])
     gaussians, receiver = random_gaussians(rng, n), make_receiver([0.0, 0.0, 0.0])
     attenuation, signal = (jnp.asarray(rng.uniform(0, 0.6, (n, b)), jnp.float32) for _ in range(2))
@@ -99,7 +100,7 @@ def random_scene(n: int, b: int, seed: int) -> Scene:
 
 
 def temporary_gb(compiled: jax.stages.Compiled) -> float:
-    """Memory that a compiled function takes beyond its inputs and outputs."""
+    """Returns the memory (GB) that a compiled function takes beyond its inputs and outputs."""
     analysis = compiled.memory_analysis()
     assert analysis is not None, "every backend with XLA knows"
     return analysis.temp_size_in_bytes / 1e9

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import optax
 
 from experiments.bench.timing import Effort, Report, interleaved
+from experiments.profiles import TINY
 from wbgs_jax._util.command import say
 from wbgs_jax.config import Settings, changed, limit_steps
 from wbgs_jax.data import load_dataset
@@ -36,8 +37,9 @@ def preset(effort: Effort) -> str:
 
 
 def settings(effort: Effort) -> Settings:
-    """Returns the settings of that preset."""
-    return get_field(FIELD).presets[preset(effort)]
+    """Returns the settings of that preset, with a tiny field where the figures mean nothing."""
+    chosen = get_field(FIELD).presets[preset(effort)]
+    return changed(chosen, {"field": TINY, "loop": {"epoch_steps": 2}}) if effort.quick else chosen
 
 
 def start_run(effort: Effort, folder: Path, epoch_steps: int | None = None) -> Run:
@@ -82,8 +84,8 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         return jax.grad(lambda *args: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(function(*args))), argnums)
 
     query = jax.tree.map(lambda a: a[index], data.links.query)
-    planned = field.portable(field.plan(params, receiver, run.limits))  # without what the networks make of the Gaussians
-    geometry = planned.geometry
+    geometry = plan(params)
+    planned = wideband.WidebandPlan(geometry, None, field.frame, receiver, field.config)  # features: in every call
     even = jnp.full((params.gaussians.alive.size, len(index)), 0.3)  # the time does not depend on these values
     splatting = (geometry.splats, geometry.jobs, even, even)
     image, gradients = 0.9 * data.pas(index), params

@@ -103,6 +103,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, m
     assert len(calls) == 4
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path):
     """The real thing: SIGKILL in the middle of a run of the command, and the command again."""
     program = (

@@ -1,19 +1,30 @@
 """Jobs: what the tables need is among them, each trains and tests on what it says, budgets are what they are said to be."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from synthetic import tiny_scene
 
-from experiments import figure8, paper, table1, table2
-from experiments.jobs import BUDGETS, ONE_FREQUENCY, PROFILES, REFERENCES, SCORED_SLOW, SCORED_TRAINED, Job, settings
-from experiments.tables import EXPERIMENTS, unique_jobs
+from experiments import paper
+from experiments.catalogue import EXPERIMENTS, unique_jobs
+from experiments.jobs import BASELINES, ONE_FREQUENCY, SCORED_TRAINED, Job, displaced
+from experiments.profiles import PROFILES, SCORED_SLOW, TABLE_PROFILES
+from experiments.settings import settings
+from experiments.tables import figure8, table1, table2
 from wbgs_jax.config import check
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.fields import get_field
 
 JOBS = unique_jobs()
-TRAINED = [job for job in JOBS if job.field != REFERENCES]
+TRAINED = [job for job in JOBS if job.field != BASELINES]
 
 
 def test_names_are_unique_and_stay_as_they_are():
     assert len({job.name for job in JOBS}) == len(JOBS)
+    everything = [(job.profile, job.name) for job in unique_jobs(tuple(EXPERIMENTS))]
+    assert len(set(everything)) == len(everything)
     names = {
         "scene1_wideband_seed0": Job("1", "wideband"),
         "scene3_wrfgs_long_seed2": Job("3", "wrfgs", variant="long", seed=2),
@@ -104,36 +115,76 @@ def test_the_slow_field_is_scored_on_some_of_the_others_transmitters():
     np.testing.assert_array_equal(slow.train, others.train)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+def test_a_folder_of_spectra_is_a_job_too(tmp_path):
+    path = tmp_path / "kitchen.npz"
+    save_scene(path, tiny_scene())
+    job = Job(str(path), "wrfgs", profile="smoke")
+    assert job.name == "kitchen_wrfgs_seed0" and job.known_ghz == job.test_ghz == (1, 10, 94)
+    assert [name for name, _ in job.models()] == ["1GHz", "10GHz", "94GHz"]
+    assert settings(job).optim.steps == 2
+
+
+@pytest.mark.parametrize("profile", TABLE_PROFILES)
 def test_all_settings_can_work_and_have_the_steps_of_the_profile(profile):
     size = PROFILES[profile]
-    for job in {(job.field, job.variant, job.scene): job for job in TRAINED}.values():
-        chosen = settings(job, size)
+    for job in {(job.field, job.variant, job.scene): job.sized(profile) for job in TRAINED}.values():
+        chosen = settings(job)
         check(chosen)
+        get_field(job.field).check(chosen.field)
         assert chosen.optim.min_steps == chosen.optim.steps  # no data set cuts them
         if job.field in ONE_FREQUENCY:
-            block, share = chosen.loop.epoch_steps, size.steps * BUDGETS.get(job.variant, 1) / len(job.test_ghz)
+            block, share = chosen.loop.epoch_steps, size.steps * job.budget / len(job.test_ghz)
             assert chosen.optim.steps == block or abs(chosen.optim.steps - share) <= block / 2
+
+
+def test_series_keep_their_size_but_are_small_too():
+    job = Job("1", "wideband", profile="choices")
+    assert job.sized("paper") == job and job.sized("smoke").profile == "smoke"
+    assert Job("1", "wideband").sized("paper").profile == "paper"
 
 
 @pytest.mark.parametrize("variant", ["", "long"])
 def test_wrfgs_sees_as_many_spectra_as_the_wideband_field(variant):
-    ours, theirs = (settings(Job("1", field, variant=variant), PROFILES["quick"]).optim for field in ("wideband", "wrfgs"))
+    ours, theirs = (settings(Job("1", field, variant=variant)).optim for field in ("wideband", "wrfgs"))
     assert 10 * theirs.steps * theirs.batch == ours.steps * ours.batch
 
 
 def test_the_longest_wrfgs_sees_as_many_spectra_at_every_frequency():
-    ours = settings(Job("1", "wideband"), PROFILES["quick"]).optim
-    theirs = settings(Job("1", "wrfgs", variant="longest"), PROFILES["quick"]).optim
+    ours = settings(Job("1", "wideband")).optim
+    theirs = settings(Job("1", "wrfgs", variant="longest")).optim
     assert theirs.steps * theirs.batch == ours.steps * ours.batch
 
 
 def test_variants_change_what_they_name():
-    blind = settings(Job("1_21f", "wideband", variant="no_frequency"), PROFILES["quick"]).wideband
+    blind = settings(Job("1_21f", "wideband", variant="no_frequency")).field
     assert not blind.attenuation_frequency and not blind.radiance_frequency and blind.gaussians == 1000
-    usual, fast = (settings(Job("1", "wrfgs", variant=variant), PROFILES["quick"]) for variant in ("", "fast"))
-    assert fast.optim.network_lr > usual.optim.network_lr and fast.optim.steps == usual.optim.steps
-    assert fast.wrfgs == usual.wrfgs
+    usual, fast = (settings(Job("1", "wrfgs", variant=variant)) for variant in ("", "fast"))
+    assert fast.field.network_lr > usual.field.network_lr and fast.optim == usual.optim
+    assert dataclasses.replace(fast.field, network_lr=usual.field.network_lr) == usual.field
+
+
+def test_a_displaced_mesh_is_moved_part_by_part():
+    scene = tiny_scene(4)
+    twice = dataclasses.replace(
+        scene,
+        vertices=np.concatenate([scene.vertices, scene.vertices + 50]),
+        faces=np.concatenate([scene.faces, scene.faces + len(scene.vertices)]),
+        face_part=np.concatenate([scene.face_part, scene.face_part]),
+    )
+    dataset = scene_dataset(twice)
+    shift = displaced(dataset, 0.1, 3).vertices - dataset.vertices
+    first, second = shift[: len(scene.vertices)], shift[len(scene.vertices) :]
+    for part in (first, second):
+        np.testing.assert_allclose(part, np.tile(part[0], (len(part), 1)), atol=1e-4)
+    assert np.abs(first[0] - second[0]).max() > 1e-3
+
+
+def test_a_job_of_a_displaced_mesh_trains_on_it(tmp_path):
+    path = tmp_path / "box.npz"
+    save_scene(path, tiny_scene(4))
+    whole, moved = (Job(str(path), "wave", variant=variant, seed=3).dataset() for variant in ("", "mesh_moved_3cm"))
+    np.testing.assert_array_equal(moved.vertices, displaced(whole, 0.03, 3).vertices)
+    assert np.abs(moved.vertices - whole.vertices).max() > 1e-3
 
 
 def test_the_papers_averages_are_those_of_its_rows():

@@ -14,15 +14,18 @@ from unittest import mock
 import numpy as np
 import pytest
 import synthetic
+from toys import RippleField, registered
 
-from experiments import execute, jobs, runner
-from experiments.jobs import BUDGETS, Job
+from experiments import execute, profiles, runner
+from experiments.jobs import Job
+from experiments.paper import GHZ_10
 from experiments.results import Results
-from wbgs_jax.data.scene_file import save_scene
+from experiments.variants import VARIANTS
 from wbgs_jax._util.command import run_command
+from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.training.loop import Run
 
-JOB = Job("1", "wideband")
+JOB = Job("1", "wideband", profile="smoke")
 VALUES = {
     "average_of_medians": 0.5,
     "training_seconds": 1.0,
@@ -43,7 +46,7 @@ def calls(monkeypatch):
     """Jobs that were executed, by a stand-in that takes no time."""
     executed = []
 
-    def stand_in(job, profile, folder, may_go_on):
+    def stand_in(job, folder, may_go_on):
         executed.append(job.name)
         return VALUES, None
 
@@ -53,8 +56,9 @@ def calls(monkeypatch):
 
 @pytest.fixture
 def scenes(monkeypatch, tmp_path):
-    """A tiny scene 1 with the ten frequencies."""
-    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(jobs.GHZ_10) * 1e9)
+    """A tiny scene 1 with the ten frequencies; what is compiled stays compiled."""
+    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
+    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(GHZ_10) * 1e9)
     monkeypatch.setenv("WBGS_DATA", str(tmp_path / "data"))
     save_scene(tmp_path / "data" / "scene1.npz", dataclasses.replace(synthetic.tiny_scene(), name="scene1"))
 
@@ -64,7 +68,7 @@ def result_of(command, job=JOB):
 
 
 def test_every_job_is_done_once(command, calls):
-    wanted = [Job("1", "wideband", seed=seed) for seed in range(3)]
+    wanted = [dataclasses.replace(JOB, seed=seed) for seed in range(3)]
     assert runner.run(wanted[:2], command) == []
     assert runner.run(wanted, command) == []
     assert calls == [job.name for job in wanted]
@@ -72,7 +76,7 @@ def test_every_job_is_done_once(command, calls):
 
 def test_a_failing_job_does_not_stop_the_others(command, calls, monkeypatch, capsys):
     succeed = runner.execute
-    broken = Job("1", "wave")
+    broken = Job("1", "wave", profile="smoke")
 
     def execute_most(job, *others):
         if job == broken:
@@ -85,7 +89,7 @@ def test_a_failing_job_does_not_stop_the_others(command, calls, monkeypatch, cap
     with pytest.raises(SystemExit) as stop:
         run_command(runner.main)
     assert stop.value.code == 2
-    assert len(calls) == len([job for job in runner.all_jobs(("table1",)) if job.scene == "1"]) - 1
+    assert len(calls) == len([job for job in runner.all_jobs(("table1",), "smoke") if job.scene == "1"]) - 1
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == f"error: 1 of {len(calls) + 1} jobs failed: scene1_wave_seed0: ZeroDivisionError: no paths"
 
@@ -129,7 +133,7 @@ def test_the_lock_of_a_killed_process_is_free(command, calls):
 def test_the_time_limit_holds_outside_a_training(command, monkeypatch, capsys):
     monkeypatch.setattr(runner, "execute", lambda *_: time.sleep(60))
     begin = time.monotonic()
-    assert runner.run([JOB, Job("2", "wideband")], dataclasses.replace(command, minutes=0.005)) == []
+    assert runner.run([JOB, dataclasses.replace(JOB, scene="2")], dataclasses.replace(command, minutes=0.005)) == []
     assert time.monotonic() - begin < 10
     assert "the time is up" in capsys.readouterr().err
     assert result_of(command) is None
@@ -160,11 +164,20 @@ def test_a_signal_from_outside_stops_everything(command, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-@pytest.mark.usefixtures("compile_once", "scenes")
-def test_a_cut_training_goes_on_to_the_same_result(command, monkeypatch, tmp_path):
-    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
-    steady = jobs.PROFILES["smoke"].changes | {"density": {"every": 0}}  # compiles once
-    monkeypatch.setitem(jobs.PROFILES, "smoke", dataclasses.replace(jobs.PROFILES["smoke"], changes=steady))
+@pytest.fixture
+def toy_field():
+    """A field that compiles in no time."""
+    with registered(RippleField):
+        yield
+
+
+@pytest.mark.usefixtures("scenes", "toy_field")
+@pytest.mark.parametrize("field", ["ripple", pytest.param("wideband", marks=pytest.mark.slow)])
+def test_a_cut_training_goes_on_to_the_same_result(field, command, monkeypatch, tmp_path):
+    job, size = dataclasses.replace(JOB, field=field), profiles.PROFILES["smoke"]
+    if field == "wideband":
+        steady = size.changes | {"density": {"every": 0}}  # compiles once
+        monkeypatch.setitem(profiles.PROFILES, "smoke", dataclasses.replace(size, changes=steady))
     original, epochs = Run.epoch, []
 
     def epoch(run):
@@ -175,16 +188,16 @@ def test_a_cut_training_goes_on_to_the_same_result(command, monkeypatch, tmp_pat
         return result
 
     monkeypatch.setattr(Run, "epoch", epoch)
-    assert runner.run([JOB], command) == []
-    assert epochs == [0, 2] and result_of(command) is None
-    assert runner.run([JOB], command) == []
+    assert runner.run([job], command) == []
+    assert epochs == [0, 2] and result_of(command, job) is None
+    assert runner.run([job], command) == []
     assert epochs == [0, 2, 4, 6]
-    cut = result_of(command)
+    cut = result_of(command, job)
     whole = dataclasses.replace(command, results=tmp_path / "other", runs=tmp_path / "more")
-    runner.run([JOB], whole)
-    np.testing.assert_array_equal(cut.ssim, result_of(whole).ssim)
-    assert cut.values["curve"]["step"] == [2, 4, 6, 8]
-    assert not (command.runs / "smoke" / JOB.name).exists()
+    runner.run([job], whole)
+    np.testing.assert_array_equal(cut.ssim, result_of(whole, job).ssim)
+    assert cut.values["curve"] == result_of(whole, job).values["curve"] and cut.values["curve"]["step"] == [2, 4, 6, 8]
+    assert not (command.runs / "smoke" / job.name).exists()
 
 
 @pytest.fixture
@@ -195,7 +208,7 @@ def models(monkeypatch):
     def train(dataset, field, settings, seed, folder, resume):
         trained.append(folder.name)
         (folder / "metrics.jsonl").write_text("".join(json.dumps({"step": s, "loss": 1 / s}) + "\n" for s in range(1, 500)))
-        return SimpleNamespace(params=None, steps=499, seconds=1.5, gaussians=7)
+        return SimpleNamespace(field=None, params=None, steps=499, seconds=1.5, sizes={"gaussians": 7})
 
     monkeypatch.setattr(execute, "train", train)
     monkeypatch.setattr(execute, "predict_spectra", lambda field, params, dataset, index: np.asarray(dataset.pas(index)) * 0.9)
@@ -204,7 +217,7 @@ def models(monkeypatch):
 
 @pytest.mark.usefixtures("scenes")
 def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
-    job, stop = Job("1", "wrfgs"), mock.patch.object(execute, "score", side_effect=[KeyboardInterrupt])
+    job, stop = Job("1", "wrfgs", profile="smoke"), mock.patch.object(execute, "score", side_effect=[KeyboardInterrupt])
     with stop, contextlib.suppress(KeyboardInterrupt):
         runner.run([job], command)
     assert models == ["1GHz"]
@@ -223,7 +236,7 @@ def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
     runner.run([job], command)
     assert models[4:] == ["5GHz", "10GHz", "24.25GHz", "37GHz", "47GHz", "60GHz", "77GHz", "94GHz"]
     found = result_of(command, job)
-    assert found.ghz == list(jobs.GHZ_10) and found.ssim.shape == (2, 10)
+    assert found.ghz == list(GHZ_10) and found.ssim.shape == (2, 10)
     assert found.values["models"] == 10 and found.values["steps"] == 4990 and found.values["training_seconds"] == 15
 
 
@@ -241,10 +254,10 @@ def test_a_result_says_where_it_comes_from(command, models):
 
 
 @pytest.mark.usefixtures("scenes")
-def test_references_are_a_job_of_their_own(command):
-    job = Job("1", "references", "C4", all_tx=True)
+def test_baselines_are_a_job_of_their_own(command):
+    job = Job("1", "baselines", "C4", all_tx=True, profile="smoke")
     runner.run([job], command)
-    found = result_of(command, job).values["references"]
+    found = result_of(command, job).values["baselines"]
     assert set(found) == {"mean_image", "nearest_tx", "inverse_distance", "line_of_sight"}
     assert list(found["nearest_tx"]) == ["2.4", "5", "10", "24.25", "37", "47", "60", "77"]
 
@@ -259,7 +272,7 @@ def test_a_list_of_numbers_is_one_line(command):
 def test_jobs_come_in_the_order_of_importance():
     listed = runner.all_jobs()
     assert listed[0] == Job("1", "wideband")
-    costly = [job for job in listed if job.seed and (job.variant in BUDGETS or job.field == "wave")]
+    costly = [job for job in listed if job.seed and (job.budget > 1 or job.field == "wave")]
     cheap = [job for job in listed if job not in costly]
     assert listed == cheap + costly
     for some in (cheap, costly):
@@ -271,17 +284,17 @@ def test_times_of_another_budget_are_scaled(command):
     runner.run([JOB], command)
     durations = runner.Durations(Results(command.profile, command.results), [JOB])
     usual = durations.expect(dataclasses.replace(JOB, scene="2"))
-    assert durations.expect(dataclasses.replace(JOB, variant="long")) == usual * BUDGETS["long"] > 0
+    assert durations.expect(dataclasses.replace(JOB, variant="long")) == usual * VARIANTS["long"].budget > 0
 
 
 def test_a_listing_says_what_is_done(command, calls):
-    wanted = [JOB, Job("2", "wideband"), Job("1", "wave")]
+    wanted = [JOB, dataclasses.replace(JOB, scene="2"), dataclasses.replace(JOB, field="wave")]
     runner.run(wanted[:1], command)
     (command.runs / "smoke" / "scene1_wave_seed0").mkdir()
     done, same_kind, begun, total = runner.listing(wanted, command).splitlines()
-    assert done.split() == ["done", "1", "s", "scene1_wideband_seed0"]
-    assert same_kind.split() == ["open", "1", "s", "scene2_wideband_seed0"]
-    assert begun.split() == ["begun", "?", "s", "scene1_wave_seed0"]
+    assert done.split() == ["done", "1", "s", "smoke/scene1_wideband_seed0"]
+    assert same_kind.split() == ["open", "1", "s", "smoke/scene2_wideband_seed0"]
+    assert begun.split() == ["begun", "?", "s", "smoke/scene1_wave_seed0"]
     assert total == "3 jobs: 2 left, about 0.0 h and 1 of unknown length"
 
 
@@ -298,3 +311,34 @@ def test_a_wrong_choice_is_one_line(arguments, words, monkeypatch, capsys):
         run_command(runner.main)
     (line,) = capsys.readouterr().err.splitlines()
     assert stop.value.code == 2 and words in line
+
+
+def test_series_are_run_when_they_are_asked_for_in_their_own_size():
+    assert {job.profile for job in runner.all_jobs()} == {"quick"}
+    series = runner.all_jobs(("choices", "tuning", "wave_choices"), "paper")
+    assert {job.profile for job in series} == {"choices", "choices_octaves4", "tuning"}
+    assert {job.profile for job in runner.all_jobs(("wave_choices", "table1"), "smoke")} == {"smoke"}
+
+
+def test_jobs_run_on_other_data(command):
+    chosen = runner.chosen_jobs(dataclasses.replace(command, only=("choices",), scenes=("1", "2"), data="a/kitchen.npz"))
+    assert {job.scene for job in chosen} == {"a/kitchen.npz"} and len({job.name for job in chosen}) == len(chosen)
+    assert Job("a/kitchen.npz", "wideband", variant="fusion_2", seed=1, profile="smoke") in chosen
+
+
+@pytest.mark.usefixtures("scenes")
+def test_a_change_is_trained_by_the_same_runner(command, models, monkeypatch):
+    seen, train = [], execute.train
+
+    def watched(dataset, field, settings, *others, **options):
+        seen.append((dataset.vertices, settings))
+        return train(dataset, field, settings, *others, **options)
+
+    monkeypatch.setattr(execute, "train", watched)
+    wanted = [dataclasses.replace(JOB, field="wave", variant=name) for name in ("", "mesh_moved_3cm", "no_search")]
+    assert runner.run(wanted, command) == []
+    (still, plain), (moved, same), (_, without) = seen
+    assert np.abs(moved - still).max() > 1e-3 and same == plain
+    assert plain.search.rounds > without.search.rounds == 0
+    settings = [result_of(command, job).values["settings"] for job in wanted]
+    assert settings[1] == settings[0] | {"mesh.displacement": 0.03} and settings[2] == settings[0] | {"search.rounds": 0}

@@ -19,9 +19,9 @@ def test_directions_and_groups():
 
 def test_a_triangle_in_between_obstructs():
     dataset = scene_dataset(tiny_scene(4))
-    start = np.asarray(dataset.receiver.position, np.float64)
+    start = np.asarray(dataset.receiver().position, np.float64)
     wall = np.array([[1, -5, -5], [1, 5, -5], [1, 0, 8]]) + start
-    walled = dataclasses.replace(dataset, vertices=wall.astype(np.float32), faces=np.array([[0, 1, 2]]))
+    walled = dataclasses.replace(dataset, vertices=wall.astype(np.float32), faces=np.array([[0, 1, 2]]), face_part=None)
     assert obstructed(walled, start + np.array([2.0, 0.1, 0.2]))
     assert not obstructed(walled, start + np.array([0.9, 0.1, 0.2]))
     assert not obstructed(walled, start + np.array([2.0, 30.0, 0.2]))

@@ -2,14 +2,16 @@
 
 import dataclasses
 import re
-import sys
 
 import numpy as np
 import pytest
 
-from experiments import baselines, cells, figure8, headline, table1, table2, table3, tables
-from experiments.jobs import PICTURED_GHZ, PROFILES, REFERENCES, Job
+from experiments.catalogue import unique_jobs
+from experiments.jobs import BASELINES, PICTURED_GHZ, Job
+from experiments.profiles import PROFILES
 from experiments.results import Results
+from experiments.tables import __main__ as command_line
+from experiments.tables import baselines, cells, figure8, headline, page, table1, table2, table3
 
 LEVELS = {
     ("wideband", ""): 0.8,
@@ -28,8 +30,8 @@ ENVIRONMENT = {"version": "0", "commit": "abc123", "device": "cpu x86_64", "jax"
 def made_up(job, tx=(3, 5, 8, 9, 11, 20, 21)):
     """Scores around a level of the model: 0.01 higher with every seed, lower at unseen frequencies, their median exact."""
     values = {"environment": ENVIRONMENT, "training_seconds": 60.0, "evaluation_seconds": 6.0}
-    if job.field == REFERENCES:
-        return values | {"references": {name: {f"{f:g}": 0.5 for f in job.test_ghz} for name in baselines.NAMES_OF_REFERENCES}}
+    if job.field == BASELINES:
+        return values | {"baselines": {name: {f"{f:g}": 0.5 for f in job.test_ghz} for name in baselines.NAMES_OF_BASELINES}}
     level = LEVELS.get((job.field, job.variant), 0.7) + 0.01 * job.seed - 0.02 * bool(job.combination)
     spread = np.linspace(-0.03, 0.03, len(tx))
     scores = {f"{f:g}": np.round(level + spread, 4).tolist() for f in job.test_ghz}
@@ -45,7 +47,7 @@ def nothing(tmp_path_factory):
 def everything(tmp_path_factory):
     results = Results("quick", tmp_path_factory.mktemp("everything"))
     picture = np.tile(np.linspace(0, 255, 360).astype(np.uint8), (len(PICTURED_GHZ), 90, 1))
-    for job in tables.unique_jobs():
+    for job in unique_jobs():
         results.write(job, made_up(job), picture if job.pictured else None)
     return results
 
@@ -62,9 +64,9 @@ def row(text, first):
 
 
 def test_what_has_not_been_run_says_so_everywhere(nothing, tmp_path):
-    text = tables.page(nothing, tmp_path)
+    text = page.page(nothing, tmp_path)
     assert "None of the" in text and not list(tmp_path.iterdir())
-    for module in tables.PAGES:
+    for module in page.PAGES:
         assert cells.NOT_RUN in module.render(nothing, tmp_path), module.__name__
     known = re.compile(r"not run yet|\(.*\)|ceiling")
     for name, *values in rows(table1.render(nothing, tmp_path)):
@@ -153,8 +155,8 @@ def test_the_slow_field_is_compared_at_its_own_transmitters(tmp_path):
 
 
 def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
-    text = tables.page(everything, tmp_path)
-    for module in tables.PAGES:
+    text = page.page(everything, tmp_path)
+    for module in page.PAGES:
         assert f"## {module.TITLE}" in text
     shown = set(re.findall(rf"\({tmp_path.name}/(\S+?)\)", text))
     assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
@@ -162,13 +164,11 @@ def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
     assert "`abc123`" in text and "nan" not in text
 
 
-def test_pages_of_two_profiles_share_no_picture(tmp_path, monkeypatch):
+def test_pages_of_two_profiles_share_no_picture(tmp_path):
     job = Job("1", "wideband")
     for profile in ("quick", "smoke"):
         Results(profile, tmp_path).write(job, made_up(job))
-        arguments = ["--profile", profile, "--results", str(tmp_path), "--docs", str(tmp_path / "docs")]
-        monkeypatch.setattr(sys, "argv", ["tables", *arguments])
-        tables.main()
+        command_line.main(["--profile", profile, "--results", str(tmp_path), "--docs", str(tmp_path / "docs")])
     assert "(images/results_headline.png)" in (tmp_path / "docs" / "results.md").read_text()
     assert "(images_smoke/results_headline.png)" in (tmp_path / "docs" / "results_smoke.md").read_text()
     assert (tmp_path / "docs" / "images_smoke" / "results_headline.png").exists()

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from wbgs_jax.fields.losses import image_loss, pixel_loss, ssim
+from wbgs_jax.fields import losses
+from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation, pixel_loss, snapshot_losses
+
+ssim, image_loss = jax.jit(losses.ssim), jax.jit(losses.image_loss, static_argnums=2)
 
 
 @pytest.fixture
@@ -23,13 +26,20 @@ def dm_pix_ssim(a, b):
 
 
 def test_ssim_equals_dm_pix_in_value_and_gradient(rng, images):
-    weights = jnp.asarray(rng.normal(size=3))
-    value, gradient = jax.value_and_grad(lambda a, b: weights @ ssim(a, b), argnums=(0, 1))(*images)
-    expected, expected_gradient = jax.value_and_grad(lambda a, b: weights @ dm_pix_ssim(a, b), argnums=(0, 1))(*images)
-    np.testing.assert_allclose(ssim(*images), dm_pix_ssim(*images), rtol=1e-10)
+    weights = rng.normal(size=3)
+
+    def gradients(function):
+        def total(a, b):
+            each = function(a, b)
+            return weights @ each, each
+
+        return jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))(*images)
+
+    ((value, each), gradient), ((expected, expected_each), expected_gradient) = map(gradients, (losses.ssim, dm_pix_ssim))
+    np.testing.assert_allclose(each, expected_each, rtol=1e-10)
     assert float(value) == pytest.approx(float(expected), rel=1e-10)
-    for got, want in zip(gradient, expected_gradient, strict=True):
-        np.testing.assert_allclose(got, want, atol=1e-8 * float(jnp.abs(want).max()))
+    for got, want in zip(gradient, map(np.asarray, expected_gradient), strict=True):
+        np.testing.assert_allclose(got, want, atol=1e-8 * np.abs(want).max())
 
 
 def test_ssim_equals_scikit_image_with_the_gaussian_window(images):
@@ -43,8 +53,9 @@ def test_identical_images_give_one(images):
 
 
 def test_ssim_of_constant_images_is_the_luminance_term(x64):
-    a, b = jnp.full((90, 360), 0.3), jnp.full((90, 360), 0.8)
-    assert float(ssim(a, b)) == pytest.approx((2 * 0.3 * 0.8 + 1e-4) / (0.3**2 + 0.8**2 + 1e-4), rel=1e-10)
+    a, b = np.full((3, 90, 360), 0.3), np.full((3, 90, 360), 0.8)
+    expected = (2 * 0.3 * 0.8 + 1e-4) / (0.3**2 + 0.8**2 + 1e-4)
+    np.testing.assert_allclose(ssim(jnp.asarray(a), jnp.asarray(b)), expected, rtol=1e-10)
 
 
 def test_single_precision_is_enough(images):
@@ -56,19 +67,61 @@ def test_single_precision_is_enough(images):
 def test_the_loss_is_the_weighted_sum_of_the_paper(images, weight):
     a, b = images
     loss, similarity = image_loss(a, b, weight)
-    assert float(similarity) == pytest.approx(float(ssim(a, b).mean()))
-    expected = (1 - weight) * float(jnp.abs(a - b).mean()) + weight * (1 - float(similarity))
+    assert float(similarity) == pytest.approx(np.asarray(ssim(a, b)).mean())
+    expected = (1 - weight) * np.abs(np.asarray(a) - np.asarray(b)).mean() + weight * (1 - float(similarity))
     assert float(loss) == pytest.approx(expected)
 
 
 def test_the_gradient_of_a_dark_or_perfect_image_is_finite():
-    dark, truth = jnp.zeros((1, 90, 360)), jnp.ones((1, 90, 360))
-    for predicted in (dark, truth):
-        gradient = jax.grad(lambda a: image_loss(a, truth)[0])(predicted)
-        assert bool(jnp.isfinite(gradient).all())
+    both, truth = np.stack([np.zeros((90, 360)), np.ones((90, 360))]).astype(np.float32), jnp.ones((2, 90, 360))
+    gradient = np.asarray(jax.jit(jax.grad(lambda a: losses.image_loss(a, truth)[0]))(both))
+    assert np.isfinite(gradient).all() and gradient[0].any()
 
 
 def test_the_loss_of_pixels_is_a_mean_error(rng, x64):
     a, b = jnp.asarray(rng.random((3, 20))), jnp.asarray(rng.random((3, 20)))
     assert float(pixel_loss(a, b, "l1")) == pytest.approx(np.abs(a - b).mean())
     assert float(pixel_loss(a, b, "l2")) == pytest.approx(((a - b) ** 2).mean())
+
+
+@pytest.fixture
+def snapshots(rng):
+    """Complex voltages of 16 elements, and others."""
+    return [rng.normal(size=(5, 16)) + 1j * rng.normal(size=(5, 16)) for _ in range(2)]
+
+
+def squared_correlation(a, b):
+    return np.abs(np.sum(a.conj() * b, -1)) ** 2 / np.sum(np.abs(a) ** 2, -1) / np.sum(np.abs(b) ** 2, -1)
+
+
+def test_snapshot_losses_equal_their_formulas(snapshots, x64):
+    predicted, truth = snapshots
+    found = jax.jit(snapshot_losses)(jnp.asarray(predicted), jnp.asarray(truth))
+    ratio = np.linalg.norm(predicted, axis=-1) / np.linalg.norm(truth, axis=-1)
+    expected = np.mean(1 - squared_correlation(predicted, truth)), np.mean(np.log(ratio) ** 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_correlation_is_blind_to_phase_and_scale_and_power_to_direction(snapshots, x64):
+    truth = jnp.asarray(snapshots[0])
+    correlation_loss, power_loss = jax.jit(snapshot_losses)(truth * 0.1j, truth)
+    assert float(correlation_loss) == pytest.approx(0, abs=1e-9)
+    assert float(power_loss) == pytest.approx(np.log(10) ** 2, rel=1e-6)
+
+
+def test_log_decorrelation_equals_its_formula_and_no_match_is_perfect(snapshots, x64):
+    predicted, truth = snapshots
+    decorrelation = jax.jit(log_decorrelation)
+    found = decorrelation(jnp.asarray(predicted), jnp.asarray(truth))
+    np.testing.assert_allclose(found, np.log(1 - squared_correlation(predicted, truth) + GOOD_MATCH), rtol=1e-9)
+    np.testing.assert_allclose(decorrelation(jnp.asarray(3j * truth), jnp.asarray(truth)), np.log(GOOD_MATCH), rtol=1e-9)
+
+
+def test_gradients_of_a_prediction_of_nothing_are_finite(snapshots):
+    truth = jnp.asarray(snapshots[0], jnp.complex64)
+
+    def total(scale):
+        return sum(snapshot_losses(scale * truth, truth)) + jnp.sum(log_decorrelation(scale * truth, truth))
+
+    for scale in (0.0, 1e-20, 1.0):
+        assert np.isfinite(jax.jit(jax.grad(total))(scale))

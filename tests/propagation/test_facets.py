@@ -74,7 +74,7 @@ def test_sheets_and_inner_corners_have_no_edges():
 
 @pytest.mark.parametrize("material", [None, [0, 0]])
 def test_joined_bodies_diffract_at_free_edges_only(material):
-    """A leg under a table top, two millimetres apart: its upper edges are no edges, of whatever material."""
+    """A leg under a table top, two millimetres apart: its upper edges are no edges, of one material or of two."""
     leg, top = box((0, 0, 0), (0.1, 0.1, 0.7)), box((-0.5, -0.5, 0.702), (0.5, 0.5, 0.74))
     edges = edges_of(leg, top, material=material)
     leg_edges = np.abs(edges.start[:, 0] - 0.05) < 0.06

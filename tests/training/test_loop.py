@@ -9,22 +9,27 @@ import signal
 import jax
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_settings
+from synthetic import tiny_dataset
+from toys import GROWING, RippleField, registered, toy_settings
 
-from wbgs_jax.training import checkpoint
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.evaluation.score import watch
+from wbgs_jax.fields.wideband import WidebandField
+from wbgs_jax.training import checkpoint
 from wbgs_jax.training.loop import Interrupted, Run, train
 
 STEPS = 8
-SETTINGS = tiny_settings()
-GROWING = tiny_settings(
-    wideband={"gaussians": 60},
-    density={"every": 4, "start": 4, "stop_fraction": 0.5, "gradient_threshold": 0.0, "max_gaussians": 90, "reset_every": 4},
-)
-"""Half way, the Gaussians outgrow their capacity of 64."""
+PLAIN = ("ripple", toy_settings())
+CROWDED = ("wideband", GROWING)
+"""What is trained: a toy without host controls, or Gaussians that density control adds to, into more slots."""
 
 
-pytestmark = pytest.mark.usefixtures("compile_once")
+@pytest.fixture(scope="module", autouse=True)
+def toys():
+    with registered(RippleField):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +39,14 @@ def dataset():
 
 @pytest.fixture(scope="module")
 def uninterrupted(dataset, tmp_path_factory):
-    """Folders of finished runs, by settings."""
+    """Folders of finished runs, by field and settings."""
     finished = {}
 
-    def run(settings):
-        if settings not in finished:
-            finished[settings] = tmp_path_factory.mktemp("run")
-            train(dataset, "wideband", settings, 0, finished[settings])
-        return finished[settings]
+    def run(case):
+        if case not in finished:
+            finished[case] = tmp_path_factory.mktemp("run")
+            assert train(dataset, *case, 0, finished[case]).steps == STEPS
+        return finished[case]
 
     return run
 
@@ -61,8 +66,8 @@ def interrupt_after(monkeypatch, epochs, signals=(signal.SIGINT,)):
     monkeypatch.setattr(Run, "epoch", epoch)
 
 
-def final_state(dataset, folder, settings):
-    run = Run(dataset, "wideband", settings, 0, folder)
+def final_state(dataset, folder, case):
+    run = Run(dataset, *case, 0, folder)
     assert run.restore() and run.step == STEPS
     return run.state
 
@@ -73,44 +78,59 @@ def metrics_of(folder):
     return [{key: value for key, value in entry.items() if key != "seconds"} for entry in entries]
 
 
-def assert_same_run(dataset, folder, other, settings):
-    a, b = (final_state(dataset, f, settings) for f in (folder, other))
+def assert_same_run(dataset, folder, other, case):
+    a, b = (final_state(dataset, f, case) for f in (folder, other))
+    assert jax.tree.structure(a) == jax.tree.structure(b)
     for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y, err_msg=jax.tree_util.keystr(path))
     assert metrics_of(folder) == metrics_of(other)
 
 
 def test_a_run_leaves_checkpoints_and_curves(dataset, tmp_path):
-    settings = tiny_settings(loop={"checkpoint_every": 2, "evaluate_every": 4, "keep_checkpoints": 3})
-    result = train(dataset, "wideband", settings, 0, tmp_path)
-    assert (result.steps, result.gaussians) == (STEPS, 60)
+    settings = toy_settings(loop={"checkpoint_every": 2, "evaluate_every": 4, "keep_checkpoints": 3})
+    result = train(dataset, "ripple", settings, 0, tmp_path)
+    assert (result.steps, result.sizes, result.compilations) == (STEPS, {"parameters": 7}, 1)
     assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [4, 6, 8]
     entries = metrics_of(tmp_path)
     assert [entry["step"] for entry in entries] == [2, 4, 6, 8]
     assert [entry["step"] for entry in entries if "held_out_ssim" in entry] == [4, 8]
+    assert all(entry.keys() >= {"loss", "batch_ssim", "parameters"} for entry in entries)
     assert all(np.isfinite(list(entry.values())).all() for entry in entries)
 
 
-def test_checkpoints_follow_their_interval(uninterrupted):
-    assert checkpoint.checkpoint_steps(uninterrupted(SETTINGS) / "checkpoints") == [4, 8]
+@pytest.mark.parametrize("case", [PLAIN, CROWDED], ids=["plain", "crowded"])
+def test_checkpoints_follow_their_interval(uninterrupted, case):
+    assert checkpoint.checkpoint_steps(uninterrupted(case) / "checkpoints") == [4, 8]
 
 
 def test_equal_seeds_give_equal_runs_and_others_do_not(dataset, tmp_path, uninterrupted):
-    train(dataset, "wideband", SETTINGS, 0, tmp_path / "again")
-    assert_same_run(dataset, tmp_path / "again", uninterrupted(SETTINGS), SETTINGS)
-    other = train(dataset, "wideband", SETTINGS, 1, tmp_path / "other")
-    assert (other.params.gaussians.means != final_state(dataset, tmp_path / "again", SETTINGS).params.gaussians.means).any()
+    train(dataset, *PLAIN, 0, tmp_path / "again")
+    assert_same_run(dataset, tmp_path / "again", uninterrupted(PLAIN), PLAIN)
+    other = train(dataset, *PLAIN, 1, tmp_path / "other")
+    assert (other.params["level"] != final_state(dataset, tmp_path / "again", PLAIN).params["level"]).any()
+    assert metrics_of(tmp_path / "other") != metrics_of(tmp_path / "again")
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, GROWING], ids=["plain", "across a larger capacity"])
-def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninterrupted, settings):
+def test_equal_seeds_make_equal_fields_and_others_do_not(dataset):
+    """Where the Gaussians start, and with which weights. (Below, a run that starts anew ends as another one did.)"""
+    made = [WidebandField.make(GROWING.field, DatasetScene(dataset), seed) for seed in (0, 0, 1)]
+    params = [field.init(jax.random.key(seed)) for field, seed in zip(made, (0, 0, 1), strict=True)]
+    for x, y in zip(jax.tree.leaves((made[0], params[0])), jax.tree.leaves((made[1], params[1])), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert (params[0].gaussians.means != params[2].gaussians.means).any()
+    assert any((x != y).any() for x, y in zip(*(jax.tree.leaves(params[i].networks) for i in (0, 2)), strict=True))
+
+
+@pytest.mark.parametrize("case", [PLAIN, CROWDED], ids=["plain", "across more slots"])
+def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninterrupted, case):
     """The density control of step 4 lies before the checkpoint of step 4."""
-    shutil.copytree(uninterrupted(settings), tmp_path / "run")
+    shutil.copytree(uninterrupted(case), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / str(STEPS))
-    capacity = checkpoint.load_metadata(tmp_path / "run" / "checkpoints", 4)["sizes"]["gaussians"]
-    assert capacity == 64 if settings is SETTINGS else capacity > 64
-    assert train(dataset, "wideband", settings, 0, tmp_path / "run", resume=True).steps == STEPS
-    assert_same_run(dataset, tmp_path / "run", uninterrupted(settings), settings)
+    if case is CROWDED:
+        slots = checkpoint.read(tmp_path / "run" / "checkpoints", 4).state[".params.gaussians.means"].shape[0]
+        assert slots > 64
+    assert train(dataset, *case, 0, tmp_path / "run", resume=True).steps == STEPS
+    assert_same_run(dataset, tmp_path / "run", uninterrupted(case), case)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -120,95 +140,107 @@ def test_an_interrupt_saves_and_says_how_to_go_on(dataset, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         interrupt_after(patch, 1, [number])
         with pytest.raises(Interrupted, match=r"step 2 of 8.*--resume") as stopped:
-            train(dataset, "wideband", GROWING, 0, tmp_path)
+            train(dataset, *CROWDED, 0, tmp_path)
     assert isinstance(stopped.value, UserError) and "\n" not in str(stopped.value)
     assert signal.getsignal(number) == before
     assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [2]
-    train(dataset, "wideband", GROWING, 0, tmp_path, resume=True)
-    assert_same_run(dataset, tmp_path, uninterrupted(GROWING), GROWING)
+    train(dataset, *CROWDED, 0, tmp_path, resume=True)
+    assert_same_run(dataset, tmp_path, uninterrupted(CROWDED), CROWDED)
 
 
 def test_a_second_interrupt_does_not_wait(dataset, tmp_path, monkeypatch):
     interrupt_after(monkeypatch, 1, [signal.SIGINT, signal.SIGINT])
     with pytest.raises(KeyboardInterrupt):
-        train(dataset, "wideband", SETTINGS, 0, tmp_path)
+        train(dataset, *PLAIN, 0, tmp_path)
 
 
 def test_an_interrupt_in_the_last_epoch_is_passed_on(dataset, tmp_path, monkeypatch, uninterrupted):
-    interrupt_after(monkeypatch, STEPS // SETTINGS.loop.epoch_steps)
+    interrupt_after(monkeypatch, STEPS // PLAIN[1].loop.epoch_steps)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
         with pytest.raises(KeyboardInterrupt):
-            train(dataset, "wideband", SETTINGS, 0, tmp_path)
+            train(dataset, *PLAIN, 0, tmp_path)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert_same_run(dataset, tmp_path, uninterrupted(SETTINGS), SETTINGS)
+    assert_same_run(dataset, tmp_path, uninterrupted(PLAIN), PLAIN)
 
 
 def test_a_run_killed_before_its_first_checkpoint_starts_anew(dataset, tmp_path, uninterrupted):
-    first_lines = (uninterrupted(SETTINGS) / "metrics.jsonl").read_text().splitlines(keepends=True)[:1]
+    first_lines = (uninterrupted(PLAIN) / "metrics.jsonl").read_text().splitlines(keepends=True)[:1]
     (tmp_path / "metrics.jsonl").write_text("".join(first_lines))
-    train(dataset, "wideband", SETTINGS, 0, tmp_path, resume=True)
-    assert_same_run(dataset, tmp_path, uninterrupted(SETTINGS), SETTINGS)
+    train(dataset, *PLAIN, 0, tmp_path, resume=True)
+    assert_same_run(dataset, tmp_path, uninterrupted(PLAIN), PLAIN)
 
 
 def test_a_curve_cut_short_is_mended(dataset, tmp_path, uninterrupted):
-    shutil.copytree(uninterrupted(SETTINGS), tmp_path / "run")
+    shutil.copytree(uninterrupted(PLAIN), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / str(STEPS))
     curve = tmp_path / "run" / "metrics.jsonl"
     curve.write_text(curve.read_text()[:-20])
-    train(dataset, "wideband", SETTINGS, 0, tmp_path / "run", resume=True)
-    assert_same_run(dataset, tmp_path / "run", uninterrupted(SETTINGS), SETTINGS)
+    train(dataset, *PLAIN, 0, tmp_path / "run", resume=True)
+    assert_same_run(dataset, tmp_path / "run", uninterrupted(PLAIN), PLAIN)
 
 
 def test_resuming_a_finished_run_changes_nothing(dataset, tmp_path, uninterrupted):
-    shutil.copytree(uninterrupted(SETTINGS), tmp_path / "run")
-    result = train(dataset, "wideband", SETTINGS, 0, tmp_path / "run", resume=True)
+    shutil.copytree(uninterrupted(PLAIN), tmp_path / "run")
+    result = train(dataset, *PLAIN, 0, tmp_path / "run", resume=True)
     assert result.steps == STEPS
-    assert_same_run(dataset, tmp_path / "run", uninterrupted(SETTINGS), SETTINGS)
+    assert_same_run(dataset, tmp_path / "run", uninterrupted(PLAIN), PLAIN)
 
 
 def test_density_controls_are_reported_and_keep_their_schedule(uninterrupted):
-    entries = metrics_of(uninterrupted(GROWING))
+    entries = metrics_of(uninterrupted(CROWDED))
     (control,) = [entry for entry in entries if "density" in entry]
     assert control["step"] == 4
-    assert control["density"]["alive"] == 90 == [entry for entry in entries if "loss" in entry][-1]["gaussians"]
-    assert not any("density" in entry for entry in metrics_of(uninterrupted(SETTINGS)))
+    assert control["density"]["alive"] == 90
+    assert [entry["gaussians"] for entry in entries if "loss" in entry] == [60, 90, 90, 90]
+    assert not any("density" in entry for entry in metrics_of(uninterrupted(PLAIN)))
 
 
 def test_a_reset_of_the_attenuation_happens_at_its_step(dataset, tmp_path, uninterrupted):
-    shutil.copytree(uninterrupted(GROWING), tmp_path / "run")
+    """At that of step 4: all are below the ceiling then, and dead slots stay dead."""
+    shutil.copytree(uninterrupted(CROWDED), tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / str(STEPS))
-    run = Run(dataset, "wideband", GROWING, 0, tmp_path / "run")
-    assert run.restore()
-    alive = np.asarray(run.state.params.gaussians.alive) > 0
+    run = Run(dataset, *CROWDED, 0, tmp_path / "run")
+    assert run.restore() and run.step == 4
+    alive = np.asarray(run.state.params.gaussians.alive)
     ceiling = np.log(0.01 / 0.99)
-    assert np.asarray(run.state.params.gaussians.opacity_logits)[alive].max() <= ceiling + 1e-5
+    logits = np.asarray(run.state.params.gaussians.opacity_logits)
+    assert alive.sum() == 90 and logits[alive].max() <= ceiling + 1e-5 and np.isneginf(logits[~alive]).all()
 
 
 def test_a_folder_that_cannot_be_written(dataset, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"cannot write .*metrics\.jsonl"):
-        train(dataset, "wideband", SETTINGS, 0, tmp_path / "file" / "run")
+        train(dataset, *PLAIN, 0, tmp_path / "file" / "run")
 
 
 def test_data_without_training_or_test_spectra(dataset, tmp_path):
     with pytest.raises(UserError, match="box has no training spectra"):
-        train(dataclasses.replace(dataset, train=dataset.train[:0]), "wideband", SETTINGS, 0, tmp_path / "untrained")
+        train(dataclasses.replace(dataset, train=dataset.train[:0]), *PLAIN, 0, tmp_path / "untrained")
     assert not (tmp_path / "untrained").exists()
-    train(dataclasses.replace(dataset, test=dataset.test[:0]), "wideband", SETTINGS, 0, tmp_path / "unwatched")
+    train(dataclasses.replace(dataset, test=dataset.test[:0]), *PLAIN, 0, tmp_path / "unwatched")
     assert not any("held_out_ssim" in entry for entry in metrics_of(tmp_path / "unwatched"))
 
 
 def test_training_in_a_thread(dataset, tmp_path):
     """Signals can be handled in the main thread only; sweeps train in others."""
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        assert pool.submit(train, dataset, "wideband", SETTINGS, 0, tmp_path).result().steps == STEPS
+        assert pool.submit(train, dataset, *PLAIN, 0, tmp_path).result().steps == STEPS
+
+
+def test_curves_watch_the_validation_part_where_there_is_one(dataset, tmp_path):
+    run = Run(dataset, *PLAIN, 0, tmp_path)
+    assert len(run.watched) == 2 and set(run.watched) <= set(dataset.test.tolist())
+    split = hold_out_validation(dataset, 0.25)
+    run = Run(split, *PLAIN, 0, tmp_path)
+    assert len(run.watched) == 2 and set(run.watched) <= set(split.validation.tolist())
+    assert run.evaluate() == watch(run.field, run.state.params, split, run.watched)
+    assert set(run.batches(0, 50).ravel()) <= set(split.train.tolist())
 
 
 def test_a_curriculum_starts_with_low_frequencies_and_ends_with_all(dataset, tmp_path):
-    settings = dataclasses.replace(SETTINGS, optim=dataclasses.replace(SETTINGS.optim, curriculum=0.5))
-    run = Run(dataset, "wideband", settings, 0, tmp_path)
+    run = Run(dataset, "ripple", toy_settings(optim={"curriculum": 0.5}), 0, tmp_path)
     highest = [dataset.frequencies_hz[run.pool(progress)].max() for progress in (0.0, 0.26, 0.49, 0.5, 1.0)]
     assert highest == [1e9, 10e9, 10e9, 94e9, 94e9]
     np.testing.assert_array_equal(run.pool(0.5), dataset.train)

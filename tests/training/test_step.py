@@ -12,11 +12,14 @@ from toys import GROWING, CuspField, RippleField, Room, SwellingField, registere
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.layout import export_layout, load_layout
+from wbgs_jax.fields.wideband import WidebandParams
 from wbgs_jax.splat import TileLimits, project
 from wbgs_jax.splat.tiles import build_tile_jobs
 from wbgs_jax.training.data import training_data
+from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
+from wbgs_jax.types import Gaussians
 
 LENGTH = 4
 SETTINGS = toy_settings(loop={"epoch_steps": LENGTH})
@@ -129,16 +132,16 @@ def test_an_epoch_can_start_in_its_middle(tmp_path, dataset):
     assert_equal_states(whole, two_by_two)
 
 
-def test_the_statistics_of_density_control_are_sums_over_steps(tmp_path, dataset):
+def test_the_statistics_of_density_control_are_sums_over_steps(rng):
     """Of the positional gradients, on the image and in the world, and of the steps in which there was one."""
-    run = new_run(dataset, tmp_path, "wideband", GROWING)
-    (control,) = run.controls
-    statistics, rng = control.statistics(run.state.params), np.random.default_rng(0)
-    probes, means = rng.normal(size=(2, 64, 2)).astype(np.float32), rng.normal(size=(2, 64, 3)).astype(np.float32)
-    probes[0, :5] = probes[1, 3:9] = 0
+    n = 9
+    gaussians = Gaussians(jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.ones((n, 4)), jnp.zeros(n))
+    control = DensityControl(GROWING.density)
+    statistics = control.statistics(WidebandParams(gaussians, {}))
+    probes, means = rng.normal(size=(2, n, 2)).astype(np.float32), rng.normal(size=(2, n, 3)).astype(np.float32)
+    probes[0, :5] = probes[1, 3:7] = 0
     for probe, mean in zip(probes, means, strict=True):
-        gaussians = dataclasses.replace(run.state.params.gaussians, means=jnp.asarray(mean))
-        gradients = dataclasses.replace(run.state.params, gaussians=gaussians)
+        gradients = WidebandParams(dataclasses.replace(gaussians, means=jnp.asarray(mean)), {})
         statistics = control.accumulate(statistics, gradients, jnp.asarray(probe))
     norms = np.hypot(probes[..., 0] * 180, probes[..., 1] * 45)  # pixels -> -1..1 across the image
     np.testing.assert_allclose(statistics.gradient_norm, norms.sum(0), rtol=1e-5)
@@ -180,11 +183,11 @@ def test_an_overflow_commits_nothing_and_the_host_grows_the_tile_lists(tmp_path,
 
 def test_an_overflow_in_the_middle_of_an_epoch_repeats_the_rest_of_it(tmp_path, dataset):
     """A field that needs more room with every step outgrows limits that fit the first step exactly."""
-    swelling = toy_settings(field={"learning_rate": 0.04}, loop={"epoch_steps": LENGTH})
+    swelling = toy_settings(field={"learning_rate": 0.2}, loop={"epoch_steps": LENGTH})
     short, probe = (new_run(dataset, tmp_path, "swelling", swelling) for _ in range(2))
     _, report = epoch(probe, probe.state, probe.batches(0, LENGTH))
     assert bool(report.overflow) and 0 < int(report.good_steps) < LENGTH
-    assert int(report.required[0]) == short.limits.size + 1
+    assert int(report.required[0]) > short.limits.size
     figures = short.epoch()
     roomy = new_run(dataset, tmp_path, "swelling", swelling, short.limits)
     assert roomy.epoch() == figures and roomy.compilations < short.compilations
@@ -277,11 +280,13 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
 
 
 def test_the_loss_decreases(tmp_path, dataset):
-    run = new_run(dataset, tmp_path, "wideband", GROWING)
-    figures = [run.epoch() for _ in range(80)]
+    """Three spectra are learned by heart."""
+    few = dataclasses.replace(dataset, train=dataset.train[:3])
+    run = new_run(few, tmp_path, "wideband", GROWING)
+    figures = [run.epoch() for _ in range(20)]
     losses, ssims = ([f[name] for f in figures] for name in ("loss", "batch_ssim"))
-    assert np.mean(losses[-6:]) < 0.7 * np.mean(losses[:2])
-    assert np.mean(ssims[-6:]) > np.mean(ssims[:2]) + 0.1
+    assert np.mean(losses[-5:]) < 0.6 * losses[0]
+    assert np.mean(ssims[-5:]) > ssims[0] + 0.25
 
 
 def test_batches_depend_on_seed_and_epoch_alone(tmp_path, dataset):

@@ -20,7 +20,7 @@ def static(**options: Any) -> Any:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
 def pytree(cls: type[T]) -> type[T]:
-    """Make a class a frozen dataclass and a pytree.
+    """Makes a class a frozen dataclass and a pytree.
 
     Unlike `jax.tree_util.register_dataclass`, rebuilding a tree does not call `__init__`: transformations put shapes, masks
     and markers where the annotations promise arrays, and run-time type checks must not trip over them.

@@ -48,7 +48,7 @@ INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
 
 
 def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2) -> Dataset:
-    """Load a folder of the published layout; spectrum i is image i + 1.
+    """Loads a folder of the published layout; spectrum i is image i + 1.
 
     Without freq.txt all spectra have one frequency: `frequency_hz`, else `frequency` (GHz) in gateway_info.yml, else
     `NOMINAL_FREQUENCY_HZ`. Without index files `test_fraction` of the transmitters, drawn by `seed`, are the test.
@@ -87,7 +87,7 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
 
 
 def export_layout(scene: SceneFile, folder: Path | str) -> None:
-    """Write a scene as a folder of the published layout; the folder appears whole or not at all.
+    """Writes a scene as a folder of the published layout; the folder appears whole or not at all.
 
     Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and array are not kept.
 
@@ -253,7 +253,7 @@ def _read_text(path: Path) -> str:
 
 
 def _ghz_to_hz(word: str, where: Path) -> float:
-    """Through decimals, not by a factor of 1e9: rounding must not part a frequency from itself in another file."""
+    """Returns hertz, through decimals, not by a factor of 1e9: rounding must not part a frequency from itself elsewhere."""
     try:
         hertz = float(Decimal(word).scaleb(9))
     except InvalidOperation:
@@ -269,7 +269,7 @@ def _hz_to_ghz(hertz: float) -> str:
 
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside `folder` that becomes it when the block ends well and vanishes when it does not."""
+    """Gives a temporary folder beside `folder` that becomes it when the block ends well and vanishes when it does not."""
     temporary = None
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -288,7 +288,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 
 
 def main() -> None:
-    """Command line: a scene file becomes a folder of the published layout."""
+    """Entry point: a scene file becomes a folder of the published layout."""
     if len(sys.argv) != 3:
         raise UserError("usage: python -m wbgs_jax.data.layout SCENE.npz FOLDER")
     export_layout(load_scene(sys.argv[1]), sys.argv[2])

@@ -21,7 +21,7 @@ RELEASED = Path(__file__).parent / "released"
 def load_dataset(
     source: str | int | Path, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2
 ) -> Dataset:
-    """Load a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout.
+    """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout.
 
     `frequency_hz`, `seed` and `test_fraction` are for folders that do not say (`wbgs_jax.data.layout.load_layout`); scene
     files know their frequencies and their split.

@@ -11,7 +11,7 @@ from wbgs_jax._util.files import atomic_write
 
 
 def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Vertices (float32) and triangles (int32) of a PLY file, ASCII or binary.
+    """Returns vertices (float32) and triangles (int32) of a PLY file, ASCII or binary.
 
     Quads and larger polygons become fans of triangles; polygons of fewer than three corners are left out. A cloud without
     faces has no triangles.
@@ -41,7 +41,7 @@ def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.
 
 
 def write_ply(path: Path | str, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
-    """Write float32 vertices and int32 triangles as a binary PLY file, atomically; no triangles make a point cloud."""
+    """Writes float32 vertices and int32 triangles as a binary PLY file, atomically; no triangles make a point cloud."""
     corners = np.rec.fromarrays(np.asarray(vertices, "<f4").T, dtype=[(axis, "<f4") for axis in "xyz"])
     elements = [PlyElement.describe(corners, "vertex")]
     if len(faces):
@@ -53,7 +53,7 @@ def write_ply(path: Path | str, vertices: Float[np.ndarray, "vertices 3"], faces
 
 
 def _triangles(polygons: np.ndarray | None) -> np.ndarray:
-    """Fans of triangles, int64 (n, 3), of plyfile's `face` element; corner 0 of a polygon is in each of its triangles."""
+    """Returns fans of triangles, int64 (n, 3), of plyfile's `face` element; corner 0 of a polygon is in each of its own."""
     names = set() if polygons is None else {"vertex_indices", "vertex_index"} & set(polygons.dtype.names or ())
     if polygons is None or len(polygons) == 0 or not names:
         return np.zeros((0, 3), np.int64)

@@ -62,7 +62,7 @@ class SceneFile:
 
     @property
     def observations(self) -> np.ndarray:
-        """What was observed, of whichever kind: (tx, rx, freq, ...)."""
+        """Returns what was observed, of whichever kind: (tx, rx, freq, ...)."""
         (observed,) = (values for values in (self.snapshots, self.pas, self.power_db) if values is not None)
         return observed
 
@@ -72,7 +72,7 @@ _DAMAGED = (ValueError, TypeError, EOFError, RuntimeError, SyntaxError, MemoryEr
 
 
 def save_scene(path: Path | str, scene: SceneFile) -> None:
-    """Check and write a scene file; equal scenes give equal bytes."""
+    """Checks and writes a scene file; equal scenes give equal bytes."""
     arrays = {key: getattr(scene, key) for key in (*ARRAYS, *OBSERVATIONS, *TEXTS)}
     arrays = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     arrays = check_arrays(arrays, str(path))
@@ -87,7 +87,7 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
 
 
 def load_scene(path: Path | str) -> SceneFile:
-    """Read and check a scene file of this format or an older one.
+    """Reads and checks a scene file of this format or an older one.
 
     Raises:
         UserError: the file is missing, truncated, of another format, or its content is not a scene.
@@ -117,7 +117,7 @@ def load_scene(path: Path | str) -> SceneFile:
 
 
 def _from_format_1(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, np.ndarray]:
-    """The arrays of format 2 of a file of format 1: one receiver without an axis of its own, an array in wavelengths."""
+    """Returns the arrays of format 1, one receiver without an axis of its own and an array in wavelengths, as format 2."""
     array = meta.get("rx_array", {})
     texts = {"element_unit": "wavelengths", "element_pattern": array.get("pattern", "") if isinstance(array, dict) else ""}
     axis = {"snapshots": 1, "rx_position": 0, "rx_orientation": 0, "element_positions": 0}

@@ -121,7 +121,7 @@ def _by_frequency(dataset: Dataset, index: np.ndarray) -> Iterator[tuple[np.ndar
 
 
 def _squared_distances(dataset: Dataset, index: np.ndarray, neighbours: np.ndarray) -> Float[np.ndarray, "b m"]:
-    """Square metres between transmitters, axis by axis to keep one (b, m) array rather than (b, m, 3)."""
+    """Returns square metres between transmitters, axis by axis to keep one (b, m) array rather than (b, m, 3)."""
     a, b = dataset.tx_positions[index], dataset.tx_positions[neighbours]
     return sum(((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3)), np.zeros((len(a), len(b))))
 

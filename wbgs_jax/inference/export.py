@@ -104,7 +104,7 @@ def _serialize(trained: Trained, receiver: Receiver, platforms: Sequence[str]) -
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Keep the paths of this machine's source files out of what is lowered."""
+    """Keeps the paths of this machine's source files out of what is lowered."""
     name = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, name)
     jax.config.update(name, 0)

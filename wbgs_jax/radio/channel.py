@@ -70,6 +70,7 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
     """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for one of nothing."""
-    norm_a, norm_b = (jnp.sqrt(jnp.sum(squared_magnitude(v), -1)) for v in (a, b))
-    product = jnp.sqrt(squared_magnitude(jnp.sum(a.conj() * b, -1)))
-    return product / jnp.where(norm_a * norm_b > 0, norm_a * norm_b, 1)
+    # Of unit vectors: the square of a product of faint ones would vanish in single precision.
+    norms = [jnp.sqrt(jnp.sum(squared_magnitude(v), -1, keepdims=True)) for v in (a, b)]
+    unit_a, unit_b = (v / jnp.where(norm > 0, norm, 1) for v, norm in zip((a, b), norms, strict=True))
+    return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))

@@ -21,7 +21,7 @@ _ZENITH_SPAN: dict[str, float] = {"hemisphere": jnp.pi / 2, "sphere": jnp.pi}
 
 
 def rotation_matrix(quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Rotation matrices of quaternions (wxyz) of any non-zero length."""
+    """Returns rotation matrices of quaternions (wxyz) of any non-zero length."""
     w, x, y, z = jnp.moveaxis(quats / jnp.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -32,30 +32,30 @@ def rotation_matrix(quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) -> Inexact[Array, "*n 3"]:
-    """World vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into world
+    """Returns world vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into world
     ones."""
     return jnp.matmul(vectors, rotation_matrix(orientation), precision=EXACT)
 
 
 def covariance_factor(log_scales: Float[Array, "*n 3"], quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """M with covariance M M^T: the own axes as columns, scaled by the standard deviations (metres)."""
+    """Returns M with covariance M M^T: the own axes as columns, scaled by the standard deviations (metres)."""
     return rotation_matrix(quats) * jnp.exp(log_scales)[..., None, :]
 
 
 def direction_to_angles(vectors: Float[Array, "*n 3"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Azimuth (-pi..pi) and zenith (0..pi) in radians of vectors of any length in the receiver's local frame."""
+    """Returns azimuth (-pi..pi) and zenith (0..pi) in radians of vectors of any length in the receiver's local frame."""
     x, y, z = jnp.moveaxis(vectors, -1, 0)
     return jnp.arctan2(y, x), jnp.arctan2(jnp.hypot(x, y), z)
 
 
 def angles_to_direction(azimuth: Float[Array, "*n"], zenith: Float[Array, "*n"]) -> Float[Array, "*n 3"]:
-    """Unit vectors (sin t cos p, sin t sin p, cos t) of azimuth p and zenith t in radians."""
+    """Returns unit vectors (sin t cos p, sin t sin p, cos t) of azimuth p and zenith t in radians."""
     sine = jnp.sin(zenith)
     return jnp.stack([sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), jnp.cos(zenith)], -1)
 
 
 def pixels_per_radian(projection: Projection) -> tuple[float, float]:
-    """Columns per radian of azimuth and rows per radian of zenith."""
+    """Returns columns per radian of azimuth and rows per radian of zenith."""
     if projection not in _ZENITH_SPAN:
         raise ValueError(f"projection is {projection!r}; choose 'hemisphere' or 'sphere'")
     return AZIMUTH_PERIOD / (2 * jnp.pi), (PAS_HEIGHT - 1) / _ZENITH_SPAN[projection]
@@ -64,7 +64,7 @@ def pixels_per_radian(projection: Projection) -> tuple[float, float]:
 def angles_to_pixel(
     azimuth: Float[Array, "*n"], zenith: Float[Array, "*n"], projection: Projection = "hemisphere"
 ) -> Float[Array, "*n 2"]:
-    """Continuous pixel coordinates (x: column, y: row); see the paper, section 4.3, with its p_x = (phi + pi) / (2 pi) W."""
+    """Returns continuous pixel coordinates (x: column, y: row); see the paper, section 4.3, with its p_x = (phi + pi) / (2 pi) W."""
     sx, sy = pixels_per_radian(projection)
     return jnp.stack([(azimuth + jnp.pi) * sx, zenith * sy], -1)
 
@@ -72,11 +72,11 @@ def angles_to_pixel(
 def pixel_to_angles(
     pixels: Float[Array, "*n 2"], projection: Projection = "hemisphere"
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Azimuth and zenith (radians) of continuous pixel coordinates (x: column, y: row)."""
+    """Returns azimuth and zenith (radians) of continuous pixel coordinates (x: column, y: row)."""
     sx, sy = pixels_per_radian(projection)
     return pixels[..., 0] / sx - jnp.pi, pixels[..., 1] / sy
 
 
 def smooth_length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
-    """Length (metres), rounded up to a millimetre so that it is differentiable everywhere."""
+    """Returns the length (metres), rounded up to a millimetre so that it is differentiable everywhere."""
     return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)

@@ -19,20 +19,20 @@ GAIN = 1 / (1 - _EDGE)
 
 
 def mahalanobis2(dx: Float[Array, "*#n"], dy: Float[Array, "*#n"], conic: Float[Array, "*#n 3"]) -> Float[Array, "*n"]:
-    """q of offsets (pixels) from the centre."""
+    """Returns q of offsets (pixels) from the centre."""
     return conic[..., 0] * dx * dx + conic[..., 2] * dy * dy + 2 * conic[..., 1] * dx * dy
 
 
 def footprint(q: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """G(q) in 0..1."""
+    """Returns G(q) in 0..1."""
     return jnp.maximum(jnp.exp(-0.5 * q) - _EDGE, 0) * GAIN
 
 
 def windowed_exponential(q: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """-2 dG/dq: the exponential on the support, zero outside."""
+    """Returns -2 dG/dq: the exponential on the support, zero outside."""
     return jnp.where(q < CUT, jnp.exp(-0.5 * q) * GAIN, 0)
 
 
 def wrap_azimuth(dx: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The nearest alias of a column offset (pixels)."""
+    """Returns the nearest alias of a column offset (pixels)."""
     return dx - AZIMUTH_PERIOD * jnp.round(dx / AZIMUTH_PERIOD)

@@ -53,7 +53,7 @@ class Splats:
 
 
 def jacobian(local: Float[Array, "n 3"], projection: Projection) -> Float[Array, "n 2 3"]:
-    """Derivative of pixel coordinates with respect to the local position (pixels per metre)."""
+    """Returns the derivative of pixel coordinates with respect to the local position (pixels per metre)."""
     x, y, z = jnp.moveaxis(local, -1, 0)
     sx, sy = pixels_per_radian(projection)
     rho2 = jnp.maximum(x * x + y * y, MIN_RANGE**2)
@@ -103,7 +103,7 @@ def to_local_matrix(factor: Float[Array, "n 3 3"], orientation: Float[Array, "4"
 
 
 def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Keep centres off the zenith axis, where the azimuth has no derivative: there x and y get none."""
+    """Returns centres off the zenith axis, where the azimuth has no derivative: there x and y get none."""
     horizontal, vertical = local[:, :2], local[:, 2:]
     near = jnp.linalg.norm(jax.lax.stop_gradient(horizontal), axis=-1, keepdims=True) < MIN_RANGE
     beside = jax.lax.stop_gradient(horizontal) + jnp.array([MIN_RANGE, 0], local.dtype)
@@ -111,7 +111,7 @@ def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
 
 
 def _cap_azimuth(spread: Float[Array, "n 2 3"]) -> Float[Array, "n 2 3"]:
-    """Shrink the x axis where its standard deviation exceeds `MAX_AZIMUTH_SIGMA`."""
+    """Returns the spread with its x axis shrunk where its standard deviation exceeds `MAX_AZIMUTH_SIGMA`."""
     limit = MAX_AZIMUTH_SIGMA**2 - LOW_PASS
     xx = jnp.sum(spread[:, 0] ** 2, -1)
     shrink = jnp.sqrt(jnp.minimum(1, limit / jnp.maximum(xx, limit / 2)))
@@ -121,7 +121,7 @@ def _cap_azimuth(spread: Float[Array, "n 2 3"]) -> Float[Array, "n 2 3"]:
 def _covariance2d(
     spread: Float[Array, "n 2 3"],
 ) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
-    """Low-passed 2D covariance (xx, xy, yy) and its determinant.
+    """Returns the low-passed 2D covariance (xx, xy, yy) and its determinant.
 
     xx yy - xy^2 cancels for thin splats; the cross product of the two rows (Lagrange's identity) does not.
     """

@@ -17,7 +17,7 @@ from wbgs_jax.splat.project import Splats
 
 
 def render_dense(splats: Splats, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:
-    """Blend N splats for B queries; attenuation (delta, in [0, 1)) and signal (Sig) are per Gaussian and query."""
+    """Returns N splats blended for B queries; attenuation (delta, in [0, 1)) and signal (Sig) are per Gaussian and query."""
     order = jnp.argsort(jax.lax.stop_gradient(splats.depths))
     x = jnp.arange(PAS_WIDTH, dtype=attenuation.dtype)[None, :]
     y = jnp.arange(PAS_HEIGHT, dtype=attenuation.dtype)[:, None]

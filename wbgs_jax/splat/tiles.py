@@ -88,7 +88,7 @@ def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
 def _tile_range(
     low: Float[Array, "n"], high: Float[Array, "n"], size: int, tiles: int
 ) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
-    """First tile and number of tiles that hold pixels in low..high."""
+    """Returns the first tile and number of tiles that hold pixels in low..high."""
     first = jnp.clip(jnp.floor(jnp.ceil(low) / size), 0, tiles)
     last = jnp.clip(jnp.floor(jnp.floor(high) / size), -1, tiles - 1)
     return first.astype(jnp.int32), jnp.maximum(last - first + 1, 0).astype(jnp.int32)
@@ -107,7 +107,7 @@ def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"]) -> _Boxe
 def _sorted_keys(
     means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, entries: int
 ) -> tuple[UInt32[Array, "entries"], Int[Array, ""]]:
-    """Sorted keys tile * n + depth rank of all (splat, tile) pairs whose footprints overlap; `NO_ENTRY` in the rest."""
+    """Returns sorted keys tile * n + depth rank of all (splat, tile) pairs whose footprints overlap; `NO_ENTRY` in the rest."""
     n = means.shape[0]
     width = boxes.columns + boxes.alias_columns
     count = width * boxes.rows
@@ -128,7 +128,7 @@ def _sorted_keys(
 
 
 def _nearest_mahalanobis2(left: Float[Array, "e"], top: Float[Array, "e"], conic: Float[Array, "e 3"]) -> Float[Array, "e"]:
-    """Smallest q over a tile's pixels (as a continuous rectangle), given the offset of its first pixel from the centre."""
+    """Returns the smallest q over a tile's pixels (as a continuous rectangle), given the offset of its first pixel from the centre."""
     right, bottom = left + TILE_WIDTH - 1, top + TILE_HEIGHT - 1
     a, b, c = jnp.moveaxis(jnp.where(conic[:, :1] > 0, conic, jnp.array([1, 0, 1], conic.dtype)), -1, 0)
 

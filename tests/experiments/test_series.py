@@ -1,0 +1,103 @@
+"""Series: every change is one and can work; results of the time before the runner are read; tables show what was run."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from experiments.catalogue import SERIES, unique_jobs
+from experiments.jobs import Job
+from experiments.results import FOLDER, Results
+from experiments.series import choices, tuning, wave_choices
+from experiments.settings import settings
+from experiments.variants import VARIANTS
+from wbgs_jax.config import check
+from wbgs_jax.fields import get_field
+
+JOBS = unique_jobs(tuple(SERIES))
+KINDS = {(job.field, job.variant, job.profile): job for job in JOBS}
+
+
+@pytest.mark.parametrize("job", KINDS.values(), ids=lambda job: f"{job.profile}-{job.name}")
+def test_a_change_is_one_and_can_work(job):
+    variant, chosen, usual = VARIANTS[job.variant], settings(job), settings(dataclasses.replace(job, variant=""))
+    check(chosen)
+    get_field(job.field).check(chosen.field)
+    assert chosen.optim.steps == (variant.steps or usual.optim.steps) == chosen.optim.min_steps
+    for section, values in variant.changes.items():
+        assert values.items() <= vars(getattr(chosen, section)).items()
+    changed = {name for name, values in vars(chosen).items() if values != vars(usual)[name]}
+    if variant.steps is None and job.variant != "fusion_0":  # what the profile has, among others that it has not
+        assert changed == set(variant.changes)
+
+
+@pytest.mark.parametrize("series", [one for module in SERIES.values() for one in module.SERIES], ids=lambda one: one.title)
+def test_no_two_rows_of_a_table_are_the_same(series):
+    jobs = [series.jobs_of(series.scenes[0], variant)[0] for variant in series.variants]
+    rows = [(settings(job), VARIANTS[job.variant].displacement) for job in jobs]
+    assert all(one != other for one, other in itertools.combinations(rows, 2))
+
+
+def test_batches_take_equal_time_and_their_rates_follow_the_square_root():
+    small, usual, large = (settings(Job("1", "wideband", variant=f"batch_{n}", profile="choices")) for n in (4, 8, 16))
+    assert small.optim.steps > usual.optim.steps > large.optim.steps
+    for rate in ("network_lr", "means_lr", "log_scales_lr", "quats_lr", "opacity_lr"):
+        rates = [getattr(chosen.field, rate) for chosen in (small, usual, large)]
+        np.testing.assert_allclose(np.divide(rates, rates[1]), [0.5**0.5, 1, 2**0.5])
+    assert usual.field.network_lr == 1e-3
+
+
+def test_the_tuned_are_scored_where_the_slowest_one_is():
+    scored = {
+        field: {frozenset(data.tx_index[data.test].tolist()) for _, data in Job("1", field, profile="tuning").models()}
+        for field in ("wideband", "wrfgs", "nerf2")
+    }
+    (same,) = set.union(*scored.values())
+    assert len(same) == 24
+
+
+@pytest.mark.parametrize(
+    ("job", "median", "mean"),
+    [
+        # As choices_scene1_octaves4.json, choices_scene1_f1-24.25-77.json, choices_scene4_fusion.json,
+        # equal_time_scene1_batch.json, baseline_choices_scene1.json and wave_choices_scene4.json had them.
+        (Job("1", "wideband", variant="sphere", seed=1, profile="choices_octaves4"), 0.7687, 0.7346),
+        (Job("1", "wideband", "C3", variant="frequency_octaves_4", profile="choices"), 0.7559, 0.7118),
+        (Job("4", "wideband", variant="fusion_1", seed=1, profile="choices"), 0.7709, 0.752),
+        (Job("1", "wideband", variant="batch_16", profile="choices"), 0.8604, 0.8238),
+        (Job("1", "wrfgs", variant="lr_1.6e-2", profile="tuning"), 0.732, 0.7057),
+        (Job("4", "wave", variant="mesh_moved_3mm", profile="choices"), 0.8595, 0.8166),
+    ],
+    ids=lambda value: value.name if isinstance(value, Job) else "",
+)
+def test_what_was_measured_before_the_runner_counts_as_run(job, median, mean):
+    assert job in JOBS
+    found = Results("quick").get(job)
+    assert found is not None
+    assert (found.values["median_ssim"], found.values["mean_ssim"]) == (median, mean)
+
+
+def test_no_result_of_a_series_is_lost():
+    results = Results("quick")
+    found = {path for profile in ("choices", "choices_octaves4", "tuning") for path in (FOLDER / profile).iterdir()}
+    known = {results.path(job) for job in JOBS if results.get(job)}
+    published = {path for path in found if path.name.startswith("example1_")}  # of 800 steps: in the table, and no job
+    assert len(published) == 15 and len(known) == 73
+    assert found == known | published
+
+
+def test_a_table_has_seeds_their_median_and_what_is_missing(tmp_path):
+    results = Results("quick", tmp_path)
+    (series,) = (one for one in choices.SERIES if "fusion_0" in one.variants)
+    for seed, score in ((0, 0.5), (1, 0.7)):
+        results.write(series.jobs_of("2", "fusion_3")[seed], {"median_ssim": score, "mean_ssim": 0.4, "steps": 1500})
+    lines = series.render(results).splitlines()
+    assert "| 2 | fusion_3 | 0.500 | 0.700 | **0.600** | 0.400 | 1,500 |" in lines
+    assert "| 2 | fusion_2 | not run | not run |  |  |  |" in lines
+
+
+@pytest.mark.parametrize("module", [choices, tuning, wave_choices])
+def test_every_series_is_shown(module, tmp_path):
+    assert module.jobs() and "not run" in module.render(Results("quick", tmp_path))
+    assert "**0." in module.render(Results("quick"))
