@@ -33,6 +33,7 @@ from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.maps import predict_many
 from wbgs_jax.inference.predictor import BLOCK, predictor, trained_band
+from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
 from wbgs_jax.training.run_folder import TrainedField, load_trained
@@ -159,23 +160,20 @@ def ask_channel(
     return {name: np.array(rows), "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
 
 
-def _snapshot(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    return channel.snapshots_of_arrivals(arrivals, receiver.element_wavelengths(frequency_hz))
-
-
 def _power(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    return channel.received_power_db(_snapshot(arrivals, receiver, frequency_hz))
+    return channel.received_power_db(snapshots_from_paths(arrivals, receiver, frequency_hz))
 
 
 def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    elements = receiver.element_wavelengths(frequency_hz)
-    y = channel.snapshots_of_arrivals(arrivals, elements)
-    steering = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
-    return channel.beamforming_gain_db(y, jnp.max(cbf(y, steering)))
+    y = snapshots_from_paths(arrivals, receiver, frequency_hz)
+    directions = jnp.asarray(pas_directions(), jnp.float32)
+    return channel.beamforming_gain_db(
+        y, jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
+    )
 
 
 CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]] = {
-    "snapshot": ("snapshots", _snapshot),
+    "snapshot": ("snapshots", snapshots_from_paths),
     "power": ("power_db", _power),
     "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
     "k-factor": ("k_factor_db", lambda arrivals, *_: channel.k_factor_db(arrivals)),

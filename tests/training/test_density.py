@@ -1,70 +1,81 @@
 """Density control on hand-made Gaussians: who is cloned, split, removed, and what travels along."""
 
 import dataclasses
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import make_epoch, make_optimizer, tiny_dataset, tiny_settings
+from synthetic import tiny_dataset
+from toys import GROWING, RippleConfig, RippleField
 
 from wbgs_jax.config import DensityConfig
-from wbgs_jax.data.surface import surface_from_points
-from wbgs_jax.training.density import capacity_bucket, choose, control_density, reset_attenuation
-from wbgs_jax.fields import wideband
-from wbgs_jax.splat import Capacity
-from wbgs_jax.training.step import DensityStats, TrainState, init_state, training_data
+from wbgs_jax.fields.wideband import WidebandField, WidebandParams
+from wbgs_jax.training.controls import Context, Edit
+from wbgs_jax.training.density import DensityControl, DensityStatistics, choose, control_density, reset_attenuation
+from wbgs_jax.training.loop import Run, _map_like
+from wbgs_jax.training.optim import make_optimizer
+from wbgs_jax.training.step import TrainState
+from wbgs_jax.types import Gaussians
 
-SETTINGS = tiny_settings()
-OPTIMIZER = make_optimizer(SETTINGS.optim)
-CONFIG = DensityConfig(gradient_threshold=1.0, split_scale=0.5, prune_attenuation=0.005, max_gaussians=100)
+STEP, SLOTS = 7, 64
+CONFIG = DensityConfig(
+    every=STEP, start=1, gradient_threshold=1.0, split_scale=0.5, prune_attenuation=0.005, max_gaussians=100
+)
+OPTIMIZER = make_optimizer(WidebandField, GROWING.field, GROWING.optim)
 CALM, CLONED, SPLIT, USELESS, UNSEEN, DEAD = range(6)  # the Gaussians of `state`
 
 
 def make_state(rng, means, log_scales, quats, logits, gradient, visible) -> TrainState:
-    """Gaussians of the given shapes padded to 64, with moments that are different everywhere."""
-    n = len(means)
-    surface = jax.tree.map(jnp.asarray, surface_from_points(rng.normal(size=(n, 3))))
-    params = wideband.init(jax.random.key(0), surface, SETTINGS.wideband, 64)
+    """Gaussians of the given shapes in 64 slots, with moments that are different everywhere."""
 
-    def put(padded, values):
-        return padded.at[:n].set(jnp.asarray(values, jnp.float32))
+    def padded(values, fill=0.0):
+        values = np.asarray(values, np.float32)
+        pad = [(0, SLOTS - len(values))] + [(0, 0)] * (values.ndim - 1)
+        return jnp.asarray(np.pad(values, pad, constant_values=fill))
 
-    gaussians = params.gaussians
-    gaussians = dataclasses.replace(
-        gaussians,
-        means=put(gaussians.means, means),
-        log_scales=put(gaussians.log_scales, log_scales),
-        quats=put(gaussians.quats, quats),
-        opacity_logits=put(gaussians.opacity_logits, logits),
+    gaussians = Gaussians(padded(means), padded(log_scales), padded(quats), padded(logits, -np.inf))
+    networks = {"attenuation": {"kernel": jnp.asarray(rng.normal(size=(3, 2)), jnp.float32)}, "radiance": jnp.ones(4)}
+    params = WidebandParams(gaussians, networks)
+    statistics = DensityStatistics(padded(gradient), padded(rng.normal(size=(len(means), 3))), padded(visible))
+    moments = jax.tree.map(
+        lambda a: jnp.asarray(rng.uniform(1, 2, a.shape), a.dtype) if a.ndim else a + 7, OPTIMIZER.init(params)
     )
-    state = init_state(dataclasses.replace(params, gaussians=gaussians), OPTIMIZER)
-    zeros = state.density
-    density = DensityStats(
-        gradient_norm=put(zeros.gradient_norm, gradient),
-        mean_gradient=put(zeros.mean_gradient, rng.normal(size=(n, 3))),
-        visible=put(zeros.visible, visible),
-    )
-    moments = jax.tree.map(lambda a: jnp.asarray(rng.uniform(1, 2, a.shape), a.dtype) if a.ndim else a + 7, state.optimizer)
-    return dataclasses.replace(state, optimizer=moments, density=density, step=jnp.asarray(7, jnp.int32))
+    return TrainState(params, moments, (statistics,), jnp.asarray(STEP, jnp.int32))
 
 
 @pytest.fixture
 def state(rng):
     log_scales = np.log(np.full((6, 3), 0.2)) + 0.1 * rng.normal(size=(6, 3))
     log_scales[SPLIT, 1] = np.log(0.9)  # one long axis is enough
-    logits = np.array([0.0, 0.5, -1.0, -9.0, 0.2, 0.3])
+    logits = np.array([0.0, 0.5, -1.0, -9.0, 0.2, -np.inf])
     # Sums over the visible steps: 0.9, 3, 4, 9 and 50 a step; the unseen one has no gradient.
     gradient, visible = np.array([9.0, 6, 8, 18, 0, 50]), np.array([10.0, 2, 2, 2, 0, 1])
     means = rng.normal(size=(6, 3)) * 0.5 + [0, 0, 2.5]  # above the receiver's horizon, where training sees them
-    made = make_state(rng, means, log_scales, rng.normal(size=(6, 4)), logits, gradient, visible)
-    gaussians = dataclasses.replace(made.params.gaussians, alive=made.params.gaussians.alive.at[DEAD].set(0))
-    return dataclasses.replace(made, params=dataclasses.replace(made.params, gaussians=gaussians))
+    return make_state(rng, means, log_scales, rng.normal(size=(6, 4)), logits, gradient, visible)
 
 
-def control(state, config=CONFIG, seed=0):
-    return control_density(state, config, np.random.default_rng(seed))
+class Done(NamedTuple):
+    """What a control left."""
+
+    state: TrainState
+    report: dict[str, int]
+
+
+def edited(state, config, seed=0) -> Edit:
+    """It looks at nothing but the Gaussians."""
+    context: Any = Context(None, None, np.zeros(0, int))
+    field, rng = RippleField(RippleConfig()), np.random.default_rng(seed)
+    return DensityControl(config).apply(field, state.params, state.statistics[0], context, STEP, rng)
+
+
+def control(state, config=CONFIG, seed=0) -> Done:
+    """As the loop does it."""
+    edit = edited(state, config, seed)
+    new = TrainState(edit.params, _map_like(state, edit.moments), (edit.statistics,), state.step)
+    return Done(new, edit.report["density"])
 
 
 def rows(gaussians):
@@ -81,10 +92,10 @@ def per_gaussian(state):
 
 def test_who_stays_and_who_comes(state):
     new, report = control(state)
-    assert dataclasses.asdict(report) == {"cloned": 1, "split": 1, "pruned": 1, "alive": 6}
+    assert report == {"cloned": 1, "split": 1, "pruned": 1, "alive": 6}
     old, got = rows(state.params.gaussians), rows(new.params.gaussians)
     alive = np.asarray(new.params.gaussians.alive)
-    assert alive.tolist() == [1] * 6 + [0] * (len(alive) - 6)
+    assert alive.tolist() == [True] * 6 + [False] * (len(alive) - 6)
     survivors = [CALM, CLONED, UNSEEN]
     for name in old:
         np.testing.assert_array_equal(got[name][:3], old[name][survivors], err_msg=name)
@@ -98,7 +109,7 @@ def test_who_stays_and_who_comes(state):
 def test_a_clone_steps_downhill_by_half_its_smallest_deviation(state):
     new, _ = control(state)
     step = np.asarray(new.params.gaussians.means[3] - state.params.gaussians.means[CLONED])
-    gradient = np.asarray(state.density.mean_gradient[CLONED])
+    gradient = np.asarray(state.statistics[0].mean_gradient[CLONED])
     length = 0.5 * np.exp(np.asarray(state.params.gaussians.log_scales[CLONED]).min())
     np.testing.assert_allclose(step, -length * gradient / np.linalg.norm(gradient), atol=1e-5)
 
@@ -112,7 +123,7 @@ def test_halves_are_drawn_from_the_gaussian_they_replace(rng):
     draws = []
     for seed in range(20):
         new, report = control(state, dataclasses.replace(CONFIG, max_gaussians=1000), seed)
-        assert report.split == n and report.alive == 2 * n
+        assert report["split"] == n and report["alive"] == 2 * n
         draws.append(np.asarray(new.params.gaussians.means[: 2 * n]) - mean)
     own_axes = Rotation.from_quat(quat, scalar_first=True).inv().apply(np.concatenate(draws)) / np.exp(log_scales)
     np.testing.assert_allclose(np.cov(own_axes.T), np.eye(3), atol=0.15)
@@ -136,33 +147,34 @@ def test_moments_travel_with_survivors_and_are_zero_for_the_new(state):
 def test_statistics_start_anew_and_the_step_stays(state):
     new, _ = control(state)
     assert int(new.step) == 7
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(new.density))
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(new.statistics))
     np.testing.assert_array_equal(jax.tree.leaves(new.params.networks)[0], jax.tree.leaves(state.params.networks)[0])
 
 
 def test_the_neediest_come_first_where_room_is_short(state):
     one_more = dataclasses.replace(CONFIG, max_gaussians=5)  # four are useful
     new, report = control(state, one_more)
-    assert (report.cloned, report.split, report.alive) == (0, 1, 5)
+    assert (report["cloned"], report["split"], report["alive"]) == (0, 1, 5)
     full = dataclasses.replace(CONFIG, max_gaussians=4)
-    assert dataclasses.asdict(control(state, full)[1]) == {"cloned": 0, "split": 0, "pruned": 1, "alive": 4}
+    assert control(state, full).report == {"cloned": 0, "split": 0, "pruned": 1, "alive": 4}
     below = dataclasses.replace(CONFIG, max_gaussians=2)  # never a reason to remove useful ones
-    assert control(state, below)[1].alive == 4
+    assert control(state, below).report["alive"] == 4
     assert new.params.gaussians.alive.sum() == 5
 
 
 def test_a_field_of_useless_gaussians_is_not_emptied(state):
-    gaussians = dataclasses.replace(state.params.gaussians, opacity_logits=jnp.full(64, -20.0))
-    keep, clone, split = choose(gaussians, state.density, CONFIG)
+    logits = state.params.gaussians.opacity_logits
+    gaussians = dataclasses.replace(state.params.gaussians, opacity_logits=jnp.where(jnp.isinf(logits), logits, -20.0))
+    keep, clone, split = choose(gaussians, state.statistics[0], CONFIG)
     assert (keep | split).sum() == 5 and not keep[DEAD] and not (clone & split).any()
 
 
 def test_the_removed_never_return_and_padding_stays_empty(state, rng):
     calm = dataclasses.replace(CONFIG, gradient_threshold=1e9)
     once, report = control(state, calm)
-    assert (report.pruned, report.alive) == (1, 4)
+    assert (report["pruned"], report["alive"]) == (1, 4)
     twice, report = control(once, calm)
-    assert (report.pruned, report.alive) == (0, 4)
+    assert (report["pruned"], report["alive"]) == (0, 4)
     for name, values in rows(twice.params.gaussians).items():
         np.testing.assert_array_equal(values, rows(once.params.gaussians)[name])
 
@@ -176,11 +188,12 @@ def test_equal_seeds_give_equal_controls(state):
 
 def test_a_reset_lowers_the_high_and_forgets_their_moments_only(state):
     ceiling = np.log(0.01 / 0.99)
-    new = reset_attenuation(state, CONFIG)
+    edit = reset_attenuation(Edit(state.params, state.statistics[0], lambda tree: tree, {}), CONFIG)
     old = np.asarray(state.params.gaussians.opacity_logits)
-    np.testing.assert_allclose(new.params.gaussians.opacity_logits, np.minimum(old, ceiling), rtol=1e-6)
-    assert float(new.params.gaussians.opacity_logits[USELESS]) == -9
-    before, after = per_gaussian(state), per_gaussian(new)
+    np.testing.assert_allclose(edit.params.gaussians.opacity_logits, np.minimum(old, ceiling), rtol=1e-6)
+    assert float(edit.params.gaussians.opacity_logits[USELESS]) == -9
+    before, after = per_gaussian(state), per_gaussian(dataclasses.replace(state, optimizer=_map_like(state, edit.moments)))
+    assert before.keys() == after.keys()
     for path, moments in after.items():
         if "opacity_logits" in path.split(".gaussians.")[1]:
             assert not moments.any(), path
@@ -188,24 +201,57 @@ def test_a_reset_lowers_the_high_and_forgets_their_moments_only(state):
             np.testing.assert_array_equal(moments, before[path], err_msg=path)
 
 
-def test_capacity_buckets_hold_what_they_must_and_are_few():
-    buckets = [capacity_bucket(n) for n in range(1, 5000)]
-    assert all(n <= bucket for n, bucket in enumerate(buckets, 1))
-    assert all(bucket <= 1.3 * n + 16 for n, bucket in enumerate(buckets[63:], 64))
-    assert buckets == sorted(buckets) and len(set(buckets)) < 30
-    assert all(bucket % 16 == 0 for bucket in buckets)
+def test_a_reset_after_a_control_does_both(state):
+    """Where both are due: moments are gathered first, then those of delta_o forgotten, and the statistics start anew."""
+    both = dataclasses.replace(CONFIG, reset_every=STEP)
+    (alone, _), (new, report) = control(state), control(state, both)
+    assert report == {"cloned": 1, "split": 1, "pruned": 1, "alive": 6}
+    logits = np.asarray(alone.params.gaussians.opacity_logits)
+    np.testing.assert_allclose(new.params.gaussians.opacity_logits, np.minimum(logits, np.log(0.01 / 0.99)), rtol=1e-6)
+    np.testing.assert_array_equal(new.params.gaussians.means, alone.params.gaussians.means)
+    gathered = per_gaussian(alone)
+    for path, moments in per_gaussian(new).items():
+        forgotten = "opacity_logits" in path.split(".gaussians.")[1]
+        np.testing.assert_array_equal(moments, 0 if forgotten else gathered[path], err_msg=path)
+    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(new.statistics))
 
 
-def test_training_goes_on_after_a_control_and_leaves_padding_alone(state):
-    data = training_data(tiny_dataset())
-    epoch = make_epoch(wideband, OPTIMIZER, Capacity(16384, 2048), SETTINGS.optim)
-    edited, _ = control(state)
-    # The epoch takes its argument's memory.
-    before = jax.tree.map(np.array, edited.params.gaussians)
-    batches = jnp.asarray(np.arange(8).reshape(4, 2), jnp.int32)
-    after, report = epoch(edited, data, batches, jnp.asarray(0, jnp.int32))
-    assert int(report.good_steps) == 4
-    changed = {name: rows(after.params.gaussians)[name] != values for name, values in rows(before).items()}
+def test_a_reset_alone_leaves_the_statistics(state):
+    """They go on being summed for the next control."""
+    reset_only = dataclasses.replace(CONFIG, every=2, reset_every=STEP)
+    edit = edited(state, reset_only)
+    assert edit.report == {} and edit.statistics is state.statistics[0]
+    assert float(edit.params.gaussians.opacity_logits[CALM]) == pytest.approx(np.log(0.01 / 0.99), rel=1e-5)
+
+
+def test_the_schedule():
+    every = DensityControl(dataclasses.replace(CONFIG, every=3, start=6, stop_fraction=0.5))
+    assert [step for step in range(31) if every.due(step, 30)] == [6, 9, 12, 15]
+    resets = DensityControl(dataclasses.replace(CONFIG, every=6, start=1, stop_fraction=1.0, reset_every=4))
+    assert [step for step in range(25) if resets.due(step, 24)] == [4, 6, 8, 12, 16, 18, 20, 24]
+    off = DensityControl(dataclasses.replace(CONFIG, every=0, reset_every=4))
+    assert not any(off.due(step, 24) for step in range(25))
+    from_the_start = DensityControl(dataclasses.replace(CONFIG, every=2, start=0, stop_fraction=1.0))
+    assert not from_the_start.due(0, 24)
+
+
+def test_what_was_removed_is_reported_by_the_pure_part_too(state):
+    edit = control_density(state.params, state.statistics[0], CONFIG, np.random.default_rng(0))
+    assert edit.report == {"density": control(state).report}
+    np.testing.assert_array_equal(edit.params.gaussians.means, control(state).state.params.gaussians.means)
+
+
+def test_training_goes_on_after_a_control_and_leaves_padding_alone(state, tmp_path):
+    run = Run(tiny_dataset(), "wideband", GROWING, 0, tmp_path)
+    gaussians = control(state).state.params.gaussians
+    params = dataclasses.replace(run.state.params, gaussians=gaussians)
+    run.state = dataclasses.replace(run.state, params=params)
+    before = jax.tree.map(np.array, gaussians)  # the epoch takes its argument's memory
+    figures = [run.epoch(), run.epoch()]
+    assert run.step == 4 and np.isfinite([f["loss"] for f in figures]).all() and run.compilations == 1
+    after = run.state.params.gaussians
+    changed = {name: rows(after)[name] != values for name, values in rows(before).items()}
     assert all(mask[:6].any() and not mask[6:].any() for mask in changed.values())
-    np.testing.assert_array_equal(after.params.gaussians.alive, before.alive)
-    assert float(after.density.visible[:6].max()) > 0 and not after.density.visible[6:].any()
+    np.testing.assert_array_equal(after.alive, np.arange(SLOTS) < 6)
+    (seen,) = run.state.statistics
+    assert float(seen.visible[:6].max()) > 0 and not seen.visible[6:].any()

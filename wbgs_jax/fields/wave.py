@@ -32,8 +32,8 @@ from wbgs_jax.propagation.paths import (
     TracedPaths,
     trace_paths,
 )
-from wbgs_jax.propagation.slab import complex_permittivity
-from wbgs_jax.propagation.transport import Slabs, arrivals, snapshots_from_paths
+from wbgs_jax.propagation.slab import Slabs, complex_permittivity
+from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
 from wbgs_jax.radio.array import EXACT, normalise, pas_directions, snapshot_to_pas, squared_magnitude, steering_vector
 from wbgs_jax.radio.channel import Arrivals, received_power_db
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver

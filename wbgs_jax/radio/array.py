@@ -98,8 +98,28 @@ def snapshot_to_pas(
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
     """Returns every PAS scaled to a maximum of 1; an all-zero PAS stays zero."""
-    peak = jnp.max(pas, axis=(-2, -1), keepdims=True)
+    peak = _peak(pas)
     return pas / jnp.where(peak > 0, peak, 1)
+
+
+@jax.custom_jvp
+def _peak(pas: Float[Array, "*n h w"]) -> Float[Array, "*n 1 1"]:
+    """Returns the largest pixel of every PAS.
+
+    Its derivative is that of the first such pixel. JAX's own counts the pixels that equal the maximum; compiled together with
+    what makes them, they may be rounded otherwise the second time, the count be zero and the gradient not a number.
+    """
+    return jnp.max(pas, axis=(-2, -1), keepdims=True)
+
+
+@_peak.defjvp
+def _peak_jvp(
+    primals: tuple[Float[Array, "*n h w"]], tangents: tuple[Float[Array, "*n h w"]]
+) -> tuple[Float[Array, "*n 1 1"], Float[Array, "*n 1 1"]]:
+    (pas,), (tangent,) = primals, tangents
+    flat, flat_tangent = (x.reshape(*x.shape[:-2], -1) for x in (pas, tangent))
+    place = jnp.argmax(flat, -1, keepdims=True)
+    return _peak(pas), jnp.take_along_axis(flat_tangent, place, -1)[..., None]
 
 
 def lag_basis(element_positions: Float[np.ndarray, "elements 3"], tolerance: float = 1e-9) -> Float[np.ndarray, "pixels rank"]:

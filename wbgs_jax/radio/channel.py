@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, squared_magnitude
 
 
 class Arrivals(NamedTuple):
@@ -25,12 +25,6 @@ class Arrivals(NamedTuple):
 
 SMALLEST = 1e-30
 """Power that stands for nothing, so that decibels stay finite."""
-
-
-def snapshots_of_arrivals(arrivals: Arrivals, element_wavelengths: Float[Array, "elements 3"]) -> Complex[Array, "elements"]:
-    """Returns the array's complex voltages, every path a plane wave; element positions in wavelengths, receiver's frame."""
-    steering = steering_vector(element_wavelengths, arrivals.direction)
-    return jnp.matmul(arrivals.amplitude, steering, precision=EXACT)
 
 
 def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
