@@ -154,7 +154,8 @@ def test_the_slow_field_is_compared_at_its_own_transmitters(tmp_path):
     assert cells_of_scene[1] == cells.NOT_RUN
 
 
-def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path):
+def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics, "DRAWS", 20)
     text = page.page(everything, tmp_path)
     for module in page.PAGES:
         assert f"## {module.TITLE}" in text

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import as_float64, box, mesh_of, room
+from rooms import as_float64, mesh_of, rectangle, room
 from synthetic import FIELDS
 
 from wbgs_jax import fields
@@ -45,7 +45,7 @@ def field_of(name):
     """In double precision; its geometry is the same in all tests, because the wave field's is compiled in."""
     if name == "wave":
         materials = [0, 0, 1, 1, 1, 1, 2]
-        mesh = mesh_of(*room(), box((3, 1, 0.5), (4, 2, 1.2)), material=materials)
+        mesh = mesh_of(*room(), rectangle((3, 0, 0), (0, 4, 0), (0, 0, 3)), material=materials)
         config = dataclasses.replace(
             FIELDS[name], mirror_areas=(0.0,), specular_tried=32, specular_kept=16, diffracted_tried=16, diffracted_kept=8
         )

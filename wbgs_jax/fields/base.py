@@ -118,8 +118,8 @@ class Field(ABC):
         return compare(seen, batch)
 
     def limits(self, params: Any, receivers: Receiver) -> Any:
-        """Returns the static sizes that planning needs under jit, with room to grow (host): a frozen dataclass of numbers, which
-        checkpoints keep; None if it needs none."""
+        """Returns the static sizes that planning needs under jit, with room to grow (host): a frozen dataclass of numbers, kept
+        in checkpoints; None if it needs none."""
         return None
 
     def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:

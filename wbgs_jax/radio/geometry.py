@@ -32,8 +32,8 @@ def rotation_matrix(quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) -> Inexact[Array, "*n 3"]:
-    """Returns world vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into world
-    ones."""
+    """Returns world vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into
+    world ones."""
     return jnp.matmul(vectors, rotation_matrix(orientation), precision=EXACT)
 
 
@@ -64,7 +64,7 @@ def pixels_per_radian(projection: Projection) -> tuple[float, float]:
 def angles_to_pixel(
     azimuth: Float[Array, "*n"], zenith: Float[Array, "*n"], projection: Projection = "hemisphere"
 ) -> Float[Array, "*n 2"]:
-    """Returns continuous pixel coordinates (x: column, y: row); see the paper, section 4.3, with its p_x = (phi + pi) / (2 pi) W."""
+    """Returns continuous pixel coordinates (x: column, y: row) (paper, section 4.3, with p_x = (phi + pi) / (2 pi) W)."""
     sx, sy = pixels_per_radian(projection)
     return jnp.stack([(azimuth + jnp.pi) * sx, zenith * sy], -1)
 

@@ -128,7 +128,7 @@ def _sorted_keys(
 
 
 def _nearest_mahalanobis2(left: Float[Array, "e"], top: Float[Array, "e"], conic: Float[Array, "e 3"]) -> Float[Array, "e"]:
-    """Returns the smallest q over a tile's pixels (as a continuous rectangle), given the offset of its first pixel from the centre."""
+    """Returns the smallest q over a tile's pixels (a continuous rectangle), given the offset of the first from the centre."""
     right, bottom = left + TILE_WIDTH - 1, top + TILE_HEIGHT - 1
     a, b, c = jnp.moveaxis(jnp.where(conic[:, :1] > 0, conic, jnp.array([1, 0, 1], conic.dtype)), -1, 0)
 
