@@ -6,6 +6,7 @@ of is not said, and their thickness (0.1 m) is.
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -24,7 +25,7 @@ def convert(folder: Path) -> SceneFile:
         raise UserError(f"{folder} holds no snapshots.npz; give the folder of the box room's data")
     data = np.load(folder / "snapshots.npz", allow_pickle=False)
     meshes = {path.stem: trimesh.load_mesh(path) for path in sorted(folder.glob("*.ply"))}
-    room = trimesh.util.concatenate(list(meshes.values()))
+    room: Any = trimesh.util.concatenate(list(meshes.values()))
     n_tx = len(data["tx_positions"])
     return SceneFile(
         name="box_room",

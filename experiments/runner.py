@@ -6,6 +6,12 @@ was cut goes on where it stopped, however it was cut; runners side by side never
 results.
 """
 
+import os
+
+os.environ["TF_CPP_MIN_LOG_LEVEL"] = os.environ.get("TF_CPP_MIN_LOG_LEVEL", "3")  # read with JAX; see wbgs_jax/_util/quiet.py
+
+# isort: split
+
 import contextlib
 import dataclasses
 import fcntl

@@ -120,8 +120,10 @@ def obstructed(dataset: Dataset, tx_position: Float[np.ndarray, "3"]) -> bool:
     start = np.asarray(dataset.receiver().position, np.float64)
     line, triangles = tx_position - start, dataset.vertices[dataset.faces].astype(np.float64)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    lines = (np.broadcast_to(vector, normals.shape) for vector in (start, line))
-    points, cut, along = trimesh.intersections.planes_lines(triangles[:, 0], trimesh.unitize(normals), *lines, True)
+    starts, lines = (np.broadcast_to(vector, normals.shape) for vector in (start, line))
+    points, cut, along = trimesh.intersections.planes_lines(
+        triangles[:, 0], trimesh.unitize(normals), starts, lines, return_distance=True
+    )
     inside = (trimesh.triangles.points_to_barycentric(triangles[cut], points) >= 0).all(1)
     return bool((inside & (along > 1e-6) & (along < 1 - 1e-6)).any())
 

@@ -15,7 +15,7 @@ HOUSEKEEPING = ("loop.evaluate_every", "loop.evaluate_spectra", "loop.checkpoint
 def settings(job: Job) -> Settings:
     """Returns the settings of every model of a job."""
     profile, variant, preset = PROFILES[job.profile], VARIANTS[job.variant], preset_of(job)
-    base = changed(preset, profile.changes | {"field": profile.fields.get(job.field, {})})
+    base = changed(preset, {**profile.changes, "field": profile.fields.get(job.field, {})})
     block = base.loop.epoch_steps
     steps = variant.steps or whole(wanted_steps(job), block)
     rates = {name: variant.rates * value for name, value in vars(base.field).items() if name.endswith("_lr")}

@@ -69,7 +69,8 @@ class Comparison:
 
 
 def compare(ours: Float[np.ndarray, "seeds tx ghz"], theirs: Float[np.ndarray, "seeds2 tx ghz"]) -> Comparison:
-    """Returns the test paired over transmitters, each with the mean of its spectra and of as many seeds on both sides, the first ones."""
+    """Returns the test paired over transmitters, each with the mean of its spectra and of as many seeds on both sides, the
+    first ones."""
     seeds = min(len(ours), len(theirs))
     gap = ours[:seeds].mean((0, 2)) - theirs[:seeds].mean((0, 2))
     p = float(wilcoxon(gap).pvalue) if np.any(gap) else 1.0

@@ -70,22 +70,22 @@ VOLUME = {
     "l2": _of_field(pixel_loss="l2"),
     "directions_384": _of_field(directions=384),
 }
-_NO_EDGES = {"diffracted_tried": 1, "diffracted_kept": 1}
+_NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
-_NO_SEARCH = {"search": {"rounds": 0}}
+_NO_SEARCH: Changes = {"search": {"rounds": 0}}
 COHERENT = {
-    "phase_blind": Variant({"field": {"coherent": False}} | _NO_SEARCH),  # phases would name the materials
+    "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
     "order_1": _of_field(mirror_areas=(0.0,), **_NO_EDGES),
     "order_2": _of_field(mirror_areas=(0.0, 0.05), **_NO_EDGES),
     "order_3": _of_field(**_NO_EDGES),
     "no_search": Variant(_NO_SEARCH),
-    "no_search_low_frequencies_first": Variant({"optim": {"curriculum": 0.5}} | _NO_SEARCH),
+    "no_search_low_frequencies_first": Variant({"optim": {"curriculum": 0.5}, **_NO_SEARCH}),
     "search_alone": _of_field(**_UNTRAINED),
     "no_corrections": _of_field(corrections_lr=0.0),
-    "free_reflectivity": Variant({"field": _NO_MATERIALS} | _NO_SEARCH),
-    "untrained": Variant({"field": _UNTRAINED} | _NO_SEARCH),
+    "free_reflectivity": Variant({"field": _NO_MATERIALS, **_NO_SEARCH}),
+    "untrained": Variant({"field": _UNTRAINED, **_NO_SEARCH}),
     "no_snapshot_loss": _of_field(correlation_weight=0.0, power_weight=0.0),
     "more_candidates": _of_field(diffracted_tried=4096, diffracted_kept=512, mirror_areas=(0.0, 0.02, 0.3)),
     "mesh_moved_3mm": Variant(displacement=0.003),

@@ -21,9 +21,9 @@ def call(main, *arguments) -> SimpleNamespace:
     return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
 
 
-def in_a_process(*arguments, **environment) -> SimpleNamespace:
-    """The same of `wbgs-jax ARGUMENTS` in a process of its own."""
-    command = [sys.executable, "-m", "wbgs_jax", *map(str, arguments)]
+def in_a_process(module, *arguments, **environment) -> SimpleNamespace:
+    """The same of `python -m MODULE ARGUMENTS`, in a process of its own."""
+    command = [sys.executable, "-m", module, *map(str, arguments)]
     environment = os.environ | {"JAX_PLATFORMS": "cpu"} | environment
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     return SimpleNamespace(code=done.returncode, out=done.stdout, err=done.stderr)

@@ -21,7 +21,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.evaluation import pictures
-from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table
+from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.training import curves
@@ -56,14 +56,15 @@ def main(arguments: list[str] | None = None) -> None:
     index = held_out(dataset, command.part)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
     report, predicted = evaluate(trained, dataset, command.part)
-    write_json(command.run / ("eval.json" if command.part == "test" else f"eval_{command.part}.json"), report)
+    write_json(command.run / f"{with_part('eval', command.part)}.json", report)
     if command.results:
         path = result_path(command.results, report, trained.config.preset)
         write_json(path, report | {"provenance": provenance(trained)})
         console.print(f"results: {path}")
     if command.pictures and dataset.kind != "power":
         entries = curves.read(command.run / "metrics.jsonl")
-        for path in pictures.draw_all(command.run / "pictures", dataset, index, predicted, report, entries):
+        folder = command.run / with_part("pictures", command.part)
+        for path in pictures.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
     if command.json:
         print(json.dumps(report, allow_nan=False))

@@ -29,7 +29,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.fields import Field, Observation, field_names, get_field
+from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.maps import predict_many
 from wbgs_jax.inference.predictor import BLOCK, predictor, trained_band
@@ -142,22 +143,37 @@ def ask_channel(
     """Returns {name with unit: values (tx, freq) or (tx, freq, elements)} of every transmitter at every frequency.
 
     Raises:
-        UserError: the field knows no paths.
+        UserError: the field knows nothing of it.
     """
-    if "paths" not in trained.field.gives:
-        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+    enough = {"paths", OBSERVED.get(what, "paths")}
+    if not enough & set(trained.field.gives):
+        able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
         raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field {able}")
     plan = trained.field.plan(trained.params, dataset.receiver())
-    name, measure = CHANNEL[what]
+    name, function = CHANNEL[what]
 
-    @jax.jit
-    def one(field: Field, params: Any, plan: Any, tx: Any, frequency: Any) -> Any:
-        found = field.arrivals(params, plan, Query(tx[None], frequency[None]))
-        return measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency)
+    measure = jax.jit(function)
+
+    def one(tx: Any, frequency: Any) -> np.ndarray:
+        query = Query(tx[None], frequency[None])
+        if "paths" not in trained.field.gives:
+            return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name))[0]
+        found = _arrivals(trained.field, trained.params, plan, query)
+        return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency))
 
     positions, frequencies = (jnp.asarray(a, jnp.float32) for a in (tx_positions, frequencies_hz))
-    rows = [[np.asarray(one(trained.field, trained.params, plan, tx, f)) for f in frequencies] for tx in positions]
+    rows = [[one(tx, f) for f in frequencies] for tx in positions]
     return {name: np.array(rows), "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
+
+
+@jax.jit
+def _observe(field: Field, params: Any, plan: Any, query: Query) -> Observation:
+    return field.render(params, plan, query)
+
+
+@jax.jit
+def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> channel.Arrivals:
+    return field.arrivals(params, plan, query)
 
 
 def _power(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
@@ -180,6 +196,8 @@ CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]]
     "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
 }
 """Name in the file, and how it follows from what arrives."""
+OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
+"""What a field may give (`Field.gives`) that knows no paths."""
 
 
 def write_channel(path: Path, answer: dict[str, np.ndarray], trained: TrainedField, dataset: Dataset) -> None:

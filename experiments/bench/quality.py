@@ -19,7 +19,6 @@ from experiments.bench.timing import Effort, Report
 from experiments.bench.training import preset, settings, start_run
 from wbgs_jax._util.command import say
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.training.step import run_epoch
 
 TARGETS = (0.72, 0.80, 0.85)
 PLATEAU = 0.01
@@ -114,7 +113,7 @@ def measure(report: Report, effort: Effort) -> None:
     assert plateau is not None
     report.add("time_to_plateau_s", plateau, "s", "lower")
     report.add("ssim_last", curve.ssim[-1], "SSIM", "higher")
-    report.add("compilations_per_run", curve.compilations_of(run_epoch.__name__), "compilations", "lower")
+    report.add("compilations_per_run", curve.compilations_of("run_epoch"), "compilations", "lower")
     report.add("compile_s_per_run", sum(seconds for _, seconds in curve.compiled), "s", "lower")
     if not effort.quick:
         for name, seconds in zip(("cold", "warm"), start_seconds(effort), strict=True):

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from experiments.bench.timing import Effort, Report, interleaved
@@ -53,7 +54,8 @@ def start_run(effort: Effort, folder: Path, epoch_steps: int | None = None) -> R
 
 def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
     """The parts of a step as separate calls, on a copy of the run's state (the trainer gives its own away)."""
-    state, data, field = jax.tree.map(jnp.copy, run.state), run.data, run.field
+    state, data = jax.tree.map(jnp.copy, run.state), run.data
+    field: Any = run.field
     params, receiver, weight = state.params, run.dataset.receiver(), run.settings.field.ssim_weight
     index = jnp.asarray(run.batches(0, 1)[0])
 
@@ -88,7 +90,7 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
     planned = wideband.WidebandPlan(geometry, None, field.frame, receiver, field.config)  # features: in every call
     even = jnp.full((params.gaussians.alive.size, len(index)), 0.3)  # the time does not depend on these values
     splatting = (geometry.splats, geometry.jobs, even, even)
-    image, gradients = 0.9 * data.pas(index), params
+    image, gradients = 0.9 * run.dataset.pas(np.asarray(index)), params
     calls: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         "plan": (plan, (params,)),
         "networks": (networks, (params, query, planned)),

@@ -1,5 +1,6 @@
 """What all series share: a field, its changes, where and how often each is trained, and the table of their scores."""
 
+import dataclasses
 import statistics
 from dataclasses import dataclass
 
@@ -25,8 +26,8 @@ class Series:
 
     def jobs_of(self, scene: str, variant: str) -> list[Job]:
         """Returns one row of the table: a job a seed."""
-        other = {"variant": variant, "profile": self.profile, "combination": self.combination}
-        return [Job(scene, self.field, seed=seed, **other) for seed in self.seeds]
+        first = Job(scene, self.field, self.combination, variant=variant, profile=self.profile)
+        return [dataclasses.replace(first, seed=seed) for seed in self.seeds]
 
     def jobs(self) -> list[Job]:
         """Returns all jobs."""

@@ -1,63 +1,42 @@
 """The two command lines, from a scene file and from a folder of spectra, and what they say when something is wrong."""
 
-import contextlib
-import io
 import json
-import os
 import shutil
-import subprocess
-import sys
-from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
+from commands import assert_error_for_people, call, in_a_process
 from PIL import Image
-from synthetic import tiny_scene
+from synthetic import tiny_dataset, tiny_scene
+from toys import RippleField, registered
 
 from wbgs_jax import eval as eval_command
 from wbgs_jax import train as train_command
-from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.data.layout import export_layout
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax._util.command import run_command
+from wbgs_jax.training.checkpoint import checkpoint_steps
+from wbgs_jax.training.run_folder import load_trained
 
-pytestmark = pytest.mark.slow
-
-TINY_SETTINGS = {
-    "wideband": {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance-widths": 8},
+NETWORKS = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance-widths": 8}
+SHORT = {
     "optim": {"steps": 4, "batch": 2},
     "loop": {"epoch-steps": 2, "evaluate-every": 4, "evaluate-spectra": 2},
 }
-TINY = ["--preset", "smoke"]
-TINY += [word for group, values in TINY_SETTINGS.items() for name, v in values.items() for word in (f"--{group}.{name}", v)]
 
 
-def call(module, *arguments):
-    """Exit code, stdout and stderr of a command line, in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    argv = mock.patch.object(sys, "argv", [module.__name__, *map(str, arguments)])
-    with argv, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            run_command(module.main)
-        except SystemExit as stop:
-            return SimpleNamespace(code=stop.code, out=out.getvalue(), err=err.getvalue())
-    return SimpleNamespace(code=0, out=out.getvalue(), err=err.getvalue())
+def words(sections):
+    return [word for name, values in sections.items() for key, v in values.items() for word in (f"--{name}.{key}", str(v))]
 
 
-def in_a_process(module, *arguments):
-    command = [sys.executable, "-m", module.__name__, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-    return SimpleNamespace(code=done.returncode, out=done.stdout, err=done.stderr)
+SMOKE = ["--preset", "smoke", *words(SHORT)]
+TINY = [*SMOKE, *words({"wideband": NETWORKS})]
+TOY = [*SMOKE, "--field", "ripple"]
 
 
-def assert_error_for_people(result, *words):
-    assert result.code == 2
-    assert result.out == ""
-    (line,) = result.err.splitlines()
-    assert line.startswith("error: ")
-    for word in words:
-        assert str(word) in line
+@pytest.fixture(scope="module", autouse=True)
+def toys():
+    with registered(RippleField):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +53,20 @@ def layout(tmp_path_factory):
     return folder
 
 
+def train_and_check(folder, *arguments):
+    result = call(train_command.main, *arguments, "--out", folder)
+    assert (result.code, result.out) == (0, ""), result.err
+    assert "trained 4 steps" in result.err
+    return folder
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, scene, layout):
-    """Run folders by the kind of their data."""
-    runs = {}
-    for option, source in (("--scene", scene), ("--data", layout)):
-        runs[option] = tmp_path_factory.mktemp("runs") / "run"
-        result = call(train_command, option, source, "--out", runs[option], *TINY)
-        assert (result.code, result.out) == (0, ""), result.err
-        assert "trained 4 steps" in result.err
-    return runs
+    """Run folders by the kind of their data; of the folder of spectra, that of a field that compiles quickly."""
+    return {
+        "--scene": train_and_check(tmp_path_factory.mktemp("runs") / "run", "--scene", scene, *TINY),
+        "--data": train_and_check(tmp_path_factory.mktemp("runs") / "run", "--data", layout, *TOY),
+    }
 
 
 @pytest.fixture
@@ -93,49 +76,113 @@ def run(tmp_path, trained):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("kind", ["--scene", "--data"])
-def test_train_then_eval_prints_one_json_object_and_draws(trained, kind):
-    folder = trained[kind]
+def assert_eval_prints_one_json_object_and_draws(folder, field):
     assert {path.name for path in folder.iterdir()} >= {"config.json", "metrics.jsonl", "checkpoints"}
     assert checkpoint_steps(folder / "checkpoints") == [4]
-    result = call(eval_command, "--run", folder, "--json")
+    result = call(eval_command.main, "--run", folder, "--json")
     assert result.code == 0, result.err
     report = json.loads(result.out)
     assert report == json.loads((folder / "eval.json").read_text())
-    assert report.keys() >= {"scene", "field", "n", "median_ssim", "mean_ssim", "per_frequency", "references"}
-    assert (report["scene"], report["field"], report["n"]) == ("box", "wideband", 6)
+    assert report.keys() >= {"scene", "field", "n", "median_ssim", "mean_ssim", "per_frequency", "baselines"}
+    assert (report["scene"], report["field"], report["part"], report["n"]) == ("box", field, "test", 6)
     assert [row["frequency_ghz"] for row in report["per_frequency"]] == [1, 10, 94]
     assert sum(row["n"] for row in report["per_frequency"]) == 6
-    assert report["references"].keys() == {"mean_image", "nearest_tx", "inverse_distance", "line_of_sight"}
-    for scores in (report, *report["references"].values()):
+    assert report["baselines"].keys() == {"mean_image", "nearest_tx", "inverse_distance", "line_of_sight"}
+    for scores in (report, *report["baselines"].values()):
         assert 0 < scores["median_ssim"] < 1 and 0 < scores["mean_ssim"] < 1
     for name in ("spectra.png", "spectra_polar.png", "ssim_by_frequency.png", "curves.png"):
         with Image.open(folder / "pictures" / name) as image:
             assert image.format == "PNG" and np.asarray(image.convert("L")).std() > 5
 
 
+@pytest.mark.parametrize(("kind", "field"), [("--scene", "wideband"), ("--data", "ripple")])
+def test_train_then_eval_prints_one_json_object_and_draws(trained, kind, field):
+    assert_eval_prints_one_json_object_and_draws(trained[kind], field)
+
+
+@pytest.mark.slow
+def test_the_paper_s_field_trains_on_a_folder_of_spectra(tmp_path, layout):
+    folder = train_and_check(tmp_path / "run", "--data", layout, *TINY)
+    assert_eval_prints_one_json_object_and_draws(folder, "wideband")
+
+
 def test_eval_of_other_data_for_people_with_results(run, layout, tmp_path):
-    result = call(eval_command, "--run", run, "--data", layout, "--no-pictures", "--results", tmp_path / "results")
+    result = call(eval_command.main, "--run", run, "--data", layout, "--no-pictures", "--results", tmp_path / "results")
     assert result.code == 0, result.err
     assert "held-out SSIM" in result.out and "inverse distance" in result.out and "ms a PAS" in result.out
     assert not (run / "pictures").exists()
     (path,) = (tmp_path / "results").iterdir()
     assert path.name == "quality_box_wideband_smoke_cpu.json"
     provenance = json.loads(path.read_text())["provenance"]
-    assert provenance["steps"] == 4 and provenance["gaussians"] > 0 and provenance["seed"] == 0
-    assert "--preset smoke" in provenance["command"]
+    assert provenance["steps"] == 4 and provenance["gaussians"] == 60 and provenance["seed"] == 0
+    assert provenance["command"] == "wbgs-jax train --scene box.npz --field wideband --preset smoke --seed 0"
+    assert provenance["settings"]["wideband"]["width"] == 8
+
+
+def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tmp_path, scene):
+    """Curves watch it, `eval --part validation` scores it, and what belongs to the test is not replaced by it."""
+    run = train_and_check(tmp_path / "run", "--scene", scene, "--validation", 0.3, *TOY)
+    plain, split = tiny_dataset(), load_trained(run).dataset()
+    np.testing.assert_array_equal(split.test, plain.test)
+    assert len(split.validation) == 3 and set(split.validation) | set(split.train) == set(plain.train)
+    (held_out,) = set(split.tx_index[split.validation])
+    assert held_out not in split.tx_index[split.train]
+    reports = {}
+    for part in ("test", "validation"):
+        results = ["--results", tmp_path / "results"]
+        result = call(eval_command.main, "--run", run, "--part", part, "--json", *results, *["--no-pictures"][part == "test" :])
+        assert result.code == 0, result.err
+        reports[part] = json.loads(result.out)
+        assert reports[part]["part"] == part and reports[part]["n"] == len(getattr(split, part))
+    curves = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert len(split.validation) > 2  # the curves watch two of them, drawn once
+    watched = {entry["step"]: entry["held_out_ssim"] for entry in curves if "held_out_ssim" in entry}
+    assert watched.keys() == {4}
+    assert json.loads((run / "eval.json").read_text()) == reports["test"]
+    assert json.loads((run / "eval_validation.json").read_text()) == reports["validation"]
+    names = {path.name for path in (tmp_path / "results").iterdir()}
+    assert names == {"quality_box_ripple_smoke_cpu.json", "quality_box_ripple_smoke_cpu_validation.json"}
+    written = json.loads((tmp_path / "results" / "quality_box_ripple_smoke_cpu_validation.json").read_text())
+    assert written["provenance"]["command"].count("--validation 0.3") == 1
+    assert {path.name for path in run.iterdir() if path.is_dir()} == {"checkpoints", "pictures_validation"}
+    people = call(eval_command.main, "--run", run, "--part", "validation", "--no-pictures")
+    assert "validation SSIM" in people.out
+
+
+def test_a_part_that_there_is_not(run):
+    result = call(eval_command.main, "--run", run, "--part", "validation")
+    assert_error_for_people(result, "box has no validation spectra")
+    assert not (run / "eval_validation.json").exists()
+
+
+def test_one_receiver_of_several_frequencies_and_fewer_transmitters(tmp_path):
+    """What is looked at is part of the run: evaluated as it was trained, and said by its name and provenance."""
+    save_scene(tmp_path / "three.npz", tiny_scene(n_rx=3))
+    choice = ["--receiver", 1, "--train-ghz", 1, 94, "--train-tx", 3]
+    run = train_and_check(tmp_path / "run", "--scene", tmp_path / "three.npz", *choice, *TOY)
+    result = call(eval_command.main, "--run", run, "--json", "--no-pictures", "--results", tmp_path / "results")
+    assert result.code == 0, result.err
+    report = json.loads(result.out)
+    assert report["scene"] == "box_rx1_f1-94_tx3" and report["n"] == 2
+    assert [row["frequency_ghz"] for row in report["per_frequency"]] == [10]
+    (path,) = (tmp_path / "results").iterdir()
+    command = json.loads(path.read_text())["provenance"]["command"]
+    for option in ("--receiver 1", "--train-ghz 1 94", "--train-tx 3"):
+        assert option in command
 
 
 def test_resuming_and_what_stands_in_its_way(run, scene):
+    """Of the same settings only; a run that has ended stays as it is."""
     arguments = ["--scene", scene, "--out", run, *TINY]
     before = (run / "metrics.jsonl").read_text()
-    assert_error_for_people(call(train_command, *arguments), run, "--resume")
-    assert_error_for_people(call(train_command, *arguments, "--resume", "--seed", 1), "seed: 0, not 1")
+    assert_error_for_people(call(train_command.main, *arguments), run, "--resume")
+    assert_error_for_people(call(train_command.main, *arguments, "--resume", "--seed", 1), "seed: 0, not 1")
     longer = [*arguments, "--optim.steps", 6, "--resume"]
-    assert_error_for_people(call(train_command, *longer), "settings.optim.steps: 4, not 6")
+    assert_error_for_people(call(train_command.main, *longer), "settings.optim.steps: 4, not 6")
     assert (run / "metrics.jsonl").read_text() == before
-    assert call(train_command, *arguments, "--resume").code == 0
+    assert call(train_command.main, *arguments, "--resume").code == 0
     assert (run / "metrics.jsonl").read_text() == before
+    assert checkpoint_steps(run / "checkpoints") == [4]
 
 
 @pytest.mark.parametrize(
@@ -153,12 +200,17 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--preset", "smoke", "--optim.batch", "0"], ["optim.batch"]),
         (["--scene", "SCENE", "--preset", "smoke", "--wideband.radiance-widths"], ["radiance-widths", "at least 1"]),
         (["--data", "LAYOUT", "--frequency-ghz", "5"], ["freq.txt"]),
+        (["--scene", "SCENE", "--validation", "1"], ["--validation", "share"]),
+        (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "share"]),
+        (["--scene", "SCENE", "--receiver", "1"], ["receivers 0 to 0"]),
+        (["--scene", "SCENE", "--train-tx", "5"], ["4 training transmitters"]),
+        (["--scene", "SCENE", "--train-ghz", "28"], ["no spectra at 28 GHz"]),
     ],
 )
 def test_what_cannot_be_trained(tmp_path, scene, layout, arguments, words):
     """Nothing is written, not even the run folder."""
     places = {"SCENE": str(scene), "LAYOUT": str(layout)}
-    result = call(train_command, "--out", tmp_path / "run", *(places.get(word, word) for word in arguments))
+    result = call(train_command.main, "--out", tmp_path / "run", *(places.get(word, word) for word in arguments))
     assert_error_for_people(result, *words)
     assert list(tmp_path.iterdir()) == []
 
@@ -168,7 +220,7 @@ def test_run_folders_that_cannot_be_used(tmp_path, scene):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("mine")
     for folder in ("file", "file/below", "other"):
-        assert_error_for_people(call(train_command, "--scene", scene, "--out", tmp_path / folder, *TINY), tmp_path / folder)
+        assert_error_for_people(call(train_command.main, "--scene", scene, "--out", tmp_path / folder, *TINY), tmp_path / folder)
     assert (tmp_path / "file").read_text() == "mine"
     assert [path.name for path in (tmp_path / "other").iterdir()] == ["notes.txt"]
 
@@ -184,20 +236,20 @@ def test_run_folders_that_cannot_be_used(tmp_path, scene):
 )
 def test_what_cannot_be_evaluated(run, damage, words):
     damage(run)
-    assert_error_for_people(call(eval_command, "--run", run, "--json"), run, *words)
+    assert_error_for_people(call(eval_command.main, "--run", run, "--json"), run, *words)
     assert not (run / "eval.json").exists()
 
 
 def test_data_that_are_gone(run, scene, tmp_path):
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps(config | {"source": str(tmp_path / "gone.npz")}))
-    assert_error_for_people(call(eval_command, "--run", run), "gone.npz")
+    assert_error_for_people(call(eval_command.main, "--run", run), "gone.npz")
 
 
 def test_a_damaged_checkpoint_in_a_process_of_its_own(run):
     (manifest,) = (run / "checkpoints" / "4").glob("*/manifest.ocdbt")
     manifest.write_bytes(b"")
-    result = in_a_process(eval_command, "--run", run, "--json")
+    result = in_a_process("wbgs_jax", "eval", "--run", run, "--json")
     assert (result.code, result.out) == (2, "")
     # Reads that Orbax gave up may still complain to stderr while the process ends.
     (line,) = [line for line in result.err.splitlines() if line.startswith("error: ")]
@@ -205,5 +257,5 @@ def test_a_damaged_checkpoint_in_a_process_of_its_own(run):
 
 
 def test_an_unknown_scene_in_a_process_of_its_own(tmp_path):
-    assert_error_for_people(in_a_process(train_command, "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene")
+    assert_error_for_people(in_a_process("wbgs_jax.train", "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene")
     assert list(tmp_path.iterdir()) == []

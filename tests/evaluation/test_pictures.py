@@ -1,7 +1,6 @@
 """Pictures: every file a readable PNG that shows something, from any run that an evaluation accepts."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from matplotlib import pyplot as plt
 from PIL import Image
 from synthetic import tiny_dataset
 
-from wbgs_jax.data.splits import select_frequencies
+from wbgs_jax.data.splits import hold_out_validation, select_frequencies
 from wbgs_jax.evaluation.metrics import score
 from wbgs_jax.evaluation.pictures import draw_all, draw_curves, draw_frequencies, draw_spectra, spread
 
@@ -30,7 +29,7 @@ def predictions(dataset):
     truth = np.asarray(dataset.pas(dataset.test))
     predicted = np.clip(truth + 0.1 * np.sin(np.arange(360)), 0, 1).astype(np.float32)
     report = {"scene": dataset.name, "field": "wideband"} | score(predicted, truth, dataset.frequencies_hz[dataset.test])
-    return predicted, report | {"references": {"mean_image": score(truth[::-1], truth, dataset.frequencies_hz[dataset.test])}}
+    return predicted, report | {"baselines": {"mean_image": score(truth[::-1], truth, dataset.frequencies_hz[dataset.test])}}
 
 
 def assert_shows_something(path):
@@ -41,8 +40,7 @@ def assert_shows_something(path):
 
 
 def test_a_whole_set_of_pictures(tmp_path, dataset):
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in CURVE))
-    files = draw_all(tmp_path, dataset, *predictions(dataset))
+    files = draw_all(tmp_path / "pictures", dataset, dataset.test, *predictions(dataset), CURVE)
     assert sorted(path.name for path in files) == ["curves.png", "spectra.png", "spectra_polar.png", "ssim_by_frequency.png"]
     assert sorted((tmp_path / "pictures").iterdir()) == sorted(files)
     for path in files:
@@ -52,7 +50,7 @@ def test_a_whole_set_of_pictures(tmp_path, dataset):
 
 def test_a_single_frequency_without_curves(tmp_path, dataset):
     single = select_frequencies(dataset, train_ghz=[10.0], test_ghz=[10.0])
-    files = draw_all(tmp_path, single, *predictions(single))
+    files = draw_all(tmp_path, single, single.test, *predictions(single), [])
     assert "curves.png" not in {path.name for path in files}
     for path in files:
         assert_shows_something(path)
@@ -77,7 +75,17 @@ def test_curves_show_the_logged_numbers():
     plt.close(figure)
 
 
-def test_frequencies_show_the_field_and_every_reference(dataset):
+def test_curves_of_any_field_are_drawn():
+    """Without batch figures, without sizes that change, of powers."""
+    entries = [{"step": 2, "loss": 9.0, "parameters": 7}, {"step": 4, "loss": 4.0, "held_out_power_error_db": 1.5}]
+    figure = draw_curves(entries)
+    assert [[line.get_xydata().tolist() for line in axis.lines] for axis in figure.axes] == [[[[2, 9], [4, 4]]], [[[4, 1.5]]]]
+    assert figure.axes[1].get_legend().get_texts()[0].get_text() == "held out power error db"
+    unwatched = draw_curves([{"step": 2, "loss": 9.0, "batch_ssim": None}])
+    assert [len(axis.lines) for axis in unwatched.axes] == [1, 0]
+
+
+def test_frequencies_show_the_field_and_every_baseline(dataset):
     _, report = predictions(dataset)
     figure = draw_frequencies(report)
     (axis,) = figure.axes
@@ -87,6 +95,13 @@ def test_frequencies_show_the_field_and_every_reference(dataset):
 
 
 def test_the_chosen_spectra_are_the_same_for_every_run_and_cover_the_band(dataset):
-    chosen = spread(dataset)
-    np.testing.assert_array_equal(chosen, spread(dataclasses.replace(dataset, name="again")))
+    chosen = spread(dataset, dataset.test)
+    np.testing.assert_array_equal(chosen, spread(dataclasses.replace(dataset, name="again"), dataset.test))
     assert set(dataset.frequencies_hz[dataset.test[chosen]]) == set(dataset.frequencies_hz)
+
+
+def test_the_chosen_spectra_are_of_the_part_that_is_shown():
+    split = hold_out_validation(tiny_dataset(), 0.4)
+    chosen = split.validation[spread(split, split.validation)]
+    assert len(chosen) == 6 and set(chosen) <= set(split.validation.tolist())
+    assert set(split.frequencies_hz[chosen]) == set(split.frequencies_hz)

@@ -1,4 +1,4 @@
-"""Result files and the table of all of them: results of the first version count as run, and a table tool reads what they say."""
+"""Result files and the table of all of them: results of the first version count as run, and a table tool reads them."""
 
 import csv
 import dataclasses
@@ -41,7 +41,13 @@ def test_settings_that_have_moved_are_found_under_todays_names():
     old = {"optim.network_lr": 0.016, "optim.steps": 100, "loop.checkpoint_every": 200, "density.every": 75}
     assert todays(old, "wrfgs") == {"wrfgs.network_lr": 0.016, "optim.steps": 100, "density.every": 75}
     assert todays(old, "nerf2") == {"nerf2.network_lr": 0.016, "optim.steps": 100}
-    old = {"wave.survival": 0.5, "optim.residual_lr": 0.1, "optim.snapshot_weight": 0.2, "density.start": 75, "search.rounds": 0}
+    old = {
+        "wave.survival": 0.5,
+        "optim.residual_lr": 0.1,
+        "optim.snapshot_weight": 0.2,
+        "density.start": 75,
+        "search.rounds": 0,
+    }
     new = {"wave.excess_amplitude": 0.5, "wave.corrections_lr": 0.1, "wave.correlation_weight": 0.2, "search.rounds": 0}
     assert todays(old, "wave") == new
     assert todays(new, "wave") == new
@@ -61,9 +67,9 @@ def test_a_setting_that_matters_makes_a_result_another_one(tmp_path):
     results.write(JOB, VALUES)
     path = results.path(JOB)
     written = json.loads(path.read_text())
-    for change, counts in (({"loop.keep_checkpoints": 7}, True), ({"wideband.width": 3}, False), ({"optim.min_steps": 1}, False)):
-        path.write_text(json.dumps(written | {"settings": written["settings"] | change}))
-        assert (results.get(JOB) is not None) == counts, change
+    for name, counts in {"loop.keep_checkpoints": True, "wideband.width": False, "optim.min_steps": False}.items():
+        path.write_text(json.dumps(written | {"settings": written["settings"] | {name: 7}}))
+        assert (results.get(JOB) is not None) == counts, name
 
 
 def test_a_result_read_twice_is_read_again_where_it_has_changed(tmp_path):
@@ -110,7 +116,13 @@ def test_baselines_are_rows_by_their_names(table):
 
 def test_what_was_kept_without_frequencies_is_one_row(table):
     (row,) = (row for row in table if row["profile"] == "tuning" and row["job"] == "scene1_wrfgs_lr_8e-3_seed0")
-    assert (row["ghz"], row["median_ssim"], row["mean_ssim"], row["steps"], row["models"]) == ("", "0.7215", "0.6944", "1000", "10")
+    assert (row["ghz"], row["median_ssim"], row["mean_ssim"], row["steps"], row["models"]) == (
+        "",
+        "0.7215",
+        "0.6944",
+        "1000",
+        "10",
+    )
 
 
 def test_every_result_is_in_the_table_and_says_whether_it_counts(table):

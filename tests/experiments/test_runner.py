@@ -1,6 +1,5 @@
 """The runner: what is done is skipped, what was cut goes on, no job is done twice, no failure stops the others."""
 
-import contextlib
 import dataclasses
 import json
 import signal
@@ -8,22 +7,14 @@ import subprocess
 import sys
 import threading
 import time
-from types import SimpleNamespace
-from unittest import mock
 
-import numpy as np
 import pytest
-import synthetic
-from toys import RippleField, registered
 
-from experiments import execute, profiles, runner
+from experiments import runner
 from experiments.jobs import Job
-from experiments.paper import GHZ_10
 from experiments.results import Results
 from experiments.variants import VARIANTS
 from wbgs_jax._util.command import run_command
-from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.training.loop import Run
 
 JOB = Job("1", "wideband", profile="smoke")
 VALUES = {
@@ -37,11 +28,6 @@ VALUES = {
 
 
 @pytest.fixture
-def command(tmp_path):
-    return runner.Command(profile="smoke", results=tmp_path / "results", runs=tmp_path / "runs")
-
-
-@pytest.fixture
 def calls(monkeypatch):
     """Jobs that were executed, by a stand-in that takes no time."""
     executed = []
@@ -52,15 +38,6 @@ def calls(monkeypatch):
 
     monkeypatch.setattr(runner, "execute", stand_in)
     return executed
-
-
-@pytest.fixture
-def scenes(monkeypatch, tmp_path):
-    """A tiny scene 1 with the ten frequencies; what is compiled stays compiled."""
-    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
-    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(GHZ_10) * 1e9)
-    monkeypatch.setenv("WBGS_DATA", str(tmp_path / "data"))
-    save_scene(tmp_path / "data" / "scene1.npz", dataclasses.replace(synthetic.tiny_scene(), name="scene1"))
 
 
 def result_of(command, job=JOB):
@@ -139,127 +116,11 @@ def test_the_time_limit_holds_outside_a_training(command, monkeypatch, capsys):
     assert result_of(command) is None
 
 
-@pytest.mark.usefixtures("scenes")
-def test_a_training_that_ends_as_the_time_does_is_scored_the_next_time(command, models, monkeypatch):
-    train = execute.train
-
-    def slow(*arguments, **options):
-        result = train(*arguments, **options)
-        with contextlib.suppress(runner.TimeIsUp):
-            signal.raise_signal(signal.SIGALRM)  # a training notes it and returns
-        return result
-
-    monkeypatch.setattr(execute, "train", slow)
-    with mock.patch.object(execute, "predict_spectra", side_effect=AssertionError("scored")):
-        assert runner.run([JOB], command) == []
-    monkeypatch.setattr(execute, "train", train)
-    runner.run([JOB], command)
-    assert models == ["all", "all"] and result_of(command) is not None
-
-
 def test_a_signal_from_outside_stops_everything(command, monkeypatch):
     monkeypatch.setattr(runner, "execute", lambda *_: signal.raise_signal(signal.SIGTERM))
     with pytest.raises(runner.TimeIsUp):
         runner.run([JOB], command)
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-
-
-@pytest.fixture
-def toy_field():
-    """A field that compiles in no time."""
-    with registered(RippleField):
-        yield
-
-
-@pytest.mark.usefixtures("scenes", "toy_field")
-@pytest.mark.parametrize("field", ["ripple", pytest.param("wideband", marks=pytest.mark.slow)])
-def test_a_cut_training_goes_on_to_the_same_result(field, command, monkeypatch, tmp_path):
-    job, size = dataclasses.replace(JOB, field=field), profiles.PROFILES["smoke"]
-    if field == "wideband":
-        steady = size.changes | {"density": {"every": 0}}  # compiles once
-        monkeypatch.setitem(profiles.PROFILES, "smoke", dataclasses.replace(size, changes=steady))
-    original, epochs = Run.epoch, []
-
-    def epoch(run):
-        epochs.append(run.step)
-        result = original(run)
-        if len(epochs) == 2:
-            signal.raise_signal(signal.SIGALRM)  # as if the time were up
-        return result
-
-    monkeypatch.setattr(Run, "epoch", epoch)
-    assert runner.run([job], command) == []
-    assert epochs == [0, 2] and result_of(command, job) is None
-    assert runner.run([job], command) == []
-    assert epochs == [0, 2, 4, 6]
-    cut = result_of(command, job)
-    whole = dataclasses.replace(command, results=tmp_path / "other", runs=tmp_path / "more")
-    runner.run([job], whole)
-    np.testing.assert_array_equal(cut.ssim, result_of(whole, job).ssim)
-    assert cut.values["curve"] == result_of(whole, job).values["curve"] and cut.values["curve"]["step"] == [2, 4, 6, 8]
-    assert not (command.runs / "smoke" / job.name).exists()
-
-
-@pytest.fixture
-def models(monkeypatch):
-    """Stand-ins for training and prediction; the folders of the models that were trained."""
-    trained = []
-
-    def train(dataset, field, settings, seed, folder, resume):
-        trained.append(folder.name)
-        (folder / "metrics.jsonl").write_text("".join(json.dumps({"step": s, "loss": 1 / s}) + "\n" for s in range(1, 500)))
-        return SimpleNamespace(field=None, params=None, steps=499, seconds=1.5, sizes={"gaussians": 7})
-
-    monkeypatch.setattr(execute, "train", train)
-    monkeypatch.setattr(execute, "predict_spectra", lambda field, params, dataset, index: np.asarray(dataset.pas(index)) * 0.9)
-    return trained
-
-
-@pytest.mark.usefixtures("scenes")
-def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
-    job, stop = Job("1", "wrfgs", profile="smoke"), mock.patch.object(execute, "score", side_effect=[KeyboardInterrupt])
-    with stop, contextlib.suppress(KeyboardInterrupt):
-        runner.run([job], command)
-    assert models == ["1GHz"]
-    original = execute.score
-    answers = [original, original, KeyboardInterrupt]
-
-    def score(dataset, predicted):
-        answer = answers.pop(0)
-        if answer is KeyboardInterrupt:
-            raise KeyboardInterrupt
-        return answer(dataset, predicted)
-
-    with mock.patch.object(execute, "score", score), pytest.raises(KeyboardInterrupt):
-        runner.run([job], command)
-    assert models == ["1GHz", "1GHz", "2.4GHz", "5GHz"]
-    runner.run([job], command)
-    assert models[4:] == ["5GHz", "10GHz", "24.25GHz", "37GHz", "47GHz", "60GHz", "77GHz", "94GHz"]
-    found = result_of(command, job)
-    assert found.ghz == list(GHZ_10) and found.ssim.shape == (2, 10)
-    assert found.values["models"] == 10 and found.values["steps"] == 4990 and found.values["training_seconds"] == 15
-
-
-@pytest.mark.usefixtures("scenes")
-def test_a_result_says_where_it_comes_from(command, models):
-    runner.run([JOB], command)
-    found = result_of(command).values
-    assert {"commit", "device", "jax", "version"} <= set(found["environment"])
-    assert found["job"] == dataclasses.asdict(JOB) and found["profile"] == found["preset"] == "smoke"
-    assert found["settings"]["wideband.gaussians"] == 60 and found["settings"]["optim.steps"] == 8
-    assert len(found["curve"]["step"]) <= execute.CURVE_POINTS
-    assert found["samples"] == 499 * 2
-    pictures = Results(command.profile, command.results).pictures(JOB)
-    assert pictures.shape == (8, 90, 360) and pictures.max() > 200
-
-
-@pytest.mark.usefixtures("scenes")
-def test_baselines_are_a_job_of_their_own(command):
-    job = Job("1", "baselines", "C4", all_tx=True, profile="smoke")
-    runner.run([job], command)
-    found = result_of(command, job).values["baselines"]
-    assert set(found) == {"mean_image", "nearest_tx", "inverse_distance", "line_of_sight"}
-    assert list(found["nearest_tx"]) == ["2.4", "5", "10", "24.25", "37", "47", "60", "77"]
 
 
 def test_a_list_of_numbers_is_one_line(command):
@@ -324,21 +185,3 @@ def test_jobs_run_on_other_data(command):
     chosen = runner.chosen_jobs(dataclasses.replace(command, only=("choices",), scenes=("1", "2"), data="a/kitchen.npz"))
     assert {job.scene for job in chosen} == {"a/kitchen.npz"} and len({job.name for job in chosen}) == len(chosen)
     assert Job("a/kitchen.npz", "wideband", variant="fusion_2", seed=1, profile="smoke") in chosen
-
-
-@pytest.mark.usefixtures("scenes")
-def test_a_change_is_trained_by_the_same_runner(command, models, monkeypatch):
-    seen, train = [], execute.train
-
-    def watched(dataset, field, settings, *others, **options):
-        seen.append((dataset.vertices, settings))
-        return train(dataset, field, settings, *others, **options)
-
-    monkeypatch.setattr(execute, "train", watched)
-    wanted = [dataclasses.replace(JOB, field="wave", variant=name) for name in ("", "mesh_moved_3cm", "no_search")]
-    assert runner.run(wanted, command) == []
-    (still, plain), (moved, same), (_, without) = seen
-    assert np.abs(moved - still).max() > 1e-3 and same == plain
-    assert plain.search.rounds > without.search.rounds == 0
-    settings = [result_of(command, job).values["settings"] for job in wanted]
-    assert settings[1] == settings[0] | {"mesh.displacement": 0.03} and settings[2] == settings[0] | {"search.rounds": 0}

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from experiments import statistics
 from experiments.catalogue import unique_jobs
 from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES

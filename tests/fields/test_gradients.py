@@ -5,27 +5,30 @@ fields have no forward mode, and the wave field none with respect to the positio
 """
 
 import dataclasses
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import as_float64, mesh_of, rectangle, room
+from rooms import as_float64, box, mesh_of, rectangle, room
 from synthetic import FIELDS
 
 from wbgs_jax import fields
+from wbgs_jax._util.pytree import replaced, with_leaves
 from wbgs_jax.data.surface import surface_from_points
 from wbgs_jax.fields import get_field, wave, wideband
-from wbgs_jax.fields.nerf2 import Nerf2Field
+from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.splat import TileLimits
-from wbgs_jax.types import Query, Receiver, make_query, make_receiver
+from wbgs_jax.types import Query, Receiver
 
 RX = (1.0, 1.0, 1.2)
 LIMITS = TileLimits(entries=4096, jobs=1024)
 STEPS = (1e-7, 3e-9)
 """A kink (the edge of a footprint at a pixel, a ReLU) may lie within the longer one, hardly within both."""
+TOLERANCE = 2e-5
+"""Relative to the derivative, and to the sum of the magnitudes that it is the sum of."""
 UNUSED = {
     "wideband": {".pattern_exponent"},
     "wrfgs": {".pattern_exponent", ".frequency_hz"},
@@ -38,57 +41,203 @@ INVARIANT = {"wave": {".log_gain"}}
 """Leaves that scale all snapshots alike, which a normalised spectrum does not show: zero up to rounding."""
 OUTSIDE = {"wave": {".position"}}
 """Leaves that the promise leaves out."""
+NAMES = [*UNUSED, pytest.param("wave with edges", marks=pytest.mark.slow)]
+
+
+SMALL_VOLUME = dict.fromkeys(("skip", "point_octaves", "direction_octaves", "tx_octaves", "frequency_octaves"), 1)
+SMALL_VOLUME |= {"samples": 2, "width": 4, "depth": 2, "radiance_widths": (4,)}
 
 
 @cache
 def field_of(name):
-    """In double precision; its geometry is the same in all tests, because the wave field's is compiled in."""
-    if name == "wave":
-        materials = [0, 0, 1, 1, 1, 1, 2]
-        mesh = mesh_of(*room(), rectangle((3, 0, 0), (0, 4, 0), (0, 0, 3)), material=materials)
-        config = dataclasses.replace(
-            FIELDS[name], mirror_areas=(0.0,), specular_tried=32, specular_kept=16, diffracted_tried=16, diffracted_kept=8
-        )
-        made = dataclasses.replace(wave.make_field(mesh, config), known_thickness=jnp.array([0.0, 0.1, 0.0]))
+    """In double precision. The wave field's geometry is compiled in, and without edges it compiles in a third of the time."""
+    if name.startswith("wave"):
+        parts, materials = [*room(), rectangle((3, 0, 0), (0, 4, 0), (0, 0, 3))], [0, 0, 1, 1, 2, 2, 0]
+        if name == "wave with edges":
+            parts, materials = [*parts, box((4, 1, 0.5), (5, 2, 1.2))], [*materials, 2]
+        tried = {"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 16}
+        config = dataclasses.replace(FIELDS["wave"], mirror_areas=(0.0,), **tried)
+        made = wave.make_field(mesh_of(*parts, material=materials), config)
+        made = dataclasses.replace(made, known_thickness=jnp.array([0.0, 0.1, 0.0]))
     elif name == "nerf2":
-        made = Nerf2Field(jnp.array([[0.0, 0, 0], [6, 4, 3]]), dataclasses.replace(FIELDS[name], samples=2, width=4))
+        made = Nerf2Field(jnp.array([[0.0, 0, 0], [6, 4, 3]]), Nerf2Config(**SMALL_VOLUME))
     else:
         points = np.random.default_rng(0).uniform([0.2, 0.2, 0.9], [5.8, 3.8, 3], (20, 3))
-        config = dataclasses.replace(FIELDS[name], depth=3, skip=2)
-        made = wideband.make_field(surface_from_points(points), config, get_field(name))
+        made = wideband.make_field(surface_from_points(points), FIELDS[name], get_field(name))
     with jax.enable_x64(True):
         return as_float64(made)
 
 
 @cache
-def differentiated(name, unit):
+def differentiated(name, unit="wavelengths"):
     """The weighted sum of all pixels, and its gradient, jitted; the arrays' unit is part of their structure."""
     field, position = field_of(name), jnp.asarray(np.array(RX))
+    limits = LIMITS if name in ("wideband", "wrfgs") else None
 
     def total(arguments, weights):
         params, receiver, query = arguments
-        if name == "wave":  # mirror images are found on the host: neither field nor position can be traced
+        if name.startswith("wave"):  # found on the host: neither field nor position can be traced
             receiver = dataclasses.replace(receiver, position=position)
-        limits = LIMITS if name in ("wideband", "wrfgs") else None
         spectra = fields.pas(field, params, receiver, query, limits)
         return jnp.sum(spectra * weights), spectra
 
     return jax.jit(jax.value_and_grad(total, has_aux=True))
 
 
-def random_arguments(rng, name, unit="wavelengths"):
-    """(params, receiver, query): nothing is zero by its initialiser, and nothing is compiled to have them."""
+def random_arguments(rng, name):
+    """(params, receiver, query) as NumPy arrays: nothing is zero by its initialiser, and nothing is compiled to have them."""
     field = field_of(name)
-    shapes = jax.eval_shape(field.init, jax.random.key(0))
-    params = jax.tree.map(lambda a: rng.normal(0, 0.3, a.shape), shapes)
-    if name == "wave":
-        params = dataclasses.replace(
-            params, materials=jax.tree.map(lambda stir, at: at + stir, params.materials, as_float64(field.init(None).materials))
-        )
+    params = jax.tree.map(lambda a: rng.normal(0, 0.3, a.shape), jax.eval_shape(field.init, jax.random.key(0)))
+    if name.startswith("wave"):
+        start = np.log([3.0, 0.02, np.e, 0.1])  # log susceptibility, log conductivity, slope, log thickness
+        materials = params.materials
+        params = replaced(params, materials=with_leaves(materials, *(jax.tree.leaves(materials) + start[:, None])))
     elif name != "nerf2":
-        start = jax.tree.map(np.asarray, wideband._initial_gaussians(field.surface))
-        stirred = jax.tree.map(lambda at, stir: at + 0.3 * stir, start, params.gaussians)
-        params = dataclasses.replace(params, gaussians=stirred)
-    orientation = rng.normal(size=4) * [0.2, 0.2, 0.2, 1] + [1, 0, 0, 0]
-    receiver = Receiver(np.array(RX), orientation, planar_array(3, 2, 0.4), np.array(0.7), unit)
-    return params, receiver, Query(rng.uniform([1.5, 0.5, 0.5], [5.5, 3.5, 2.5], (2, 3)), rng.uniform(2e9, 4e9, 2))
+        points, gaussians = np.asarray(field.surface.points), params.gaussians
+        alive = np.arange(len(gaussians.means)) < len(points)
+        changes = {
+            "means": gaussians.means + np.pad(points, ((0, len(alive) - len(points)), (0, 0))),
+            "log_scales": gaussians.log_scales - 1.5,
+            "opacity_logits": np.where(alive, gaussians.opacity_logits, -np.inf),
+        }
+        params = replaced(params, gaussians=replaced(gaussians, **changes))
+    orientation = np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.2, 4)
+    receiver = Receiver(*map(jnp.asarray, (np.array(RX), orientation, planar_array(3, 2, 0.4), np.array(0.7))))
+    places = rng.uniform([1.5, 0.5, 0.5], [5.5, 3.5, 2.5], (2, 3)), rng.uniform(2e9, 4e9, 2)
+    return jax.tree.map(np.asarray, (params, receiver, Query(*map(jnp.asarray, places))))
+
+
+def ends_with(path, names):
+    return any(jax.tree_util.keystr(path).endswith(name) for name in names)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
+    kind, function = name.split()[0], differentiated(name)
+    arguments, weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
+    (value, spectra), gradients = function(arguments, weights)
+    assert np.isfinite(float(value)) and np.asarray(spectra).std(axis=(1, 2)).min() > 1e-3
+    leaves, structure = jax.tree.flatten(arguments)
+    for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
+        leaf, gradient, where = leaves[i], np.asarray(gradient), jax.tree_util.keystr(path)
+        assert np.isfinite(gradient).all(), where
+        if ends_with(path, OUTSIDE.get(kind, ())):
+            continue
+        direction = rng.normal(size=leaf.shape) * (np.abs(leaf) if ".frequency_hz" in where else 1)
+
+        def slope(step, i=i, direction=direction):
+            moved = [[*leaves[:i], leaves[i] + t * direction, *leaves[i + 1 :]] for t in (step, -step)]
+            high, low = (float(function(jax.tree.unflatten(structure, m), weights)[0][0]) for m in moved)
+            return (high - low) / (2 * step)
+
+        if ends_with(path, UNUSED[kind]):
+            assert not gradient.any() and slope(STEPS[0]) == 0, where
+            continue
+        exact, magnitude = np.sum(gradient * direction), np.linalg.norm(gradient * direction)
+        if ends_with(path, INVARIANT.get(kind, ())):
+            assert abs(exact) < 1e-9 and abs(slope(1e-3)) < 1e-7, where
+            continue
+        assert gradient.any(), where
+        found = [slope(STEPS[0])]
+        if abs(found[0] - exact) > TOLERANCE * (abs(exact) + magnitude):
+            found.append(slope(STEPS[1]))
+        assert any(abs(one - exact) <= TOLERANCE * (abs(exact) + magnitude) for one in found), (where, exact, found)
+
+
+@pytest.mark.parametrize("name", ["wideband", "wrfgs"])
+def test_empty_slots_have_no_gradient(rng, x64, name):
+    arguments = random_arguments(rng, name)
+    _, (params, _, _) = differentiated(name)(arguments, rng.normal(size=(2, 90, 360)))
+    empty = np.asarray(arguments[0].gaussians.opacity_logits) == -np.inf
+    assert 0 < empty.sum() < len(empty)
+    for leaf in jax.tree.leaves(params.gaussians):
+        assert not np.asarray(leaf)[empty].any() and np.asarray(leaf)[~empty].any()
+
+
+def test_materials_of_known_thickness_have_no_gradient_of_it(rng, x64):
+    _, (params, _, _) = differentiated("wave")(random_arguments(rng, "wave"), rng.normal(size=(2, 90, 360)))
+    assert (np.asarray(params.materials.log_thickness) != 0).tolist() == [True, False, True]
+
+
+def test_a_plan_from_outside_has_the_wrong_gradient(rng, x64):
+    """The reason for `fields.pas`: what is planned outside of the differentiated function is a constant to it.
+
+    Scales and rotations enter through the plan alone: their gradient is zero, without a warning.
+    """
+    arguments, weights = random_arguments(rng, "wideband"), rng.normal(size=(2, 90, 360))
+    field, (params, receiver, query) = field_of("wideband"), jax.tree.map(jnp.asarray, arguments)
+    _, (right, _, _) = differentiated("wideband")(arguments, weights)
+    plan = jax.jit(lambda params: field.plan(params, receiver, LIMITS))(params)
+
+    @jax.jit
+    @jax.grad
+    def gradients(params, plan):
+        return jnp.sum(wideband.render(params, plan, query) * weights)
+
+    wrong = gradients(params, plan)
+    for name in ("log_scales", "quats"):
+        assert not np.asarray(getattr(wrong.gaussians, name)).any()
+        assert np.asarray(getattr(right.gaussians, name)).any()
+    assert np.asarray(wrong.gaussians.means).any()  # a part: that of the networks' inputs
+    assert relative(wrong.gaussians.means, right.gaussians.means) > 0.1
+    # What does not pass through the plan is right.
+    assert relative(wrong.gaussians.opacity_logits, right.gaussians.opacity_logits) < 1e-9
+
+
+def relative(a, b):
+    a, b = np.asarray(a), np.asarray(b)
+    finite = np.isfinite(b)
+    return np.abs(a - b)[finite].max() / np.abs(b[finite]).max()
+
+
+DESIGN_HZ = 3e9
+
+
+@pytest.mark.parametrize("name", ["wideband", "nerf2", "wave"])
+def test_an_array_in_metres_is_one_in_wavelengths_at_its_design_frequency(rng, x64, name):
+    """The same spectrum and the same gradient; that of the frequency has a part more, for the array grows with it."""
+    (params, receiver, query), weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
+    query = replaced(query, frequency_hz=np.full(2, DESIGN_HZ))
+    metre = DESIGN_HZ / SPEED_OF_LIGHT
+    fixed = replaced(receiver, element_positions=receiver.element_positions / metre, unit="metres")
+    (_, expected), (d_params, d_receiver, d_query) = differentiated(name)((params, receiver, query), weights)
+    (_, found), gradients = differentiated(name, "metres")((params, fixed, query), weights)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    grown = np.sum(d_receiver.element_positions * receiver.element_positions) / DESIGN_HZ
+    assert abs(grown) > 1e-3 * np.abs(d_query.frequency_hz).max()
+    np.testing.assert_allclose(
+        np.sum(gradients[2].frequency_hz), np.sum(d_query.frequency_hz) + grown, rtol=1e-6, atol=1e-6 * abs(grown)
+    )
+    same = replaced(d_receiver, element_positions=d_receiver.element_positions * metre)
+    for (path, got), want in zip(
+        jax.tree_util.tree_leaves_with_path((gradients[0], gradients[1], gradients[2].tx_position)),
+        jax.tree.leaves((d_params, same, d_query.tx_position)),
+        strict=True,
+    ):
+        scale = np.abs(want).max() + 1e-6
+        np.testing.assert_allclose(got / scale, want / scale, atol=1e-8, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.parametrize("name", ["wideband", "wrfgs"])
+def test_forward_mode_of_splatting_fields_is_refused(rng, x64, name):
+    """Before anything is compiled; all ways to ask for it: tests/splat/test_reverse_mode.py."""
+    field, arguments = field_of(name), jax.tree.map(jnp.asarray, random_arguments(rng, name))
+    _, receiver, query = arguments
+    render = jax.jit(lambda arguments: fields.pas(field, *arguments, LIMITS))
+    with pytest.raises(TypeError, match="reverse mode only"):
+        jax.jvp(render, (arguments,), (jax.tree.map(jnp.ones_like, arguments),))
+    with pytest.raises(TypeError, match="reverse mode only"):
+        jax.jacfwd(lambda tx: render((arguments[0], receiver, replaced(query, tx_position=tx))))(query.tx_position)
+
+
+def test_the_wave_field_says_that_its_mirror_images_are_found_on_the_host(rng, x64):
+    field, (params, receiver, query) = field_of("wave"), random_arguments(rng, "wave")
+
+    def total(receiver):
+        return jnp.sum(fields.pas(field, params, receiver, query))
+
+    for transformed in (jax.grad(total), jax.jit(total)):
+        with pytest.raises(TypeError, match=r"mirror images on the host.*close over both"):
+            transformed(jax.tree.map(jnp.asarray, receiver))
+    with pytest.raises(TypeError, match="mirror images on the host"):
+        jax.jit(lambda field: field.plan(params, jax.tree.map(jnp.asarray, receiver)))(field)

@@ -7,34 +7,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene, tiny_settings
+from synthetic import FIELDS, tiny_dataset, tiny_scene, tiny_settings
 
 from wbgs_jax import train as train_command
-from wbgs_jax.radio.array import PAS_SHAPE, pas_directions
-from wbgs_jax.config import Nerf2Config, Settings, check
-from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.fields import SampledField, get_field, nerf2, wideband
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.fields import nerf2
+from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.inference.predictor import predict_spectra
-from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.training.step import loss_and_gradients, training_data
+from wbgs_jax.radio.array import PAS_SHAPE, pas_directions
+from wbgs_jax.training.data import training_data
 from wbgs_jax.training.loop import Run, train
+from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.step import loss_and_gradients
 from wbgs_jax.types import Query, make_query, make_receiver
 
 BOX = np.array([[-3.0, -2, 0], [3, 2.5, 2.8]], np.float32)
 RECEIVER = make_receiver([0.3, -0.2, 1.0], [0.9, 0.1, -0.3, 0.2])
-CONFIG = {"samples": 6, "directions": 40, "width": 8, "depth": 3, "skip": 1, "radiance_widths": (8,)}
-SETTINGS = tiny_settings(nerf2=CONFIG, optim={"steps": 60, "network_lr": 1e-2}, loop={"epoch_steps": 20, "evaluate_every": 60})
+CONFIG = dataclasses.replace(FIELDS["nerf2"], samples=3, directions=40, depth=3)
+SETTINGS = tiny_settings(
+    "nerf2",
+    field=vars(CONFIG) | {"network_lr": 1e-2},
+    optim={"steps": 60},
+    loop={"epoch_steps": 20, "evaluate_every": 60},
+)
 QUERY = make_query([[1.0, 2, 1.5], [-1, 0.5, 2]], [2.4e9, 60e9])
+LOCAL = jnp.asarray(pas_directions().reshape(-1, 3), jnp.float32)
+render = jax.jit(nerf2.render)
 
-pytestmark = pytest.mark.usefixtures("compile_once")
+
+@jax.jit
+def some_pixels(params, plan, query, pixels):
+    """Spectra at some pixels: rays are marched for these alone."""
+    rays = nerf2.make_rays(plan.box, plan.receiver, LOCAL[pixels])
+    return nerf2.march(params, plan, rays, query).T
 
 
-def make_params(rng, **changes):
+def make_field(**changes):
+    return Nerf2Field(jnp.asarray(BOX), dataclasses.replace(CONFIG, **changes))
+
+
+def make_params(rng, field):
     """Every weight drawn anew: nothing is zero by its initialiser."""
-    params = nerf2.init(jax.random.key(0), jnp.asarray(BOX), dataclasses.replace(SETTINGS.nerf2, **changes))
-    networks = jax.tree.map(lambda a: jnp.asarray(rng.normal(0, 0.4, a.shape), jnp.float32), params.networks)
-    return dataclasses.replace(params, networks=networks)
+    return jax.tree.map(lambda a: jnp.asarray(rng.normal(0, 0.4, a.shape), jnp.float32), field.init(jax.random.key(0)))
 
 
 def test_a_single_opaque_shell_returns_its_radiance(rng, x64):
@@ -70,28 +85,32 @@ def test_rays_along_the_axes_reach_the_faces_opposite():
 
 
 def test_sampled_pixels_are_those_of_the_whole_image(rng):
-    params = make_params(rng)
-    whole = jax.jit(nerf2.render)(params, nerf2.plan(params, RECEIVER), QUERY)
+    field = make_field()
+    params = make_params(rng, field)
+    plan = field.plan(params, RECEIVER)
+    whole = render(params, plan, QUERY)
     assert whole.shape == (2, *PAS_SHAPE) and float(whole.std()) > 1e-3
-    pixels = nerf2.choose_pixels(params, jax.random.key(int(rng.integers(1000))))
-    seen = jax.jit(nerf2.observe_pixels)(params, RECEIVER, QUERY, pixels)
+    pixels = nerf2.choose_pixels(jax.random.key(int(rng.integers(1000))), CONFIG.directions)
+    seen = some_pixels(params, plan, QUERY, pixels)
     np.testing.assert_allclose(seen, whole.reshape(2, -1)[:, pixels], rtol=1e-4, atol=1e-5)
 
 
 def test_a_query_does_not_depend_on_its_neighbours_in_the_batch(rng):
-    params = make_params(rng)
-    plan, render = nerf2.plan(params, RECEIVER), jax.jit(nerf2.render)
+    field = make_field()
+    params = make_params(rng, field)
+    plan = field.plan(params, RECEIVER)
     both = render(params, plan, QUERY)
     for i in range(2):
-        one = render(params, plan, jax.tree.map(lambda a, i=i: a[i : i + 1], QUERY))
+        one = render(params, plan, jax.tree.map(lambda a, i=i: jnp.stack([a[i], a[i]]), QUERY))
         np.testing.assert_allclose(one[0], both[i], rtol=1e-4, atol=1e-5)
+        alone = some_pixels(params, plan, jax.tree.map(lambda a, i=i: a[i : i + 1], QUERY), jnp.arange(0, 32_400, 800))
+        np.testing.assert_allclose(alone[0], both[i].reshape(-1)[::800], rtol=1e-4, atol=1e-5)
     assert float(jnp.abs(both[0] - both[1]).max()) > 1e-3
 
 
 @pytest.mark.parametrize("count", [40, 7, 32_400])
-def test_pixels_are_one_of_each_stretch_and_a_function_of_the_key(rng, count):
-    params = dataclasses.replace(make_params(rng), config=Nerf2Config(directions=count))
-    first, again, other = (np.asarray(nerf2.choose_pixels(params, jax.random.key(k))) for k in (1, 1, 2))
+def test_pixels_are_one_of_each_stretch_and_a_function_of_the_key(count):
+    first, again, other = (np.asarray(nerf2.choose_pixels(jax.random.key(k), count)) for k in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     edges = np.arange(count + 1) * 32_400 / count
     assert (first >= np.floor(edges[:-1])).all() and (first <= edges[1:]).all() and first.max() < 32_400
@@ -100,27 +119,40 @@ def test_pixels_are_one_of_each_stretch_and_a_function_of_the_key(rng, count):
 
 @pytest.mark.parametrize("relative", [True, False])
 def test_frequency_transmitter_and_all_weights_matter_with_finite_gradients(rng, relative):
-    params = make_params(rng, relative=relative)
-    pixels = nerf2.choose_pixels(params, jax.random.key(0))
+    field = make_field(relative=relative)
+    params = make_params(rng, field)
+    plan, pixels = field.plan(params, RECEIVER), nerf2.choose_pixels(jax.random.key(0), CONFIG.directions)
 
-    def total(networks, query):
-        changed = dataclasses.replace(params, networks=networks)
-        return jnp.sum(nerf2.observe_pixels(changed, RECEIVER, query, pixels) ** 2)
+    @jax.jit
+    def gradients(params, query):
+        return jax.grad(lambda *both: jnp.sum(some_pixels(both[0], plan, both[1], pixels) ** 2), argnums=(0, 1))(params, query)
 
     # A transmitter at the receiver is where lengths have no derivative.
     query = Query(jnp.stack([QUERY.tx_position[0], RECEIVER.position]), QUERY.frequency_hz)
-    networks, asked = jax.jit(jax.grad(total, argnums=(0, 1)))(params.networks, query)
-    for path, leaf in jax.tree_util.tree_leaves_with_path((networks, asked)):
+    weights, asked = gradients(params, query)
+    for path, leaf in jax.tree_util.tree_leaves_with_path((weights, asked)):
         assert bool(jnp.isfinite(leaf).all()), jax.tree_util.keystr(path)
+    assert all(float(jnp.abs(leaf).max()) > 0 for leaf in jax.tree.leaves(weights))
     assert float(jnp.abs(asked.frequency_hz).max()) > 0 and float(jnp.abs(asked.tx_position[0]).max()) > 0
 
 
-def test_the_step_decides_the_directions():
-    dataset = tiny_dataset()
-    params, data = nerf2.init(jax.random.key(0), jnp.asarray(BOX), SETTINGS.nerf2), training_data(dataset)
-    losses = jax.jit(lambda step: loss_and_gradients(nerf2, params, data, jnp.arange(3), None, SETTINGS.optim, step)[0][0])
-    first, again, other = (float(losses(jnp.asarray(step))) for step in (0, 0, 1))
+def test_the_key_of_a_step_decides_the_directions():
+    """A run folds its seed and the step into it."""
+    data, field = training_data(tiny_dataset()), make_field()
+    params = field.init(jax.random.key(0))
+    losses = jax.jit(lambda key: loss_and_gradients(field, params, None, data, jnp.arange(3), None, key)[0][0])
+    first, again, other = (float(losses(jax.random.key(seed))) for seed in (0, 0, 1))
     assert first == again != other
+
+
+def test_its_pixels_are_drawn_with_the_runs_seed(tmp_path):
+    """The same parameters and batches, another seed: another loss in the first epoch."""
+    first, other = (Run(tiny_dataset(), "nerf2", SETTINGS, seed, tmp_path / str(seed)) for seed in (0, 1))
+    batches = first.batches(0, SETTINGS.loop.epoch_steps)
+    for run in (first, other):
+        run.batches = lambda *_: batches
+    other.state = jax.tree.map(jnp.copy, first.state)
+    assert first.epoch()["loss"] != other.epoch()["loss"]
 
 
 def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
@@ -138,22 +170,16 @@ def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path, monkeypatch):
+def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path):
     save_scene(tmp_path / "box.npz", tiny_scene())
-    tiny = "--nerf2.samples 4 --nerf2.width 8 --nerf2.directions 30 --optim.steps 20 --loop.evaluate-spectra 2"
-    command = f"train --scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run {tiny}"
-    monkeypatch.setattr("sys.argv", command.split())
-    train_command.main()
+    tiny = "--nerf2.samples 2 --nerf2.width 8 --nerf2.directions 30 --optim.steps 20 --loop.evaluate-spectra 2"
+    command = f"--scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run {tiny}"
+    train_command.main(command.split())
     trained = load_trained(tmp_path / "run")
-    assert trained.step == 20 and trained.config.settings.nerf2.samples == 4
-    dataset = trained.config.dataset()
+    assert trained.step == 20 and trained.config.settings.field.samples == 2
+    dataset = trained.dataset()
     predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test[:2])
     assert predicted.shape == (2, *PAS_SHAPE) and np.isfinite(predicted).all()
-
-
-def test_it_is_trained_on_some_directions_and_no_other_field_is():
-    assert isinstance(get_field("nerf2"), SampledField)
-    assert not isinstance(wideband, SampledField)
 
 
 @pytest.mark.parametrize(
@@ -162,4 +188,4 @@ def test_it_is_trained_on_some_directions_and_no_other_field_is():
 )
 def test_settings_that_cannot_work_are_refused(name, value):
     with pytest.raises(UserError, match=name.replace("_", "-")):
-        check(dataclasses.replace(Settings(), nerf2=Nerf2Config(**{name: value})))
+        Nerf2Field.check(Nerf2Config(**{name: value}))

@@ -7,21 +7,30 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import FREQUENCIES_HZ, RX, tiny_dataset
+from toys import RippleConfig, RippleField
 from untrained import STEP, make_run, make_trained
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.predictor import predictor
 
-GUIDE = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
+@pytree
+class BrokenField(RippleField):
+    """Renders nothing."""
+
+    def render(self, params, plan, query):
+        raise ZeroDivisionError
+
+
+GUIDE = (Path(__file__).parents[2] / "docs" / "inference.md").read_text()
 FOREIGN = ["wbgs_jax", "flax", "optax", "orbax", "jaxtyping"]
 TX = np.array([[1.0, 0.5, 1.5], [-1.0, 1.0, 1.2], [0.0, 2.0, 0.4]])
 HZ = np.array([28e9, 5e9, 1e9])
@@ -34,7 +43,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def predict(trained):
-    return predictor(trained, tiny_dataset().receiver)
+    return predictor(trained, tiny_dataset().receiver())
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +98,7 @@ def test_the_file_holds_no_paths_of_this_machine_and_equal_fields_make_equal_fil
     with zipfile.ZipFile(path) as archive:
         assert sorted(archive.namelist()) == ["field.bin", "metadata.json"]
         code = archive.read("field.bin")
-    assert str(Path(__file__).parents[1]).encode() not in code and b".py" not in code
+    assert str(Path(__file__).parents[2]).encode() not in code and b".py" not in code
     export_field(trained, tmp_path / "again.zip", dataset=tiny_dataset())
     assert (tmp_path / "again.zip").read_bytes() == path.read_bytes()
 
@@ -184,9 +193,9 @@ def test_an_export_that_fails_leaves_nothing(trained, tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UserError, match="cannot write"):
         export_field(trained, tmp_path / "file" / "field.zip", ("cpu",), tiny_dataset())
-    broken = SimpleNamespace(**vars(trained.field) | {"render": lambda *_: 1 / 0})
+    broken = dataclasses.replace(trained, field=BrokenField(RippleConfig()))
     before = jax.config.jax_traceback_in_locations_limit
     with pytest.raises(ZeroDivisionError):
-        export_field(dataclasses.replace(trained, field=broken), tmp_path / "field.zip")
+        export_field(broken, tmp_path / "field.zip", dataset=tiny_dataset())
     assert jax.config.jax_traceback_in_locations_limit == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]

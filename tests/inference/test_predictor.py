@@ -4,11 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene
+from jax.extend.core import jaxprs_in_params
+from synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene, tiny_settings
 from untrained import make_trained
 
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import get_field
 from wbgs_jax.inference import predictor as inference
-from wbgs_jax.inference.predictor import fold, map_queries, predict_blocks, predict_many, predict_map, predictor
+from wbgs_jax.inference.maps import map_queries, predict_blocks, predict_many, predict_map
+from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.splat import TileLimits
 from wbgs_jax.types import Query, make_query, make_receiver
 
 TX = np.array([[1.0, 0.5, 1.5], [-1.0, 1.0, 1.2]])
@@ -21,15 +26,22 @@ def trained(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def plan(trained):
+    return trained.field.plan(trained.params, tiny_dataset().receiver())
+
+
+@pytest.fixture(scope="module")
 def predict(trained):
     return predictor(trained)
 
 
+_render = jax.jit(lambda field, *args: field.render(*args).pas)
+
+
 @pytest.fixture(scope="module")
-def expected(trained):
+def expected(trained, plan):
     """By the field's own functions."""
-    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
-    return np.asarray(jax.jit(trained.field.render)(trained.params, plan, make_query(TX, HZ)))
+    return np.asarray(_render(trained.field, trained.params, plan, make_query(TX, HZ)))
 
 
 def test_the_predictor_is_the_field(predict, expected):
@@ -52,16 +64,15 @@ def test_vmap_and_jit(predict, expected):
     np.testing.assert_allclose(jax.jit(jax.vmap(predict))(jnp.asarray(TX), jnp.asarray(HZ)), expected, atol=1e-6)
 
 
-def test_gradients_are_those_of_the_field(trained, predict, rng):
-    """tests/test_wideband.py compares the field's own with finite differences."""
-    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
+def test_gradients_are_those_of_the_field(trained, plan, predict, rng):
+    """tests/fields/test_wideband.py compares the field's own with finite differences."""
     weight = jnp.asarray(rng.normal(size=(2, 90, 360)), jnp.float32)
 
     def own(tx, ghz):
         return jnp.sum(weight * predict(tx, 1e9 * ghz))
 
     def direct(tx, ghz):
-        return jnp.sum(weight * trained.field.render(trained.params, plan, Query(tx, 1e9 * ghz)))
+        return jnp.sum(weight * trained.field.render(trained.params, plan, Query(tx, 1e9 * ghz)).pas)
 
     args = jnp.asarray(TX, jnp.float32), jnp.asarray(HZ / 1e9, jnp.float32)
     for gradient, expected in zip(*(jax.jit(jax.grad(f, argnums=(0, 1)))(*args) for f in (own, direct)), strict=True):
@@ -73,7 +84,7 @@ def test_gradients_are_those_of_the_field(trained, predict, rng):
 def test_another_receiver(trained, predict):
     """Where the array stands and how it is turned is part of the function."""
     scene = tiny_scene()
-    same = predictor(trained, make_receiver(scene.rx_position, scene.rx_orientation, scene.element_positions))
+    same = predictor(trained, make_receiver(scene.rx_position[0], scene.rx_orientation[0], scene.element_positions[0]))
     moved = predictor(trained, make_receiver(RX + np.array([0, 0.5, 0])))
     before = predict(TX, HZ)
     np.testing.assert_allclose(same(TX, HZ), before, atol=1e-6)
@@ -96,38 +107,54 @@ def test_wrong_shapes_and_units(predict, tx, frequency, named):
 
 
 def operations(function, *args):
-    """Names of the operations that a call carries out."""
-    (call,) = jax.make_jaxpr(jax.jit(function))(*args).eqns
-    return [equation.primitive.name for equation in call.params["jaxpr"].jaxpr.eqns]
+    """All operations that a call carries out, (name, shapes of the results), whatever they are nested in."""
+
+    def walk(jaxpr):
+        for equation in jaxpr.eqns:
+            found.append((equation.primitive.name, [tuple(out.aval.shape) for out in equation.outvars]))
+            for inner in jaxprs_in_params(equation.params):
+                walk(inner)
+
+    found: list[tuple[str, list[tuple[int, ...]]]] = []
+    walk(jax.make_jaxpr(function)(*args).jaxpr)
+    return found
 
 
-def test_folding_leaves_what_depends_on_the_arguments():
-    table = jnp.arange(12.0).reshape(4, 3)
-
-    def function(x, y):
-        fixed = jnp.cos(table) @ jnp.ones((3, 2))
-        return {"sum": jnp.sin(x) + fixed.sum(), "fixed": fixed, "same": y}
-
-    args = jnp.ones(5), jnp.zeros(2)
-    assert "cos" in operations(function, *args)
-    assert set(operations(fold(function), *args)) == {"sin", "add"}
-    for compiled in (fold(function), jax.jit(fold(function))):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), compiled(*args), function(*args))
+def products_without(found, size):
+    """Shapes of the matrix products whose results are no multiple of a size."""
+    return [shape for name, (shape, *_) in found if name == "dot_general" and np.prod(shape) % size]
 
 
-def test_folding_where_there_is_nothing_to_fold():
-    assert float(fold(lambda x: 2 * x)(3.0)) == 6
-    assert float(fold(lambda x: 7.0)(3.0)) == 7
-    assert float(fold(lambda x: x)(3.0)) == 3
+def test_a_plan_without_what_is_cheaply_computed_again_renders_the_same(trained, plan, expected):
+    """What a file holds (`Field.portable`) lacks what the networks make of the Gaussians alone."""
+    portable = trained.field.portable(plan)
+    size, smaller = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (plan, portable))
+    assert smaller < size
+    again = _render(trained.field, trained.params, portable, make_query(TX, HZ))
+    np.testing.assert_allclose(again, expected, atol=1e-6)
 
 
-def test_a_query_costs_less_than_the_field(trained, predict):
-    """Encodings of the Gaussians and the layers behind them are not computed again for a query."""
-    plan = trained.field.plan(trained.params, tiny_dataset().receiver)
-    query = make_query(TX, HZ)
-    plain = operations(lambda q: trained.field.render(trained.params, plan, q), query)
-    folded = operations(fold(lambda q: trained.field.render(trained.params, plan, q)), query)
-    assert folded.count("sin") < plain.count("sin") and folded.count("dot_general") < plain.count("dot_general")
+@pytest.mark.parametrize("name", ["wideband", "wrfgs"])
+def test_what_does_not_depend_on_the_query_is_planned(name):
+    """With a plan, all matrix products are of queries: encodings of the Gaussians and the layers behind them are not
+    computed again. Without it they are."""
+    queries = 7  # nothing else comes in sevens
+    field = get_field(name).make(tiny_settings(name).field, DatasetScene(tiny_dataset()), 0)
+    params = jax.eval_shape(field.init, jax.random.key(0))
+    limits = TileLimits(entries=4096, jobs=1024)
+    receiver = tiny_dataset().receiver()
+    plan = jax.eval_shape(lambda params: field.plan(params, receiver, limits), params)
+    query = make_query(np.ones((queries, 3)), 28e9)
+    planned = operations(field.render, params, plan, query)
+    again = operations(field.render, params, field.portable(plan), query)
+    assert [name for name, _ in planned].count("dot_general") >= 3
+    assert products_without(planned, queries) == []
+    assert len(products_without(again, queries)) >= 2
+
+    def count(found, operation):
+        return [name for name, _ in found].count(operation)
+
+    assert count(planned, "sin") < count(again, "sin") and count(planned, "dot_general") < count(again, "dot_general")
 
 
 class Recorder:
@@ -179,16 +206,15 @@ def test_a_map_runs_over_x_then_y_then_frequency():
     np.testing.assert_array_equal(frequencies, [5e9])
 
 
-def test_spectra_of_a_dataset_are_those_of_its_queries(trained, monkeypatch):
+def test_spectra_of_a_dataset_are_those_of_its_queries(trained, predict, monkeypatch):
     monkeypatch.setattr(inference, "BLOCK", 2)
     dataset, index = tiny_dataset(), np.array([7, 2, 11])
     images = inference.predict_spectra(trained.field, trained.params, dataset, index)
-    expected = predict_many(predictor(trained), dataset.tx_positions[index], dataset.frequencies_hz[index], block=2)
+    expected = predict_many(predict, dataset.tx_positions[index], dataset.frequencies_hz[index], block=2)
     np.testing.assert_allclose(images, expected, atol=1e-6)
 
 
 def test_what_is_known_about_the_training():
     dataset = tiny_dataset()
-    box = inference.scene_box(dataset)
-    np.testing.assert_allclose(box, [dataset.vertices.min(0), dataset.vertices.max(0)], rtol=1e-6)
+    np.testing.assert_allclose(DatasetScene(dataset).box, [dataset.vertices.min(0), dataset.vertices.max(0)], rtol=1e-6)
     assert inference.trained_band(dataset) == (FREQUENCIES_HZ.min(), FREQUENCIES_HZ.max())

@@ -52,6 +52,8 @@ REFUSED = {
     "jitted jvp": lambda: jax.jit(lambda a: direction(energy, a))(ATTENUATION),
     "jacfwd": lambda: jax.jacfwd(energy)(ATTENUATION),
     "jitted jacfwd": lambda: jax.jit(jax.jacfwd(energy))(ATTENUATION),
+    "jacfwd of a jitted function": lambda: jax.jacfwd(jax.jit(energy))(ATTENUATION),
+    "jvp of a mapped function": lambda: direction(jax.vmap(energy), jnp.stack([ATTENUATION, ATTENUATION])),
     "linearize": lambda: jax.linearize(energy, ATTENUATION)[1](ATTENUATION),
     "linearize of a jitted function": lambda: jax.linearize(jax.jit(energy), ATTENUATION)[1](ATTENUATION),
     "grad of grad": lambda: jax.grad(slope)(ATTENUATION),

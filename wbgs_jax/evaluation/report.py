@@ -49,6 +49,8 @@ def _training_arguments(config: Any) -> list[str]:
         data += ["--train-tx", str(config.train_tx)]
     if config.validation:
         data += ["--validation", f"{config.validation:g}"]
+    if config.receiver is not None:
+        data += ["--receiver", str(config.receiver)]
     return [*data, "--field", config.field, "--preset", config.preset, "--seed", str(config.seed)]
 
 
@@ -59,8 +61,14 @@ def device_name() -> str:
 
 
 def result_path(folder: Path, report: dict[str, Any], preset: str) -> Path:
-    """Returns FOLDER/quality_<dataset>_<field>_<preset>_<device>.json."""
-    return folder / f"quality_{report['scene']}_{report['field']}_{preset}_{device_name()}.json"
+    """Returns FOLDER/quality_<dataset>_<field>_<preset>_<device>.json; of another part than the test, its name at the end."""
+    name = f"quality_{report['scene']}_{report['field']}_{preset}_{device_name()}"
+    return folder / f"{with_part(name, report['part'])}.json"
+
+
+def with_part(name: str, part: str) -> str:
+    """Returns the name of what belongs to a part of the data: figures for choices never replace those of the test."""
+    return name if part == "test" else f"{name}_{part}"
 
 
 def table(report: dict[str, Any]) -> Table:

@@ -164,6 +164,9 @@ def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any
 
     Nothing is frozen: the plan is made inside. Under `jit` or `grad` a field with limits needs them given
     (`field.limits(params, receiver)`, on the host); too small ones give NaN, never a wrong spectrum. Reverse mode only.
+
+    The wave field finds mirror images on the host: neither it nor the receiver's position can be traced, and spectra have no
+    gradient with respect to that position.
     """
     return field.render(params, field.plan(params, receiver, limits), query).pas
 

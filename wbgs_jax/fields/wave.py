@@ -143,6 +143,11 @@ class WaveField(Field):
 
     def _search(self, receiver: Receiver) -> Search:
         config = self.config
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self.facets, self.edges, receiver.position))):
+            raise TypeError(
+                "the wave field finds a receiver's mirror images on the host: neither the field nor receiver.position can be "
+                "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
+            )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
         return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
 

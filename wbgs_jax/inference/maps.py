@@ -13,16 +13,19 @@ from wbgs_jax.radio.array import PAS_SHAPE
 def predict_blocks(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
 ) -> Iterator[Float[np.ndarray, "k 90 360"]]:
-    """Yields spectra (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
+    """Returns spectra (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
 
     Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation.
     """
     positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
     n = len(positions)
-    for start in range(0, n, block):
+
+    def part(start: int) -> Float[np.ndarray, "k 90 360"]:
         index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up
-        yield np.asarray(predict(positions[index], frequencies[index]))[: n - start]
+        return np.asarray(predict(positions[index], frequencies[index]))[: n - start]
+
+    return map(part, range(0, n, block))  # lazy; wrong arguments raise here
 
 
 def predict_many(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.footprint import footprint, mahalanobis2, windowed_exponential
-from wbgs_jax.splat.reverse_mode import not_differentiable, reverse_mode_only, reworded
+from wbgs_jax.splat.reverse_mode import not_differentiable, reverse_mode_only
 from wbgs_jax.splat.tiles import CHUNK, N_TILES, TILE_COLUMNS, TILE_HEIGHT, TILE_ROWS, TILE_WIDTH, TileJobs
 
 TILE_PIXELS = TILE_HEIGHT * TILE_WIDTH
@@ -49,8 +49,7 @@ def composite(
             of a jitted function when it is compiled, from `jax.linearize` when its result is called.
     """
     own = map(reverse_mode_only, (jnp.concatenate([means2d, conics], -1), attenuation, signal))
-    with reworded():
-        tiles = lax.platform_dependent(*own, jobs, cpu=_by_tiles, default=_by_jobs)
+    tiles = lax.platform_dependent(*own, jobs, cpu=_by_tiles, default=_by_jobs)
     grid = tiles.reshape(TILE_ROWS, TILE_COLUMNS, -1, TILE_HEIGHT, TILE_WIDTH)
     return grid.transpose(2, 0, 3, 1, 4).reshape(-1, PAS_HEIGHT, PAS_WIDTH)
 

@@ -1,11 +1,9 @@
 """What a hand-written backward pass does not allow, refused in a sentence of our own.
 
-JAX refuses it too, but in words about a function that nobody asked for, or about a loop within it. Nothing here costs
-anything when code runs.
+JAX refuses it too, but in words about a function that nobody asked for, or about a loop within it. Both functions below are
+the identity, and cost nothing when code runs.
 """
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import jax
@@ -24,23 +22,39 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 
 _tangent = Primitive("reverse_mode_only")
-"""The identity of tangents. Reverse mode transposes it away; forward mode comes to evaluate it, or to lower it under `jit`."""
-_tangent.def_abstract_eval(lambda tangent: tangent)
+"""(x, tangent of x) -> the tangent. Reverse mode transposes it away; forward mode comes to evaluate it, to compile it, or to map
+it over tangents of one x."""
+
+
+def _map(arguments: Any, axes: Any) -> Any:
+    if axes[0] is batching.not_mapped:
+        _refuse()
+    x, tangent = arguments[0], batching.moveaxis(arguments[1], axes[1], axes[0])
+    return _tangent.bind(x, tangent), axes[0]
+
+
+def _differentiate_again(arguments: Any, tangents: Any) -> Any:
+    (x, tangent), further = arguments, tangents[1]
+    return _tangent.bind(x, tangent), further if isinstance(further, ad.Zero) else _tangent.bind(x, further)
+
+
+_tangent.def_abstract_eval(lambda x, tangent: tangent)
 _tangent.def_impl(_refuse)
 mlir.register_lowering(_tangent, _refuse)
-ad.deflinear2(_tangent, lambda cotangent, _: [cotangent])
-batching.defvectorized(_tangent)
+batching.primitive_batchers[_tangent] = _map
+ad.primitive_jvps[_tangent] = _differentiate_again
+ad.primitive_transposes[_tangent] = lambda cotangent, x, tangent: [None, cotangent]
 
 
 @jax.custom_jvp
 def reverse_mode_only(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns x; forward-mode differentiation is a TypeError, under `jit` when the code is compiled."""
+    """Returns x; forward-mode differentiation is a TypeError, of jitted code when it is compiled."""
     return x
 
 
 @reverse_mode_only.defjvp
 def _reverse_mode_only_jvp(primals, tangents):
-    return reverse_mode_only(*primals), _tangent.bind(*tangents)
+    return reverse_mode_only(*primals), _tangent.bind(*primals, *tangents)
 
 
 @jax.custom_jvp
@@ -50,14 +64,3 @@ def not_differentiable(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 not_differentiable.defjvp(_refuse)
-
-
-@contextlib.contextmanager
-def reworded() -> Iterator[None]:
-    """Says it where JAX comes first: mapped over tangents under `jit`, as `jax.jacfwd` does."""
-    try:
-        yield
-    except TypeError as error:
-        if "custom_vjp" not in str(error):
-            raise
-        raise TypeError(MESSAGE) from error
