@@ -157,7 +157,7 @@ def ask_channel(
     def one(tx: Any, frequency: Any) -> np.ndarray:
         query = Query(tx[None], frequency[None])
         if "paths" not in trained.field.gives:
-            return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name))[0]
+            return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name)[0])
         found = _arrivals(trained.field, trained.params, plan, query)
         return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency))
 

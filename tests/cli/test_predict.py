@@ -1,17 +1,25 @@
-"""`python -m wbgs_jax.predict`: spectra and pictures, exported fields, and what it says when something is wrong."""
+"""`wbgs-jax predict`: spectra and pictures, exported fields, and what it says when something is wrong."""
 
 import json
-import sys
-from types import SimpleNamespace
+from typing import ClassVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import call
 from PIL import Image
-from untrained import make_run
+from synthetic import tiny_scene
+from toys import RippleConfig, RippleField, registered, toy_settings
+from untrained import State, make_run
 
 from wbgs_jax import predict as predict_command
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.fields import Observation
 from wbgs_jax.inference.export import load_exported
+from wbgs_jax.training import checkpoint
+from wbgs_jax.training.run_folder import RunConfig, write_config
 
 INSIDE = ["1,0.5,1.5", "-1,1,1.2"]
 
@@ -21,24 +29,14 @@ def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "box")
 
 
-@pytest.fixture
-def predict(monkeypatch, capsys):
-    """Calls the command line in this process: exit code, stdout and lines on stderr."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["predict", *map(str, arguments)])
-        code = 0
-        try:
-            run_command(predict_command.main)
-        except SystemExit as stop:
-            code = stop.code
-        captured = capsys.readouterr()
-        return SimpleNamespace(code=code, out=captured.out, lines=captured.err.splitlines())
-
-    return call
+def predict(*arguments):
+    """Exit code, stdout and lines on stderr."""
+    result = call(predict_command.main, *arguments)
+    result.lines = result.err.splitlines()
+    return result
 
 
-def test_spectra_and_export_agree(predict, run, tmp_path):
+def test_spectra_and_export_agree(run, tmp_path):
     out, picture, field = tmp_path / "spectra.npz", tmp_path / "new" / "spectra.png", tmp_path / "field.zip"
     files = ["--out", out, "--picture", picture, "--export", field]
     result = predict("--run", run, "--tx", *INSIDE, "--ghz", 28, 1, *files)
@@ -55,7 +53,7 @@ def test_spectra_and_export_agree(predict, run, tmp_path):
         assert image.format == "PNG" and np.asarray(image.convert("L")).std() > 5
 
 
-def test_what_the_field_was_not_trained_for_is_a_warning(predict, run, tmp_path):
+def test_what_the_field_was_not_trained_for_is_a_warning(run, tmp_path):
     result = predict("--run", run, "--tx", INSIDE[0], "9,0,1.5", "--ghz", 28, 100, "--out", tmp_path / "spectra.npz")
     assert result.code == 0
     warnings = [line for line in result.lines if line.startswith("warning: ")]
@@ -87,7 +85,7 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         (["--export", "RUN/config.json/a.zip"], ["cannot write"]),
     ],
 )
-def test_what_cannot_be_asked(predict, run, tmp_path, arguments, words):
+def test_what_cannot_be_asked(run, tmp_path, arguments, words):
     places = (word.replace("OUT", str(tmp_path)).replace("RUN", str(run)) for word in arguments)
     result = predict("--run", run, *places)
     assert (result.code, result.out) == (2, "")
@@ -98,10 +96,67 @@ def test_what_cannot_be_asked(predict, run, tmp_path, arguments, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_runs_that_are_none(predict, tmp_path):
+def test_runs_that_are_none(tmp_path):
     result = predict("--run", tmp_path / "gone", *ASK, "--out", tmp_path / "a.npz")
     assert result.code == 2
     assert result.lines == [
         f"error: {tmp_path / 'gone'} is not a run folder: it has no config.json; train first (make train SCENE=1)"
     ]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytree
+class HearingField(RippleField):
+    """Knows powers and snapshots, and no paths."""
+
+    name: ClassVar[str] = "hearing"
+    gives: ClassVar = ("pas", "power", "snapshots")
+
+    def render(self, params, plan, query):
+        power_db = -60 + query.tx_position[:, 0] + query.frequency_hz / 1e9
+        return Observation(super().render(params, plan, query).pas, query.tx_position[:, :1] * jnp.ones(16) * 1j, power_db)
+
+
+def make_toy_run(folder, field):
+    """As `untrained.make_run`, of a toy field."""
+    save_scene(folder.with_suffix(".npz"), tiny_scene())
+    write_config(folder, RunConfig(str(folder.with_suffix(".npz")), field.name, "smoke", 0, None, toy_settings()))
+    state = State(field.init(jax.random.key(0)))
+    checkpoint.save(folder / "checkpoints", 3, state, field, {"limits": None, "seconds": 1.0}, keep=1)
+    return folder
+
+
+def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
+    """Powers and snapshots of a field without paths; nothing of one that knows spectra alone."""
+    with registered(HearingField, RippleField):
+        run = make_toy_run(tmp_path / "hearing", HearingField(RippleConfig()))
+        ask = ["--run", run, "--tx", "1,2,1", "-1,0,2", "--ghz", 2, 5, 9]
+        for what, name, expected in (
+            ("power", "power_db", -60 + np.array([[1], [-1]]) + np.array([2, 5, 9])),
+            ("snapshot", "snapshots", np.broadcast_to(np.array([1j, -1j])[:, None, None], (2, 3, 16))),
+        ):
+            result = predict(*ask, "--what", what, "--out", tmp_path / f"{what}.npz")
+            assert result.code == 0, result.err
+            with np.load(tmp_path / f"{what}.npz") as answer:
+                np.testing.assert_allclose(answer[name], expected, atol=1e-5)
+                assert json.loads(str(answer["meta"]))["field"] == "hearing"
+        refused = predict(*ask, "--what", "k-factor", "--out", tmp_path / "k.npz")
+        assert (refused.code, len(refused.lines)) == (2, 1)
+        assert "the hearing field has no k-factor" in refused.err and "wave" in refused.err
+        blind = make_toy_run(tmp_path / "ripple", RippleField(RippleConfig()))
+        refused = predict("--run", blind, *ASK, "--what", "power", "--out", tmp_path / "none.npz")
+        assert refused.code == 2 and "the ripple field has no power, only spectra" in refused.err
+        assert "hearing" in refused.err  # among those that have it
+        assert not (tmp_path / "k.npz").exists() and not (tmp_path / "none.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--what", "power"], ["nothing to do"]),
+        ([*ASK, "--what", "power"], ["--out"]),
+        ([*ASK, "--what", "power", "--picture", "OUT/a.png", "--out", "OUT/a.npz"], ["no --picture"]),
+    ],
+)
+def test_numbers_are_written_and_not_drawn(run, tmp_path, arguments, words):
+    test_what_cannot_be_asked(run, tmp_path, arguments, words)

@@ -14,7 +14,10 @@ from wbgs_jax import eval as eval_command
 from wbgs_jax import train as train_command
 from wbgs_jax.data.layout import export_layout
 from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.evaluation.score import watch
+from wbgs_jax.training import curves
 from wbgs_jax.training.checkpoint import checkpoint_steps
+from wbgs_jax.training.loop import Run
 from wbgs_jax.training.run_folder import load_trained
 
 NETWORKS = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance-widths": 8}
@@ -119,7 +122,7 @@ def test_eval_of_other_data_for_people_with_results(run, layout, tmp_path):
     assert provenance["settings"]["wideband"]["width"] == 8
 
 
-def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tmp_path, scene):
+def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tmp_path, scene, monkeypatch):
     """Curves watch it, `eval --part validation` scores it, and what belongs to the test is not replaced by it."""
     run = train_and_check(tmp_path / "run", "--scene", scene, "--validation", 0.3, *TOY)
     plain, split = tiny_dataset(), load_trained(run).dataset()
@@ -127,24 +130,27 @@ def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tm
     assert len(split.validation) == 3 and set(split.validation) | set(split.train) == set(plain.train)
     (held_out,) = set(split.tx_index[split.validation])
     assert held_out not in split.tx_index[split.train]
-    reports = {}
+    reports, drawn = {}, []
+    monkeypatch.setattr(eval_command.pictures, "draw_all", lambda folder, *_: drawn.append(folder) or [])
     for part in ("test", "validation"):
-        results = ["--results", tmp_path / "results"]
-        result = call(eval_command.main, "--run", run, "--part", part, "--json", *results, *["--no-pictures"][part == "test" :])
+        result = call(eval_command.main, "--run", run, "--part", part, "--json", "--results", tmp_path / "results")
         assert result.code == 0, result.err
         reports[part] = json.loads(result.out)
         assert reports[part]["part"] == part and reports[part]["n"] == len(getattr(split, part))
-    curves = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert len(split.validation) > 2  # the curves watch two of them, drawn once
-    watched = {entry["step"]: entry["held_out_ssim"] for entry in curves if "held_out_ssim" in entry}
-    assert watched.keys() == {4}
+    (watched,) = [entry for entry in curves.read(run / "metrics.jsonl") if "held_out_ssim" in entry]
+    trained = load_trained(run)
+    chosen = Run(split, "ripple", trained.config.settings, 0, run).watched
+    assert watched["step"] == 4 and len(chosen) == 2 and set(chosen) <= set(split.validation)
+    assert watched["held_out_ssim"] == pytest.approx(
+        watch(trained.field, trained.params, split, chosen)["held_out_ssim"], abs=1e-6
+    )
     assert json.loads((run / "eval.json").read_text()) == reports["test"]
     assert json.loads((run / "eval_validation.json").read_text()) == reports["validation"]
     names = {path.name for path in (tmp_path / "results").iterdir()}
     assert names == {"quality_box_ripple_smoke_cpu.json", "quality_box_ripple_smoke_cpu_validation.json"}
     written = json.loads((tmp_path / "results" / "quality_box_ripple_smoke_cpu_validation.json").read_text())
     assert written["provenance"]["command"].count("--validation 0.3") == 1
-    assert {path.name for path in run.iterdir() if path.is_dir()} == {"checkpoints", "pictures_validation"}
+    assert drawn == [run / "pictures", run / "pictures_validation"]
     people = call(eval_command.main, "--run", run, "--part", "validation", "--no-pictures")
     assert "validation SSIM" in people.out
 

@@ -25,10 +25,10 @@ from wbgs_jax.types import Query, Receiver
 
 RX = (1.0, 1.0, 1.2)
 LIMITS = TileLimits(entries=4096, jobs=1024)
-STEPS = (1e-7, 3e-9)
-"""A kink (the edge of a footprint at a pixel, a ReLU) may lie within the longer one, hardly within both."""
-TOLERANCE = 2e-5
-"""Relative to the derivative, and to the sum of the magnitudes that it is the sum of."""
+STEPS = (1e-7, 2e-8, 3e-9)
+"""A kink (the edge of a footprint at a pixel, a ReLU, a null of the array) may lie within the longest, hardly within all."""
+RELATIVE, ROUNDING = 2e-5, 1e-5
+"""Tolerances: of the derivative and of the terms that it is the sum of; and what differences of sums over all pixels lose."""
 UNUSED = {
     "wideband": {".pattern_exponent"},
     "wrfgs": {".pattern_exponent", ".frequency_hz"},
@@ -68,9 +68,8 @@ def field_of(name):
         return as_float64(made)
 
 
-@cache
-def differentiated(name, unit="wavelengths"):
-    """The weighted sum of all pixels, and its gradient, jitted; the arrays' unit is part of their structure."""
+def total_of(name):
+    """The weighted sum of all pixels as a function, and the spectra."""
     field, position = field_of(name), jnp.asarray(np.array(RX))
     limits = LIMITS if name in ("wideband", "wrfgs") else None
 
@@ -81,13 +80,26 @@ def differentiated(name, unit="wavelengths"):
         spectra = fields.pas(field, params, receiver, query, limits)
         return jnp.sum(spectra * weights), spectra
 
-    return jax.jit(jax.value_and_grad(total, has_aux=True))
+    return total
+
+
+@cache
+def differentiated(name, unit="wavelengths"):
+    """The weighted sum and its gradient, jitted; the unit of the array is part of the arguments' structure."""
+    return jax.jit(jax.value_and_grad(total_of(name), has_aux=True))
+
+
+@cache
+def evaluated(name):
+    """The weighted sum alone. All but one are compiled with their gradients already, and evaluated in no time."""
+    return jax.jit(total_of(name)) if name == "nerf2" else lambda *arguments: differentiated(name)(*arguments)[0]
 
 
 def random_arguments(rng, name):
     """(params, receiver, query) as NumPy arrays: nothing is zero by its initialiser, and nothing is compiled to have them."""
     field = field_of(name)
-    params = jax.tree.map(lambda a: rng.normal(0, 0.3, a.shape), jax.eval_shape(field.init, jax.random.key(0)))
+    spread = 0.6 if name == "nerf2" else 0.3
+    params = jax.tree.map(lambda a: rng.normal(0, spread, a.shape), jax.eval_shape(field.init, jax.random.key(0)))
     if name.startswith("wave"):
         start = np.log([3.0, 0.02, np.e, 0.1])  # log susceptibility, log conductivity, slope, log thickness
         materials = params.materials
@@ -113,9 +125,9 @@ def ends_with(path, names):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
-    kind, function = name.split()[0], differentiated(name)
+    kind = name.split()[0]
     arguments, weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
-    (value, spectra), gradients = function(arguments, weights)
+    (value, spectra), gradients = differentiated(name)(arguments, weights)
     assert np.isfinite(float(value)) and np.asarray(spectra).std(axis=(1, 2)).min() > 1e-3
     leaves, structure = jax.tree.flatten(arguments)
     for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
@@ -127,7 +139,7 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
 
         def slope(step, i=i, direction=direction):
             moved = [[*leaves[:i], leaves[i] + t * direction, *leaves[i + 1 :]] for t in (step, -step)]
-            high, low = (float(function(jax.tree.unflatten(structure, m), weights)[0][0]) for m in moved)
+            high, low = (float(evaluated(name)(jax.tree.unflatten(structure, m), weights)[0]) for m in moved)
             return (high - low) / (2 * step)
 
         if ends_with(path, UNUSED[kind]):
@@ -138,10 +150,14 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
             assert abs(exact) < 1e-9 and abs(slope(1e-3)) < 1e-7, where
             continue
         assert gradient.any(), where
-        found = [slope(STEPS[0])]
-        if abs(found[0] - exact) > TOLERANCE * (abs(exact) + magnitude):
-            found.append(slope(STEPS[1]))
-        assert any(abs(one - exact) <= TOLERANCE * (abs(exact) + magnitude) for one in found), (where, exact, found)
+        tolerance = RELATIVE * (abs(exact) + magnitude) + ROUNDING
+        found = []
+        for step in STEPS:
+            found.append(slope(step))
+            if abs(found[-1] - exact) < tolerance:
+                break
+        else:
+            pytest.fail(f"{where}: {exact}, finite differences {found}")
 
 
 @pytest.mark.parametrize("name", ["wideband", "wrfgs"])
@@ -214,7 +230,7 @@ def test_an_array_in_metres_is_one_in_wavelengths_at_its_design_frequency(rng, x
         jax.tree.leaves((d_params, same, d_query.tx_position)),
         strict=True,
     ):
-        scale = np.abs(want).max() + 1e-6
+        scale = np.abs(want).max() + 1e-3
         np.testing.assert_allclose(got / scale, want / scale, atol=1e-8, err_msg=jax.tree_util.keystr(path))
 
 

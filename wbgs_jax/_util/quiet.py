@@ -4,6 +4,7 @@ XLA logs errors about tuning flags of cached programs, which are of no consequen
 loaded. In any other process nothing is changed.
 """
 
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -11,7 +12,9 @@ from pathlib import Path
 
 def is_command_line() -> bool:
     """Returns whether this process runs `wbgs-jax` or `python -m wbgs_jax...`."""
-    return any(word == "wbgs_jax" or word.startswith("wbgs_jax.") or Path(word).name == "wbgs-jax" for word in sys.orig_argv)
+    modules = [word for option, word in itertools.pairwise(sys.orig_argv) if option == "-m"]
+    scripts = [Path(word).stem for word in sys.argv[:1]]
+    return any(word == "wbgs_jax" or word.startswith("wbgs_jax.") for word in modules) or scripts == ["wbgs-jax"]
 
 
 if is_command_line():

@@ -287,11 +287,18 @@ def _new_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def main() -> None:
+USAGE = "usage: wbgs-jax layout SCENE.npz FOLDER"
+
+
+def main(arguments: list[str] | None = None) -> None:
     """Entry point: a scene file becomes a folder of the published layout."""
-    if len(sys.argv) != 3:
-        raise UserError("usage: python -m wbgs_jax.data.layout SCENE.npz FOLDER")
-    export_layout(load_scene(sys.argv[1]), sys.argv[2])
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(arguments):
+        print(f"{USAGE}\n\nWrite a scene file as a folder of the published layout (docs/formats.md).")
+        return
+    if len(arguments) != 2:
+        raise UserError(USAGE)
+    export_layout(load_scene(arguments[0]), arguments[1])
 
 
 if __name__ == "__main__":

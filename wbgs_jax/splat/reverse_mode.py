@@ -7,6 +7,7 @@ the identity, and cost nothing when code runs.
 from typing import Any, NoReturn
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
@@ -22,14 +23,14 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 
 _tangent = Primitive("reverse_mode_only")
-"""(x, tangent of x) -> the tangent. Reverse mode transposes it away; forward mode comes to evaluate it, to compile it, or to map
+"""(x, its tangent) -> the tangent. Reverse mode transposes it away; forward mode comes to evaluate it, to compile it, or to map
 it over tangents of one x."""
 
 
 def _map(arguments: Any, axes: Any) -> Any:
     if axes[0] is batching.not_mapped:
         _refuse()
-    x, tangent = arguments[0], batching.moveaxis(arguments[1], axes[1], axes[0])
+    x, tangent = arguments[0], jnp.moveaxis(arguments[1], axes[1], axes[0])
     return _tangent.bind(x, tangent), axes[0]
 
 

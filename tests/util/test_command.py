@@ -1,0 +1,49 @@
+"""What command lines share: errors as one line and an exit code, options that are looked at first."""
+
+import pytest
+
+from wbgs_jax._util.command import option_value, run_command, say
+from wbgs_jax._util.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (UserError("no such scene; give another"), 2, "error: no such scene; give another\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+)
+def test_what_stops_a_command_is_one_line_and_an_exit_code(capsys, error, code, line):
+    def main():
+        raise error
+
+    with pytest.raises(SystemExit) as stopped:
+        run_command(main)
+    assert stopped.value.code == code
+    assert capsys.readouterr() == ("", line)
+
+
+def test_mistakes_of_the_program_are_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        run_command(lambda: 1 / 0)
+
+
+def test_lines_for_people_leave_stdout_alone(capsys):
+    say("12 spectra")
+    assert capsys.readouterr() == ("", "12 spectra\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "wideband"),
+        (["--seed", "1"], "wideband"),
+        (["--field", "wave"], "wave"),
+        (["--field=wave", "--seed", "1"], "wave"),
+        (["--field", "wave", "--field=nerf2"], "nerf2"),
+        (["--field"], ""),
+        (["--fields", "wave"], "wideband"),
+    ],
+)
+def test_the_value_of_an_option_that_is_looked_at_first(arguments, expected):
+    assert option_value(arguments, "--field", "wideband") == expected
