@@ -90,9 +90,7 @@ FIELDS = {
         gaussians=60, width=8, depth=2, skip=1, radiance_widths=(8,), gaussian_octaves=2, tx_octaves=2, frequency_octaves=2
     ),
     "nerf2": Nerf2Config(samples=3, directions=12, width=8, depth=2, skip=1, radiance_widths=(8,), point_octaves=2),
-    "wave": WaveConfig(
-        mirror_areas=(0.0, 0.0), specular_tried=64, specular_kept=32, diffracted_tried=32, diffracted_kept=16
-    ),
+    "wave": WaveConfig(mirror_areas=(0.0, 0.0), specular_tried=64, specular_kept=32, diffracted_tried=32, diffracted_kept=16),
 }
 FIELDS["wrfgs"] = without_frequency(FIELDS["wideband"])
 

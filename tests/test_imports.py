@@ -1,6 +1,7 @@
-"""Importing the library, or any of its names and modules, changes nothing in the process: other programs have their own ways."""
+"""Importing the library, or any of its names and modules, changes nothing in the process."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,9 @@ import importlib, json, logging, os, pkgutil, signal, sys, warnings
 LOGGERS = (None, "absl", "asyncio", "jax", "matplotlib", "orbax")
 
 
+options = []
+
+
 def state():
     jax, backend = sys.modules.get("jax"), "not loaded"
     if "matplotlib" in sys.modules:
@@ -27,8 +31,8 @@ def state():
         "logging": [logging.root.manager.disable, repr(logging.getLoggerClass())],
         "signals": {str(number): repr(signal.getsignal(number)) for number in signal.valid_signals()},
         "hooks": [repr(hook) for hook in (sys.excepthook, sys.displayhook, sys.unraisablehook)],
-        "place": [os.getcwd(), list(sys.path), os.umask(os.umask(0o022) or 0o022)],
-        "jax": {name: repr(value) for name, value in jax.config.values.items()} if jax else {},
+        "place": [os.getcwd(), list(sys.path)],
+        "jax": {name: repr(jax.config.values[name]) for name in options} if jax else {},
         "pyplot": "matplotlib.pyplot" in sys.modules,
         "backend": backend,
     }
@@ -42,9 +46,13 @@ report, before = {}, state()
 import wbgs_jax
 
 report["import wbgs_jax"] = changes(before, state())
+import wbgs_jax._util.quiet
+
+report["before JAX is loaded"] = changes(before, state())
 report["loaded"] = sorted({"jax", "numpy", "matplotlib", "orbax", "tyro"} & set(sys.modules))
 import jax, matplotlib  # which change a little themselves
 
+options = list(jax.config.values)  # its modules know more of them
 before = state()
 for name in wbgs_jax.__all__:
     getattr(wbgs_jax, name)
@@ -61,14 +69,15 @@ print(json.dumps(report))
 @pytest.fixture(scope="module")
 def report():
     """What every import changed, in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=False)
+    environment = {key: value for key, value in os.environ.items() if key != "TF_CPP_MIN_LOG_LEVEL"}
+    done = subprocess.run([sys.executable, "-c", PROBE], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return json.loads(done.stdout)
 
 
 def test_importing_the_package_loads_and_changes_nothing(report):
-    assert report["import wbgs_jax"] == {}
+    assert report["import wbgs_jax"] == report["before JAX is loaded"] == {}
     assert report["loaded"] == []
 
 

@@ -14,7 +14,6 @@ from wbgs_jax.config import PRESETS, LoopConfig, OptimConfig, Settings, changed
 from wbgs_jax.fields import Field, Group, Observation, base, register
 from wbgs_jax.fields.base import with_field
 
-
 GROWING = tiny_settings(
     field={"network_lr": 1.5e-2, "means_lr": 1e-2, "log_scales_lr": 3e-2, "opacity_lr": 0.1},
     density={"every": 4, "start": 4, "stop_fraction": 0.5, "gradient_threshold": 0.0, "max_gaussians": 90, "reset_every": 4},

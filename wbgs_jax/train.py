@@ -19,7 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS, Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import default_field, get_field
-from wbgs_jax.training.loop import TrainResult, train
+from wbgs_jax.training.loop import TrainResult, check_data, train
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 PROGRAM = "wbgs-jax train"
@@ -130,6 +130,7 @@ def main(arguments: list[str] | None = None) -> None:
     command, settings = parse(sys.argv[1:] if arguments is None else arguments)
     config = run_config(command, settings)
     dataset = config.dataset()
+    check_data(dataset, get_field(config.field))
     folder = command.out or default_folder(dataset, config)
     prepare_folder(folder, config, command.resume)
     counts = f"{len(dataset.train)} spectra, {len(dataset.test)} held out"

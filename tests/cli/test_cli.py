@@ -1,4 +1,4 @@
-"""The console script, and what the commands say of themselves: help that fits a screen, settings of one field, clear refusals."""
+"""The console script, and what commands say of themselves: help that fits a screen, settings of one field, refusals."""
 
 import re
 

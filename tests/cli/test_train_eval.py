@@ -226,7 +226,9 @@ def test_run_folders_that_cannot_be_used(tmp_path, scene):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("mine")
     for folder in ("file", "file/below", "other"):
-        assert_error_for_people(call(train_command.main, "--scene", scene, "--out", tmp_path / folder, *TINY), tmp_path / folder)
+        assert_error_for_people(
+            call(train_command.main, "--scene", scene, "--out", tmp_path / folder, *TINY), tmp_path / folder
+        )
     assert (tmp_path / "file").read_text() == "mine"
     assert [path.name for path in (tmp_path / "other").iterdir()] == ["notes.txt"]
 

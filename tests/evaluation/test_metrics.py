@@ -92,7 +92,7 @@ def test_nothing_to_score():
 def test_powers_are_scored_in_decibels():
     truth = np.array([-60.0, -70, -80, -90])
     frequencies = np.array([1e9, 94e9, 1e9, 1e9])
-    report = score_power((truth + [1, -7, 2, -4]).astype(np.float32), truth, frequencies)
+    report = score_power((truth + np.array([1, -7, 2, -4])).astype(np.float32), truth, frequencies)
     assert report == {
         "n": 4,
         "power_error_db": 3.0,

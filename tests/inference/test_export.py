@@ -22,6 +22,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.predictor import predictor
 
+
 @pytree
 class BrokenField(RippleField):
     """Renders nothing."""

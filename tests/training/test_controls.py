@@ -142,7 +142,10 @@ def host(tree):
 
 
 def test_controls_are_what_their_protocol_says():
-    for made in (*(make(config) for make, config in zip(loop.CONTROLS.values(), (DENSITY, SEARCH), strict=True)), Growing(DENSITY)):
+    for made in (
+        *(make(config) for make, config in zip(loop.CONTROLS.values(), (DENSITY, SEARCH), strict=True)),
+        Growing(DENSITY),
+    ):
         assert isinstance(made, Control)
         assert hash(made) == hash(dataclasses.replace(made))
 

@@ -21,9 +21,7 @@ from wbgs_jax.training.step import TrainState
 from wbgs_jax.types import Gaussians
 
 STEP, SLOTS = 7, 64
-CONFIG = DensityConfig(
-    every=STEP, start=1, gradient_threshold=1.0, split_scale=0.5, prune_attenuation=0.005, max_gaussians=100
-)
+CONFIG = DensityConfig(every=STEP, start=1, gradient_threshold=1.0, split_scale=0.5, prune_attenuation=0.005, max_gaussians=100)
 OPTIMIZER = make_optimizer(WidebandField, GROWING.field, GROWING.optim)
 CALM, CLONED, SPLIT, USELESS, UNSEEN, DEAD = range(6)  # the Gaussians of `state`
 

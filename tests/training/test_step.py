@@ -270,9 +270,7 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
     """The loss alone can look healthy: its value is finite, its derivative is not."""
     run = new_run(dataset, tmp_path, "cusp")
     before = snapshot(run.state)
-    (loss, _), _ = jax.jit(loss_and_gradients)(
-        run.field, run.state.params, run.cache, run.data, jnp.arange(2), None, run.key
-    )
+    (loss, _), _ = jax.jit(loss_and_gradients)(run.field, run.state.params, run.cache, run.data, jnp.arange(2), None, run.key)
     assert np.isfinite(loss)
     state, report = epoch(run, before, run.batches(0, LENGTH))
     assert bool(report.stopped) and int(report.good_steps) == 0 and not report.overflow

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import jax
+
 from wbgs_jax._util.compilation import VARIABLE, use_compilation_cache
 
 PROGRAM = """
@@ -41,4 +43,9 @@ def test_it_can_be_switched_off_and_jax_has_its_own_say(tmp_path):
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "cache"))
-    assert use_compilation_cache() is None
+    own = jax.config.jax_compilation_cache_dir  # that of the tests
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        assert use_compilation_cache() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", own)

@@ -28,7 +28,7 @@ it over tangents of one x."""
 
 
 def _map(arguments: Any, axes: Any) -> Any:
-    if axes[0] is batching.not_mapped:
+    if axes[0] is None:  # x is not mapped: forward mode over several tangents
         _refuse()
     x, tangent = arguments[0], jnp.moveaxis(arguments[1], axes[1], axes[0])
     return _tangent.bind(x, tangent), axes[0]

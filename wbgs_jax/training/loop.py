@@ -22,7 +22,7 @@ from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
-from wbgs_jax.fields import Field, from_arrays, get_field
+from wbgs_jax.fields import Field, field_names, from_arrays, get_field
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.controls import Context, Control, Edit
 from wbgs_jax.training.data import TrainingData, training_data
@@ -221,6 +221,17 @@ def _is_masked(node: Any) -> bool:
     return isinstance(node, optax.MaskedNode)
 
 
+def check_data(dataset: Dataset, field: type[Field]) -> None:
+    """Raises a `UserError` for data that a field cannot be trained on, before any work is done."""
+    if len(dataset.train) == 0:
+        raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    if dataset.kind == "power" and "power" not in field.gives:
+        able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)
+        raise UserError(
+            f"{dataset.name} holds received powers, of which the {field.name} field knows nothing; choose one of: {able}"
+        )
+
+
 def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:
     """Trains a field, by its name, and leaves checkpoints and curves in `folder`.
 
@@ -230,8 +241,7 @@ def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: P
         Interrupted: Ctrl-C; the state is saved.
         KeyboardInterrupt: Ctrl-C in the last epoch; the state is saved, and nothing is left to train.
     """
-    if len(dataset.train) == 0:
-        raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    check_data(dataset, get_field(field))
     settings = limit_steps(settings, len(dataset.train))
     run = Run(dataset, field, settings, seed, folder)
     if resume:
