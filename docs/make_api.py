@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[1]
 STUB = ROOT / "wbgs_jax" / "__init__.pyi"
 HEAD = """# The public names
 
-Made from the docstrings by `make docs`; do not edit. `import wbgs_jax as wb` and use them as `wb.NAME`. Arrays are float32 unless
-it says otherwise; shapes stand in brackets, such as `(b, 90, 360)`.
+Made from the docstrings by `make docs`; do not edit. `import wbgs_jax as wb` and use them as `wb.NAME`. Arrays are float32
+unless it says otherwise; shapes stand in brackets, such as `(b, 90, 360)`.
 """
 TITLES = {
     "fields": "Fields",

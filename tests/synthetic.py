@@ -96,7 +96,7 @@ FIELDS["wrfgs"] = without_frequency(FIELDS["wideband"])
 
 
 def tiny_settings(field_name: str = "wideband", **changes) -> Settings:
-    """Settings that train within seconds; keywords replace values of a section: `field={"width": 4}`, `density={"every": 2}`."""
+    """Settings that train within seconds; keywords replace values of a section: `field={"width": 4}`."""
     controls = get_field(field_name).controls
     settings = Settings(
         field=FIELDS[field_name],
