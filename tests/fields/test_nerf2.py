@@ -171,12 +171,15 @@ def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
 
 
 def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path):
+    """With the settings of the other tests, to compile them once."""
     save_scene(tmp_path / "box.npz", tiny_scene())
-    tiny = "--nerf2.samples 2 --nerf2.width 8 --nerf2.directions 30 --optim.steps 20 --loop.evaluate-spectra 2"
-    command = f"--scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run {tiny}"
-    train_command.main(command.split())
+    values = vars(SETTINGS.field) | {"radiance_widths": 8, "relative": None}
+    flags = [f"--nerf2.{name.replace('_', '-')}={value}" for name, value in values.items() if value is not None]
+    flags += ["--optim.steps=60", "--optim.batch=2", "--optim.final-fraction=1.0", "--loop.evaluate-spectra=2"]
+    command = f"--scene {tmp_path}/box.npz --field nerf2 --preset smoke --out {tmp_path}/run --loop.epoch-steps=20"
+    train_command.main([*command.split(), *flags])
     trained = load_trained(tmp_path / "run")
-    assert trained.step == 20 and trained.config.settings.field.samples == 2
+    assert trained.step == 60 and trained.config.settings.field == SETTINGS.field
     dataset = trained.dataset()
     predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test[:2])
     assert predicted.shape == (2, *PAS_SHAPE) and np.isfinite(predicted).all()

@@ -42,6 +42,8 @@ def test_it_can_be_switched_off_and_jax_has_its_own_say(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
+    nothing_set = SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None))
+    monkeypatch.setattr(compilation, "jax", nothing_set)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "cache"))
     own = jax.config.jax_compilation_cache_dir  # that of the tests
     jax.config.update("jax_compilation_cache_dir", None)
