@@ -85,10 +85,8 @@ def total_of(name):
 
 @cache
 def differentiated(name, unit="wavelengths"):
-    """The weighted sum and its gradient, jitted; the unit of the array is part of the arguments' structure. What is evaluated
-    once is not optimised, and compiled in two thirds of the time."""
-    options = {"xla_backend_optimization_level": 0} if unit == "metres" else None
-    return jax.jit(jax.value_and_grad(total_of(name), has_aux=True), compiler_options=options)
+    """The weighted sum and its gradient, jitted; the unit of the array is part of the arguments' structure."""
+    return jax.jit(jax.value_and_grad(total_of(name), has_aux=True))
 
 
 @cache
