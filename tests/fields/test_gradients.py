@@ -5,7 +5,7 @@ fields have no forward mode, and the wave field none with respect to the positio
 """
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ from wbgs_jax._util.pytree import replaced, with_leaves
 from wbgs_jax.data.surface import surface_from_points
 from wbgs_jax.fields import get_field, wave, wideband
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
+from wbgs_jax.propagation.paths import Paths
+from wbgs_jax.propagation.slab import Slabs
+from wbgs_jax.propagation.transport import arrivals
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.types import Query, Receiver
@@ -173,6 +176,28 @@ def test_empty_slots_have_no_gradient(rng, x64, name):
 def test_materials_of_known_thickness_have_no_gradient_of_it(rng, x64):
     _, (params, _, _) = differentiated("wave")(random_arguments(rng, "wave"), rng.normal(size=(2, 90, 360)))
     assert (np.asarray(params.materials.log_thickness) != 0).tolist() == [True, False, True]
+
+
+def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
+    """Candidates without strength fill the list of paths up; their legs may have no length."""
+    field = field_of("wave")
+    plan = field.plan(
+        None, Receiver(*map(jnp.asarray, (np.array(RX), np.array([1.0, 0, 0, 0]), np.zeros((1, 3)), np.ones(()))))
+    )
+    slabs = Slabs(jnp.full(7, 4 - 0.1j), jnp.full(7, 0.1))
+    points = np.array([[[4.0, 3, 2], *[RX] * 4], [RX] * 5])
+    nothing = jnp.zeros((2, 5), jnp.int32)
+
+    @jax.jit
+    @partial(jax.grad, argnums=(0, 1))
+    def gradients(points, orientation):
+        paths = Paths(points, nothing, nothing, nothing, jnp.array([True, False]))
+        receiver = dataclasses.replace(plan.receiver, orientation=orientation)
+        return arrivals(paths, plan.search, slabs, jnp.asarray(3e9), receiver, diffracted=False).amplitude.real.sum()
+
+    for gradient in map(np.asarray, gradients(jnp.asarray(points), plan.receiver.orientation)):
+        assert np.isfinite(gradient).all() and gradient.any()
+        assert gradient.ndim == 1 or not gradient[1].any()
 
 
 def test_a_plan_from_outside_has_the_wrong_gradient(rng, x64):

@@ -3,9 +3,11 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 
+from wbgs_jax._util import compilation
 from wbgs_jax._util.compilation import VARIABLE, use_compilation_cache
 
 PROGRAM = """

@@ -4,10 +4,12 @@ The electric field is a complex vector across the ray, split at every slab into 
 plane of incidence. Antennas are vertically polarised: along theta-hat of their own frame. The time factor is exp(+j omega t).
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from wbgs_jax.propagation.edges import Edges
@@ -23,6 +25,8 @@ from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
 """Metres: legs that are shorter fill the places of reflections that a path does not have."""
+SOMEWHERE = np.arange(5)[:, None] * np.array([0.3, 0.5, 0.7])
+"""Points (metres) of what is no path, on a line that no edge or normal is along."""
 
 
 class _Legs(NamedTuple):
@@ -62,6 +66,8 @@ def arrivals(
         receiver: whose array stands where the paths end.
         diffracted: whether every path has one diffraction, or none has any; static under `jax.jit`.
     """
+    # What is no path may have legs of no length, and their direction no derivative.
+    paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, SOMEWHERE))
     legs = _legs(paths)
     field = zenith_vector(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
