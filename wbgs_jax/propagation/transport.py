@@ -67,7 +67,8 @@ def arrivals(
         diffracted: whether every path has one diffraction, or none has any; static under `jax.jit`.
     """
     # What is no path may have legs of no length, and their direction no derivative.
-    paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, SOMEWHERE))
+    somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
+    paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
     legs = _legs(paths)
     field = zenith_vector(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
