@@ -65,7 +65,8 @@ def execute(job: Job, folder: Path, may_go_on: Callable[[], None] = lambda: None
 def part(job: Job, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: Callable[[], None]) -> Part:
     """Train one model and score it, unless that is done."""
     trained_ghz = job.train_ghz if job.combination else ()
-    config = RunConfig(job.scene, job.field, PROFILES[job.profile].preset, job.seed, None, chosen, trained_ghz)
+    preset = PROFILES[job.profile].preset
+    config = RunConfig(job.scene, job.field, preset, job.seed, None, chosen, trained_ghz, validation=0.0)
     prepare_folder(folder, config, resume=True)  # refuses what other settings have begun
     done = folder / "part.npz"
     if done.exists():

@@ -16,7 +16,7 @@ from experiments.paper import COMBINATIONS, DENSE_SCENE, GHZ_10, GHZ_21, SCENES
 from experiments.profiles import PROFILES, SCORED_SLOW, TABLE_PROFILES
 from experiments.variants import VARIANTS
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.splits import select_frequencies, unseen_frequencies
+from wbgs_jax.data.splits import hold_out_validation, select_frequencies, unseen_frequencies
 
 SEEDS = (0, 1, 2)
 """Of the headline rows."""
@@ -99,6 +99,8 @@ class Job:
     def dataset(self) -> Dataset:
         """Returns the scene with this job's training and test spectra."""
         dataset = load_dataset(self.scene)
+        if PROFILES[self.profile].validation:
+            dataset = validation_as_test(dataset)
         if displacement := VARIANTS[self.variant].displacement:
             dataset = displaced(dataset, displacement, self.seed)
         if self.all_tx:
@@ -124,6 +126,12 @@ def some_test_transmitters(dataset: Dataset, count: int | None) -> Dataset:
     known = np.unique(dataset.tx_index[dataset.test])
     chosen = np.random.default_rng([0, 5]).permutation(known)[:count]
     return dataclasses.replace(dataset, test=dataset.test[np.isin(dataset.tx_index[dataset.test], chosen)])
+
+
+def validation_as_test(dataset: Dataset) -> Dataset:
+    """Returns the data set with the validation part in the place of the test, which is gone."""
+    held = hold_out_validation(dataset)
+    return dataclasses.replace(held, validation=held.validation[:0], test=held.validation)
 
 
 def displaced(dataset: Dataset, metres: float, seed: int) -> Dataset:

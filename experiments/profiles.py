@@ -22,6 +22,8 @@ class Profile:
     """... and by field, of its own settings."""
     scored_tx: int | None = None
     """Transmitters that are scored; None: all that are held out."""
+    validation: bool = False
+    """Whether it makes a choice: the validation part is scored, and the test is not looked at."""
 
 
 SCORED_SLOW = 24
@@ -48,6 +50,7 @@ PROFILES = {
     ),
     # Of the series, each its own.
     "tuning": Profile("cpu", 1000, 600, **QUICK, scored_tx=SCORED_SLOW),
+    "schedules": Profile("cpu", 2000, 600, validation=True),
     "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
     "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
 }

@@ -66,6 +66,21 @@ GAUSSIANS_AND_NETWORKS = {
     "weight_decay_0.1": _of_field(network_weight_decay=0.1),
     "fixed_means": _of_field(means_lr=0.0),
 }
+SCHEDULES = {
+    "warm_8e-3": Variant({"field": {"network_lr": 8e-3}, "optim": {"warmup": 0.1}}),
+    "warm_1.6e-2": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1}}),
+    "warm_2.4e-2": Variant({"field": {"network_lr": 2.4e-2}, "optim": {"warmup": 0.1}}),
+    "warm_1.6e-2_to_0": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1, "final_fraction": 1e-3}}),
+    "warm_1.6e-2_gaussians": Variant(
+        {
+            "field": {"network_lr": 1.6e-2, "means_lr": 3e-3, "log_scales_lr": 1.5e-2, "quats_lr": 3e-3, "opacity_lr": 7.5e-2},
+            "optim": {"warmup": 0.1},
+        }
+    ),
+    "warm_1.6e-2_batch_4": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1, "batch": 4}}, steps=4000),
+    "steps_6000": Variant(steps=6000),
+}
+"""How fast, and how long."""
 VOLUME = {
     "l2": _of_field(pixel_loss="l2"),
     "directions_384": _of_field(directions=384),
@@ -92,4 +107,4 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | VOLUME | COHERENT

@@ -154,10 +154,10 @@ def test_its_data_are_split_by_transmitter_and_its_batches_are_of_one_receiver(t
     assert [len(part) for part in parts] == [5, 1, 3] and len(set.union(*parts)) == N_TX
     assert all(len(dataset.receiver_index[part]) % n_rx == 0 for part in (dataset.train, dataset.validation, dataset.test))
     again = Run(dataset, "toy", run.config.settings, 0, tmp_path)
-    batches = again.batches(0, 30)
+    batches = again.numbers[again.batches(0, 30)]
     assert (np.ptp(dataset.receiver_index[batches], axis=1) == 0).all() and set(batches.ravel()) <= set(dataset.train)
     assert set(dataset.receiver_index[batches].ravel()) == set(range(n_rx))
-    assert set(again.watched) <= set(dataset.validation)
+    assert set(again.numbers[again.watched]) <= set(dataset.validation)
 
 
 @pytest.mark.parametrize(("kind", "n_rx"), KINDS)

@@ -15,7 +15,7 @@ from wbgs_jax._util.errors import UserError
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Steps, batches and schedules; every learning rate decays by a cosine to `final_fraction` of itself."""
+    """Steps, batches and schedules; after a warm-up every learning rate decays by a cosine to `final_fraction` of itself."""
 
     steps: int = 6000
     """Upper bound; see `max_epochs`."""
@@ -25,6 +25,8 @@ class OptimConfig:
     """... but get at least this many steps."""
     batch: int = 8
     """Links a step."""
+    warmup: float = 0.0
+    """Share of the steps over which every learning rate rises to its full value."""
     final_fraction: float = 0.01
     """What is left of every learning rate at the end."""
     curriculum: float = 0.0

@@ -18,6 +18,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS, Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, get_field
 from wbgs_jax.training.loop import TrainResult, check_data, train
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
@@ -49,8 +50,8 @@ class Command:
     """Train at these frequencies alone; the evaluation asks for the others (held-out transmitters, unseen frequencies)."""
     train_tx: int = 0
     """Train with this number of transmitters; 0: all that are not held out."""
-    validation: float = 0.0
-    """Share of the training transmitters that is held out for the curves and for choices, beside the test transmitters."""
+    validation: float = VALIDATION
+    """Share of the training transmitters that the curves watch and choices are made by, where the data name none; 0: none."""
     receiver: int | None = None
     """Look at this receiver alone, of data that have several."""
 
@@ -133,7 +134,7 @@ def main(arguments: list[str] | None = None) -> None:
     check_data(dataset, get_field(config.field))
     folder = command.out or default_folder(dataset, config)
     prepare_folder(folder, config, command.resume)
-    counts = f"{len(dataset.train)} spectra, {len(dataset.test)} held out"
+    counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
     result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
     say(summary(result, folder))

@@ -20,7 +20,7 @@ def measure(report: Report, effort: Effort) -> None:
     say(f"queries: {count} in blocks of {BLOCK}")
     with tempfile.TemporaryDirectory() as folder:
         run = start_run(effort, Path(folder))
-    index = np.random.default_rng(effort.seed).choice(run.dataset.test, count)
+    index = np.random.default_rng(effort.seed).choice(run.dataset.validation, count)
     blocks = [run.dataset.query(np.resize(index[i : i + BLOCK], BLOCK)) for i in range(0, count, BLOCK)]
     single = run.dataset.query(index[:1])
     plan = run.field.plan(run.state.params, run.dataset.receiver())

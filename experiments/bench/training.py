@@ -20,6 +20,7 @@ from experiments.profiles import TINY
 from wbgs_jax._util.command import say
 from wbgs_jax.config import Settings, changed, limit_steps
 from wbgs_jax.data import load_dataset
+from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
@@ -45,7 +46,7 @@ def settings(effort: Effort) -> Settings:
 
 def start_run(effort: Effort, folder: Path, epoch_steps: int | None = None) -> Run:
     """A training of scene 1 before its first step."""
-    dataset = load_dataset(1)
+    dataset = hold_out_validation(load_dataset(1))
     chosen = limit_steps(settings(effort), len(dataset.train))
     if epoch_steps:
         chosen = changed(chosen, {"loop": {"epoch_steps": epoch_steps}})

@@ -139,7 +139,8 @@ def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tm
         assert reports[part]["part"] == part and reports[part]["n"] == len(getattr(split, part))
     (watched,) = [entry for entry in curves.read(run / "metrics.jsonl") if "held_out_ssim" in entry]
     trained = load_trained(run)
-    chosen = Run(split, "ripple", trained.config.settings, 0, run).watched
+    training = Run(split, "ripple", trained.config.settings, 0, run)
+    chosen = training.numbers[training.watched]
     assert watched["step"] == 4 and len(chosen) == 2 and set(chosen) <= set(split.validation)
     assert watched["held_out_ssim"] == pytest.approx(
         watch(trained.field, trained.params, split, chosen)["held_out_ssim"], abs=1e-6
@@ -155,7 +156,9 @@ def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tm
     assert "validation SSIM" in people.out
 
 
-def test_a_part_that_there_is_not(run):
+def test_a_part_that_there_is_not(tmp_path, scene):
+    run = train_and_check(tmp_path / "run", "--scene", scene, "--validation", 0, *TOY)
+    assert not any("held_out_ssim" in entry for entry in curves.read(run / "metrics.jsonl"))  # nothing that it could watch
     result = call(eval_command.main, "--run", run, "--part", "validation")
     assert_error_for_people(result, "box has no validation spectra")
     assert not (run / "eval_validation.json").exists()

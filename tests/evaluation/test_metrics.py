@@ -8,6 +8,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.evaluation.beams import angle_error_deg, beam_loss_db
 from wbgs_jax.evaluation.metrics import PSNR_LIMIT_DB, mae, psnr_db, score, score_power, ssim
 
 
@@ -58,15 +59,29 @@ def test_the_report_holds_every_frequency(pair):
     assert report["mean_ssim"] == np.mean(values)
     assert report["psnr_db"] == np.median(psnr_db(predicted, truth))
     assert report["mae"] == np.mean(mae(predicted, truth))
+    assert report["p5_ssim"] == np.percentile(values, 5) <= report["p10_ssim"] == np.percentile(values, 10)
+    assert report["angle_error_deg"] == np.median(angle_error_deg(predicted, truth))
+    assert report["beam_loss_db"] == np.mean(beam_loss_db(predicted, truth)) > report["beam_loss_top3_db"] > 0
     rows = report["per_frequency"]
     assert [(row["frequency_ghz"], row["n"]) for row in rows] == [(1.0, 3), (2.4, 2), (94.0, 3)]
     for row in rows:
         at = frequencies == row["frequency_ghz"] * 1e9
         alone = score(predicted[at], truth[at], frequencies[at])
-        assert {key: row[key] for key in ("median_ssim", "mean_ssim", "psnr_db", "mae")} == {
-            key: alone[key] for key in ("median_ssim", "mean_ssim", "psnr_db", "mae")
+        assert row == {name: value for name, value in alone.items() if name != "per_frequency"} | {
+            "frequency_ghz": row["frequency_ghz"]
         }
     assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_what_the_receiver_sees_is_scored_apart(pair):
+    predicted, truth = pair
+    sight, frequencies = np.array([True, False] * 4), np.full(8, 1e9)
+    report = score(predicted, truth, frequencies, sight)
+    for name, chosen in (("in_sight", sight), ("out_of_sight", ~sight)):
+        alone = score(predicted[chosen], truth[chosen], frequencies[chosen])
+        assert report[name] == {key: value for key, value in alone.items() if key != "per_frequency"}
+    assert "out_of_sight" not in score(predicted, truth, frequencies, np.ones(8, bool))
+    assert "in_sight" not in score(predicted, truth, frequencies)
 
 
 def test_better_predictions_score_better(pair):

@@ -13,6 +13,7 @@ from toys import RippleConfig, RippleField
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.sight import in_sight
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
@@ -84,12 +85,13 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
     seen = observe_links(knowing.field, knowing.params, dataset, dataset.test)
     np.testing.assert_array_equal(predicted, seen.pas)
     truth, frequencies = np.asarray(dataset.pas(dataset.test)), dataset.frequencies_hz[dataset.test]
-    for key, value in metrics.score(predicted, truth, frequencies).items():
+    sight = in_sight(dataset, dataset.test)
+    for key, value in metrics.score(predicted, truth, frequencies, sight).items():
         assert report[key] == value
     for key, value in score_snapshots(seen.snapshots, dataset.snapshots[dataset.test]).items():
         assert report[key] == value
     assert report["baselines"].keys() == baselines(dataset).keys()
-    nearest = metrics.score(baselines(dataset)["nearest_tx"](dataset.test), truth, frequencies)
+    nearest = metrics.score(baselines(dataset)["nearest_tx"](dataset.test), truth, frequencies, sight)
     assert report["baselines"]["nearest_tx"] == nearest
     assert report["ms_per_pas"] > 0 and report["ms_per_pas_single"] > 0
     json.dumps(report, allow_nan=False)

@@ -9,7 +9,7 @@ import signal
 import jax
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
+from synthetic import tiny_dataset, tiny_settings
 from toys import GROWING, RippleField, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
@@ -34,7 +34,7 @@ def toys():
 
 @pytest.fixture(scope="module")
 def dataset():
-    return tiny_dataset()
+    return hold_out_validation(tiny_dataset(), 0.25)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,8 @@ def test_data_without_training_or_test_spectra(dataset, tmp_path):
     with pytest.raises(UserError, match="box has no training spectra"):
         train(dataclasses.replace(dataset, train=dataset.train[:0]), *PLAIN, 0, tmp_path / "untrained")
     assert not (tmp_path / "untrained").exists()
-    train(dataclasses.replace(dataset, test=dataset.test[:0]), *PLAIN, 0, tmp_path / "unwatched")
+    neither = dataclasses.replace(dataset, test=dataset.test[:0], validation=dataset.validation[:0])
+    train(neither, *PLAIN, 0, tmp_path / "unwatched")
     assert not any("held_out_ssim" in entry for entry in metrics_of(tmp_path / "unwatched"))
 
 
@@ -229,19 +230,30 @@ def test_training_in_a_thread(dataset, tmp_path):
         assert pool.submit(train, dataset, *PLAIN, 0, tmp_path).result().steps == STEPS
 
 
-def test_curves_watch_the_validation_part_where_there_is_one(dataset, tmp_path):
+def test_curves_watch_the_validation_part_or_nothing(dataset, tmp_path):
+    assert len(Run(tiny_dataset(), *PLAIN, 0, tmp_path).watched) == 0
     run = Run(dataset, *PLAIN, 0, tmp_path)
-    assert len(run.watched) == 2 and set(run.watched) <= set(dataset.test.tolist())
-    split = hold_out_validation(dataset, 0.25)
-    run = Run(split, *PLAIN, 0, tmp_path)
-    assert len(run.watched) == 2 and set(run.watched) <= set(split.validation.tolist())
-    assert run.evaluate() == watch(run.field, run.state.params, split, run.watched)
-    assert set(run.batches(0, 50).ravel()) <= set(split.train.tolist())
+    watched = run.numbers[run.watched]
+    assert len(watched) == 2 and set(watched) <= set(dataset.validation.tolist())
+    assert run.evaluate() == watch(run.field, run.state.params, dataset, watched)
+    assert set(run.numbers[run.batches(0, 50).ravel()]) <= set(dataset.train.tolist())
+
+
+@pytest.mark.parametrize("field", ["wideband", "nerf2", "wave"])
+def test_nothing_of_a_training_looks_at_the_test(dataset, tmp_path, field):
+    """What is held out, place and spectrum, may be anything: field, cache, data and batches are the same to the last bit."""
+    heard, places = dataset.snapshots.copy(), dataset.tx_positions.copy()
+    heard[dataset.test], places[dataset.test] = np.nan, 1e3
+    poisoned = dataclasses.replace(dataset, snapshots=heard, tx_positions=places)
+    runs = [Run(data, field, tiny_settings(field), 0, tmp_path) for data in (dataset, poisoned)]
+    seen = [(run.field, run.state, run.cache, run.data, run.batches(0, 3), run.watched) for run in runs]
+    for a, b in zip(*map(jax.tree.leaves, seen), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_curriculum_starts_with_low_frequencies_and_ends_with_all(dataset, tmp_path):
     run = Run(dataset, "ripple", toy_settings(optim={"curriculum": 0.5}), 0, tmp_path)
-    highest = [dataset.frequencies_hz[run.pool(progress)].max() for progress in (0.0, 0.26, 0.49, 0.5, 1.0)]
+    highest = [run.dataset.frequencies_hz[run.pool(progress)].max() for progress in (0.0, 0.26, 0.49, 0.5, 1.0)]
     assert highest == [1e9, 10e9, 10e9, 94e9, 94e9]
-    np.testing.assert_array_equal(run.pool(0.5), dataset.train)
+    np.testing.assert_array_equal(run.numbers[run.pool(0.5)], dataset.train)
     assert set(run.batches(0, 20).ravel()) <= set(run.pool(0.0))

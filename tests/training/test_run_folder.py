@@ -95,7 +95,7 @@ def test_no_checkpoint_yet(tmp_path):
 def test_difference_names_the_first_setting():
     assert difference(CONFIG, CONFIG) == ""
     assert difference(CONFIG, dataclasses.replace(CONFIG, seed=4)) == "seed: 3, not 4"
-    assert difference(CONFIG, dataclasses.replace(CONFIG, validation=0.1)) == "validation: 0.0, not 0.1"
+    assert difference(CONFIG, dataclasses.replace(CONFIG, validation=0.2)) == "validation: 0.1, not 0.2"
     settings = changed(CONFIG.settings, {"optim": {"batch": 99}})
     changed_batch = difference(CONFIG, dataclasses.replace(CONFIG, settings=settings))
     assert changed_batch == f"settings.optim.batch: {CONFIG.settings.optim.batch}, not 99"

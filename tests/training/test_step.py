@@ -226,12 +226,15 @@ def test_tile_lists_that_overflow_in_the_middle_of_an_epoch(tmp_path, dataset):
     splats = jax.jit(project)(start().state.params.gaussians, dataset.receiver())
     exact = TileLimits(int(build_tile_jobs(splats, TINY).required_entries), 1024)
     short, probe = start(exact), start(exact)
-    _, report = epoch(probe, probe.state, probe.batches(0, LENGTH))
+    batches = probe.batches(0, LENGTH)
+    good, report = epoch(probe, probe.state, batches)
     assert bool(report.overflow) and 0 < int(report.good_steps) < LENGTH
     figures = short.epoch()
+    # Bit for bit where both parts ran with the same limits; other limits sum in another order, and Adam makes much of it.
+    expected, _ = epoch(start(short.limits), good, batches, int(report.good_steps))
+    assert_equal_states(short.state, expected)
     roomy = start(short.limits)
-    assert roomy.epoch() == figures and roomy.compilations < short.compilations
-    assert_equal_states(short.state, roomy.state)
+    assert roomy.epoch() == pytest.approx(figures, rel=1e-3) and roomy.compilations < short.compilations
 
 
 def broken(dataset, factor=np.nan, index=slice(None)):
@@ -246,11 +249,11 @@ def test_a_spectrum_that_is_not_a_number_stops_with_the_last_good_state(tmp_path
     batches = run.batches(0, LENGTH)
     bad = next(int(i) for i in batches[2] if i not in batches[:2])
     run.save()
-    run.data = training_data(broken(dataset, index=bad))
+    run.data = training_data(broken(run.dataset, index=bad))
     with pytest.raises(UserError) as error:
         run.epoch()
     message = str(error.value)
-    assert "\n" not in message and "step 2" in message and str(batches[2].tolist()) in message
+    assert "\n" not in message and "step 2" in message and str(run.numbers[batches[2]].tolist()) in message
     assert str(tmp_path / "checkpoints" / "0") in message
     assert run.step == 2
     good = new_run(dataset, tmp_path)
@@ -292,7 +295,7 @@ def test_batches_depend_on_seed_and_epoch_alone(tmp_path, dataset):
     np.testing.assert_array_equal(run.batches(3, LENGTH), again.batches(3, LENGTH))
     assert (run.batches(0, LENGTH) != run.batches(1, LENGTH)).any()
     batch = run.batches(5, 50)
-    assert set(batch.ravel()) == set(dataset.train.tolist())
+    assert set(run.numbers[batch].ravel()) == set(dataset.train.tolist())
     assert all(len(set(row)) == 2 for row in batch)
     few = dataclasses.replace(dataset, train=dataset.train[:1])
     assert new_run(few, tmp_path).batches(0, LENGTH).shape == (LENGTH, 1)
@@ -303,7 +306,8 @@ def test_a_batch_is_of_one_receiver_and_every_receiver_has_its_share(tmp_path):
     links = dataset.train
     two_of_the_last = links[dataset.receiver_index[links] == 2][:1]
     dataset = dataclasses.replace(dataset, train=np.sort([*links[dataset.receiver_index[links] < 2], *two_of_the_last]))
-    batches = new_run(dataset, tmp_path).batches(0, 300)
+    run = new_run(dataset, tmp_path)
+    batches = run.numbers[run.batches(0, 300)]
     assert batches.shape == (300, 2)
     of = dataset.receiver_index[batches]
     np.testing.assert_array_equal(of[:, 0], of[:, 1])

@@ -2,6 +2,7 @@
 and frequencies would give it away."""
 
 import dataclasses
+import zlib
 from collections.abc import Sequence
 
 import jax
@@ -10,6 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+
+VALIDATION = 0.1
+"""Share of the training transmitters that decide between settings, where the data do not name them."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
@@ -33,18 +37,22 @@ def tx_disjoint_split(
     return np.flatnonzero(~in_test), np.flatnonzero(in_test)
 
 
-def hold_out_validation(dataset: Dataset, fraction: float = 0.1, seed: int = 0) -> Dataset:
-    """Returns the data set with `fraction` of its training transmitters, drawn by `seed`, moved to the validation part.
+def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
+    """Returns the data set with `fraction` of its training transmitters moved to the validation part.
+
+    Which ones depends on the split alone: neither a run's seed nor what is trained changes them. Data that name a validation
+    part themselves, and data of a single training transmitter, stay as they are.
 
     Raises:
-        UserError: the fraction is not between 0 and 1, or there are fewer than two training transmitters.
+        UserError: the fraction is not between 0 and 1.
     """
     tx_index = dataset.tx_index[dataset.train]
-    if len(np.unique(tx_index)) < 2:
-        raise UserError(f"{dataset.name} has fewer than two training transmitters; a validation part needs one of its own")
-    moved = _draw(tx_index, fraction, np.random.default_rng([seed, 5]), "validation")
-    validation = np.sort(np.concatenate([dataset.validation, dataset.train[moved]]))
-    return dataclasses.replace(dataset, train=dataset.train[~moved], validation=validation)
+    if len(dataset.validation) or len(np.unique(tx_index)) < 2:
+        return dataset
+    moved = _draw(
+        tx_index, fraction, np.random.default_rng(zlib.crc32(np.unique(tx_index).astype("<i8").tobytes())), "validation"
+    )
+    return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])
 
 
 def select_frequencies(
@@ -98,7 +106,22 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
         raise UserError(f"{dataset.name} has receivers 0 to {dataset.n_receivers - 1}; choose each once, not {list(which)}")
     number = np.full(dataset.n_receivers, -1)
     number[list(which)] = np.arange(len(which))
-    kept = np.flatnonzero(number[dataset.receiver_index] >= 0)
+    chosen = _keep_links(dataset, np.flatnonzero(number[dataset.receiver_index] >= 0))
+    return dataclasses.replace(
+        chosen,
+        name=f"{dataset.name}_rx" + "-".join(map(str, which)),
+        receivers=jax.tree.map(lambda leaf: leaf[np.array(which)], dataset.receivers),
+        receiver_index=number[chosen.receiver_index],
+    )
+
+
+def without_test(dataset: Dataset) -> Dataset:
+    """Returns the data set without its test links: what a training may look at."""
+    return _keep_links(dataset, np.sort(np.concatenate([dataset.train, dataset.validation])))
+
+
+def _keep_links(dataset: Dataset, kept: Int[np.ndarray, "n"]) -> Dataset:
+    """Returns a data set of some links alone, in their order; the remaining transmitters are numbered anew."""
     place = np.full(len(dataset), -1)  # of every link among those that stay
     place[kept] = np.arange(len(kept))
 
@@ -110,11 +133,9 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
 
     return dataclasses.replace(
         dataset,
-        name=f"{dataset.name}_rx" + "-".join(map(str, which)),
-        receivers=jax.tree.map(lambda leaf: leaf[np.array(which)], dataset.receivers),
         tx_positions=dataset.tx_positions[kept],
         frequencies_hz=dataset.frequencies_hz[kept],
-        receiver_index=number[dataset.receiver_index[kept]],
+        receiver_index=dataset.receiver_index[kept],
         tx_index=np.unique(dataset.tx_index[kept], return_inverse=True)[1],
         train=remaining(dataset.train),
         validation=remaining(dataset.validation),

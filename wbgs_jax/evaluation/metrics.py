@@ -1,12 +1,13 @@
-"""How good predicted spectra are: SSIM (scikit-image's), PSNR and MAE, over all spectra and by frequency."""
+"""How good predicted spectra are, over all of them, by frequency and by sight: SSIM (scikit-image's), PSNR, MAE, beams."""
 
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from skimage.metrics import structural_similarity
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.evaluation.beams import angle_error_deg, beam_loss_db
 
 PSNR_LIMIT_DB = 100.0
 """PSNR of a perfect prediction, which would be infinite and fit no report."""
@@ -32,13 +33,24 @@ def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "
 
 
 def score(
-    predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], frequencies_hz: Float[np.ndarray, "n"]
+    predicted: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    frequencies_hz: Float[np.ndarray, "n"],
+    sight: Bool[np.ndarray, "n"] | None = None,
 ) -> dict[str, Any]:
     """Returns a report of predicted spectra, ready for JSON.
 
+    Args:
+        predicted: spectra in 0..1.
+        truth: what was observed.
+        frequencies_hz: of every spectrum.
+        sight: whether the receiver sees the transmitter, where that is known.
+
     Returns:
-        n, median_ssim, mean_ssim, psnr_db (median), mae (mean), and per_frequency: a list, by ascending frequency, of the same
-        figures with frequency_ghz.
+        n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
+        strongest direction (median); beam_loss_db and beam_loss_top3_db, the power lost by using the best of one or three
+        predicted beams (means, `beams.py`). The same figures in per_frequency, a list by ascending frequency_ghz, and in
+        in_sight and out_of_sight, where `sight` is given and there are such spectra.
 
     Raises:
         UserError: there is no spectrum, or a prediction contains NaN or infinity.
@@ -47,12 +59,23 @@ def score(
         raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
     if broken := sum(not np.isfinite(p).all() for p in predicted):
         raise UserError(f"{broken} of {len(predicted)} predicted spectra contain NaN or infinity; the model diverged")
-    values = {"ssim": ssim(predicted, truth), "psnr_db": psnr_db(predicted, truth), "mae": mae(predicted, truth)}
-    per_frequency = []
-    for frequency in np.unique(frequencies_hz):
-        chosen = {name: value[frequencies_hz == frequency] for name, value in values.items()}
-        per_frequency.append({"frequency_ghz": float(frequency / 1e9), **_summary(chosen)})
-    return {**_summary(values), "per_frequency": per_frequency}
+    values = {
+        "ssim": ssim(predicted, truth),
+        "psnr_db": psnr_db(predicted, truth),
+        "mae": mae(predicted, truth),
+        "angle_error_deg": angle_error_deg(predicted, truth),
+        "beam_loss_db": beam_loss_db(predicted, truth),
+        "beam_loss_top3_db": beam_loss_db(predicted, truth, 3),
+    }
+
+    def part(chosen: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+        return _summary({name: value[chosen] for name, value in values.items()})
+
+    report = _summary(values)
+    if sight is not None:
+        report |= {name: part(where) for name, where in (("in_sight", sight), ("out_of_sight", ~sight)) if where.any()}
+    by_frequency = ((f, part(frequencies_hz == f)) for f in np.unique(frequencies_hz))
+    return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | figures for f, figures in by_frequency]}
 
 
 def score_power(
@@ -83,6 +106,11 @@ def _summary(values: dict[str, np.ndarray]) -> dict[str, Any]:
         "n": len(values["ssim"]),
         "median_ssim": float(np.median(values["ssim"])),
         "mean_ssim": float(np.mean(values["ssim"])),
+        "p5_ssim": float(np.percentile(values["ssim"], 5)),
+        "p10_ssim": float(np.percentile(values["ssim"], 10)),
         "psnr_db": float(np.median(values["psnr_db"])),
         "mae": float(np.mean(values["mae"])),
+        "angle_error_deg": float(np.median(values["angle_error_deg"])),
+        "beam_loss_db": float(np.mean(values["beam_loss_db"])),
+        "beam_loss_top3_db": float(np.mean(values["beam_loss_top3_db"])),
     }

@@ -10,6 +10,7 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax.config import to_dict
+from wbgs_jax.data.splits import VALIDATION
 
 
 def environment() -> dict[str, Any]:
@@ -47,7 +48,7 @@ def _training_arguments(config: Any) -> list[str]:
         data += ["--train-ghz", *(f"{f:g}" for f in config.train_ghz)]
     if config.train_tx:
         data += ["--train-tx", str(config.train_tx)]
-    if config.validation:
+    if config.validation != VALIDATION:
         data += ["--validation", f"{config.validation:g}"]
     if config.receiver is not None:
         data += ["--receiver", str(config.receiver)]
@@ -106,6 +107,15 @@ def _power_table(report: dict[str, Any]) -> Table:
 def closing_lines(report: dict[str, Any], block: int) -> list[str]:
     """Returns what stands below the table."""
     lines = []
+    if "median_ssim" in report:
+        lines.append(f"SSIM of the worst: {report['p5_ssim']:.3f} (5th percentile), {report['p10_ssim']:.3f} (10th)")
+        parts = {"in sight of the receiver": report.get("in_sight"), "out of sight": report.get("out_of_sight")}
+        seen = [f"{name} {part['median_ssim']:.3f} (n = {part['n']})" for name, part in parts.items() if part]
+        lines += [f"SSIM {', '.join(seen)} (medians)"] if seen else []
+        lines.append(
+            f"strongest direction: {report['angle_error_deg']:.1f} degrees off (median); best predicted beam: "
+            f"{report['beam_loss_db']:.2f} dB lost, best of three {report['beam_loss_top3_db']:.2f} dB (means)"
+        )
     if "snapshot_correlation" in report:
         alike, error = report["snapshot_correlation"], report["power_error_db"]
         lines.append(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")

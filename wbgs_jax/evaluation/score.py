@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.fields import Field, Observation
@@ -31,9 +32,9 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     report |= figures(seen, dataset, index) | time_queries(trained, dataset)
     if dataset.kind != "power":
-        truth, frequencies = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index]
+        known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
         report["baselines"] = {
-            name: metrics.score(np.asarray(predict(index)), truth, frequencies) for name, predict in baselines(dataset).items()
+            name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()
         }
     return report, np.asarray(seen.pas)
 
@@ -53,7 +54,8 @@ def figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) ->
         if seen.power_db is None or dataset.power_db is None:
             raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
         return metrics.score_power(np.asarray(seen.power_db), dataset.power_db[index], frequencies)
-    report = metrics.score(np.asarray(seen.pas), np.asarray(dataset.pas(index)), frequencies)
+    truth, sight = np.asarray(dataset.pas(index)), in_sight(dataset, index)
+    report = metrics.score(np.asarray(seen.pas), truth, frequencies, sight)
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     return report

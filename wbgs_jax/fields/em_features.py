@@ -1,10 +1,8 @@
 """What the EM feature networks say of every Gaussian and query (paper, sections 4.2 and 4.5), in two steps: what depends on the
 Gaussian alone, once for all queries, and the rest."""
 
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
@@ -56,7 +54,6 @@ def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceN
     return attenuation, RadianceNetwork(config.radiance_widths)
 
 
-@partial(jax.jit, static_argnames="config")
 def gaussian_features(
     means: Float[Array, "n 3"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
 ) -> GaussianFeatures:

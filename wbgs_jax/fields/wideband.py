@@ -7,6 +7,7 @@ Neither the geometry nor what the networks make of a Gaussian alone depends on t
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -43,6 +44,8 @@ from wbgs_jax.types import (
 )
 
 INITIAL_ATTENUATION = 0.3
+_compiled_features = jax.jit(gaussian_features, static_argnames="config")
+"""For plans that are made outside of a compiled function."""
 TILE_SLACK = 1.4
 """Room in the tile lists for footprints that grow during training."""
 
@@ -111,15 +114,20 @@ class WidebandField(Field):
         Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
         are needed under jit (`splat.geometry_plan`).
         """
-        return self._plan(params, receiver, limits, None)
+        return self._plan(params, receiver, limits, None, _compiled_features)
 
     def _plan(
-        self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None, offset: Float[Array, "n 2"] | None
+        self,
+        params: WidebandParams,
+        receiver: Receiver,
+        limits: TileLimits | None,
+        offset: Float[Array, "n 2"] | None,
+        features_of: Callable[..., GaussianFeatures],
     ) -> WidebandPlan:
         check_receiver(receiver)
         geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
-        features = gaussian_features(params.gaussians.means, params.networks, frame, receiver, self.config)
+        features = features_of(params.gaussians.means, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
@@ -134,7 +142,7 @@ class WidebandField(Field):
         self, params: WidebandParams, cache: None, batch: Batch, limits: TileLimits | None = None, probe: Any = None
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss of a batch (paper, equation 5)."""
-        planned = self._plan(params, batch.receiver, limits, probe)
+        planned = self._plan(params, batch.receiver, limits, probe, gaussian_features)
         loss, aux = compare(self.render(params, planned, batch.links.query), batch, self.config.ssim_weight)
         jobs = planned.geometry.jobs
         required = jnp.stack([jobs.required_entries, jobs.required_jobs])

@@ -20,6 +20,7 @@ from jaxtyping import Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import without_test
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, field_names, from_arrays, get_field
@@ -59,6 +60,8 @@ class Run:
     """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
 
     def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path):
+        self.numbers = np.sort(np.concatenate([dataset.train, dataset.validation]))  # of the links, as the data count them
+        dataset = without_test(dataset)  # nothing in a training can look at the test
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
         self.controls = tuple(CONTROLS[name](getattr(settings, name)) for name in kind.controls if getattr(settings, name))
@@ -71,7 +74,7 @@ class Run:
         self.data: TrainingData = training_data(dataset)
         self.cache = self.field.prepare(self.data.links, self.data.receivers)
         rng = np.random.default_rng([seed, 1])
-        part = dataset.validation if len(dataset.validation) else dataset.test
+        part = dataset.validation
         self.watched = np.sort(rng.choice(part, min(settings.loop.evaluate_spectra, len(part)), replace=False))
 
     @property
@@ -140,7 +143,7 @@ class Run:
         saved = checkpoint.checkpoint_steps(self.checkpoints)
         last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
         raise UserError(
-            f"the loss of step {self.step} or its gradient is not finite (spectra {batch.tolist()}); {last}. "
+            f"the loss of step {self.step} or its gradient is not finite (spectra {self.numbers[batch].tolist()}); {last}. "
             "Check these spectra, or start again with smaller learning rates"
         )
 
@@ -168,7 +171,7 @@ class Run:
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
 
     def evaluate(self) -> dict[str, float]:
-        """Returns figures of the watched held-out spectra."""
+        """Returns figures of the watched validation spectra."""
         return watch(self.field, self.state.params, self.dataset, self.watched)
 
     def log(self, entry: dict[str, Any]) -> None:

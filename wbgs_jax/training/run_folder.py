@@ -18,7 +18,7 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.config import Settings, from_dict, sections, to_dict
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, select_receivers, unseen_frequencies
+from wbgs_jax.data.splits import VALIDATION, fewer_transmitters, hold_out_validation, select_receivers, unseen_frequencies
 from wbgs_jax.fields import Field, from_arrays, get_field
 from wbgs_jax.training import checkpoint
 
@@ -41,8 +41,8 @@ class RunConfig:
     """Train at these frequencies and test at the others; none: train and test at all."""
     train_tx: int = 0
     """Number of training transmitters; 0: all."""
-    validation: float = 0.0
-    """Share of the training transmitters that is held out for validation."""
+    validation: float = VALIDATION
+    """Share of the training transmitters that is held out for validation, where the data name none."""
     receiver: int | None = None
     """Number of the only receiver that is looked at; None: all."""
 
@@ -54,9 +54,9 @@ class RunConfig:
             dataset = select_receivers(dataset, [self.receiver])
         if self.train_ghz:
             dataset = unseen_frequencies(dataset, self.train_ghz)
-        if self.validation:
-            dataset = hold_out_validation(dataset, self.validation, self.seed)
-        return fewer_transmitters(dataset, self.train_tx, self.seed) if self.train_tx else dataset
+        if self.train_tx:
+            dataset = fewer_transmitters(dataset, self.train_tx, self.seed)
+        return hold_out_validation(dataset, self.validation) if self.validation else dataset
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,23 @@
+"""How fast the wideband field learns, and for how long: learning rates, warm-up, what is left at the end. On validation."""
+
+from experiments.jobs import Job
+from experiments.results import Results
+from experiments.series.series import Series, jobs_of_all, render_all
+
+TITLE = "Schedules"
+RATES = ("", "lr_8e-3", "lr_1.6e-2", "warm_1.6e-2", "warm_2.4e-2")
+WARM = ("warm_8e-3", "warm_1.6e-2_to_0", "warm_1.6e-2_gaussians", "warm_1.6e-2_batch_4")
+SERIES = (
+    Series("2,000 steps", "wideband", (*RATES, *WARM), "schedules"),
+    Series("Beside the former 6,000 steps", "wideband", ("steps_6000", "warm_1.6e-2"), "schedules", scenes=("1", "2", "4")),
+)
+
+
+def jobs() -> list[Job]:
+    """Returns a job a change and scene."""
+    return jobs_of_all(SERIES)
+
+
+def render(results: Results) -> str:
+    """Returns a table a series."""
+    return render_all(SERIES, results)

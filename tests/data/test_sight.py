@@ -1,0 +1,61 @@
+"""Lines of sight against trimesh and a wall with a door."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from synthetic import RX, tiny_dataset
+
+from wbgs_jax.data import sight
+from wbgs_jax.data.sight import in_sight
+
+
+def with_mesh(mesh, tx):
+    dataset = tiny_dataset(len(tx))
+    positions = np.asarray(tx)[dataset.tx_index]
+    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+    return dataclasses.replace(dataset, tx_positions=positions, vertices=vertices, faces=faces, face_part=None, materials=None)
+
+
+def of_transmitters(dataset):
+    """One value a transmitter, which all of its links share."""
+    seen = in_sight(dataset, np.arange(len(dataset)))
+    first = np.unique(dataset.tx_index, return_index=True)[1]
+    np.testing.assert_array_equal(seen, seen[first][dataset.tx_index])
+    return seen[first]
+
+
+@pytest.mark.parametrize("at_once", [1, sight.AT_ONCE])
+def test_it_agrees_with_trimesh(rng, monkeypatch, at_once):
+    pytest.importorskip("rtree")
+    monkeypatch.setattr(sight, "AT_ONCE", at_once)
+    boxes = [
+        trimesh.creation.box((0.5, 0.4, 0.6), trimesh.transformations.translation_matrix(p))
+        for p in rng.uniform(-2, 2, (12, 3))
+    ]
+    mesh = trimesh.util.concatenate(boxes)
+    mesh.vertices = np.asarray(mesh.vertices, np.float32)
+    tx = rng.uniform(-2.5, 2.5, (60, 3))
+    tx = tx[~np.any([box.contains(tx) for box in boxes], 0) & (np.linalg.norm(tx - RX, axis=-1) > 0.1)]
+    dataset = with_mesh(mesh, tx)
+    start = np.asarray(dataset.receivers.position, float)[0]
+    offset = tx - start
+    distance = np.linalg.norm(offset, axis=-1)
+    places, ray, _ = mesh.ray.intersects_location(np.broadcast_to(start, tx.shape), offset / distance[:, None])
+    along = np.linalg.norm(places - start, axis=-1)
+    blocked = np.zeros(len(tx), bool)
+    blocked[ray[(along > 1e-3) & (along < distance[ray] - 1e-3)]] = True
+    np.testing.assert_array_equal(of_transmitters(dataset), ~blocked)
+    assert 0 < blocked.sum() < len(tx)
+
+
+def test_what_an_antenna_is_mounted_on_does_not_hide_it():
+    floor = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [0, 9, 0]], [[0, 1, 2]])
+    tx = np.array([[0.5, 0.2, 0.0], [0.5, 0.2, 1e-4], [0.5, 0.2, -0.1]])
+    np.testing.assert_array_equal(of_transmitters(with_mesh(floor, tx)), [True, True, RX[2] < 0])
+
+
+def test_points_without_faces_do_not_tell():
+    points = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.zeros((0, 3), int), process=False)
+    assert in_sight(with_mesh(points, np.ones((2, 3))), np.arange(3)) is None

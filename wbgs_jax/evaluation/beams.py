@@ -1,0 +1,44 @@
+"""What a link engineer loses by trusting a predicted spectrum: the wrong direction, the wrong beam."""
+
+import functools
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH, pas_directions
+
+RINGS, SECTORS = 4, 16
+"""The codebook: beams on four rings of equal zenith angle, sixteen on each."""
+FAINTEST_DB = -60.0
+"""A beam that hears less than this, relative to the best one, hears nothing."""
+
+
+def angle_error_deg(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+    """Returns the angle (degrees) between the strongest directions of predicted and true spectra."""
+    directions = pas_directions().reshape(-1, 3)
+    a, b = (directions[spectra.reshape(len(spectra), -1).argmax(1)] for spectra in (predicted, truth))
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+
+
+def beam_loss_db(
+    predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], tried: int = 1
+) -> Float[np.ndarray, "n"]:
+    """Returns the power (dB, at least 0) that is lost against the codebook's best beam.
+
+    The `tried` beams that a predicted spectrum ranks highest are measured, and the best of them is used. A beam is a pixel of
+    the spectrum, which is an amplitude: power is its square.
+    """
+    expected, heard = (spectra.reshape(len(spectra), -1)[:, codebook()] for spectra in (predicted, truth))
+    ranked = np.argsort(-expected, axis=1, kind="stable")[:, :tried]
+    used = np.take_along_axis(heard, ranked, 1).max(1).astype(np.float64)
+    best = heard.max(1).astype(np.float64)
+    ratio = np.where(best > 0, used / np.where(best > 0, best, 1), 1)
+    return -20 * np.log10(np.maximum(ratio, 10 ** (FAINTEST_DB / 20)))
+
+
+@functools.cache
+def codebook() -> Int[np.ndarray, "beams"]:
+    """Returns the pixels, in row-major order, that the codebook's beams point at."""
+    rows = (np.arange(RINGS) + 0.5) * (PAS_HEIGHT - 1) / RINGS
+    columns = np.arange(SECTORS) * (PAS_WIDTH - 1) / SECTORS
+    return (rows.round().astype(int)[:, None] * PAS_WIDTH + columns.round().astype(int)).reshape(-1)
