@@ -72,7 +72,7 @@ bench: setup  ## measure this machine, compare: make bench [GATE=1 to fail on a 
 experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE=quick|paper MINUTES=60 ARGS="--only table1"]
 	$(PY) -m experiments.runner --profile $(PROFILE) $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)
 
-tables: setup  ## write docs/results.md from the results that there are: make tables [PROFILE=]
+tables: setup  ## write docs/results.md and the marked numbers of all pages from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
 
 docs: setup  ## write docs/api.md from the docstrings

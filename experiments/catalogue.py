@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from experiments.jobs import Job
-from experiments.series import choices, schedules, tuning, wave_choices
+from experiments.series import choices, frequency, schedules, tuning, wave_choices
 from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
@@ -19,7 +19,13 @@ TABLES: dict[str, ModuleType] = {
     "table2": table2,
     "baselines": baselines,
 }
-SERIES: dict[str, ModuleType] = {"choices": choices, "tuning": tuning, "schedules": schedules, "wave_choices": wave_choices}
+SERIES: dict[str, ModuleType] = {
+    "choices": choices,
+    "tuning": tuning,
+    "schedules": schedules,
+    "frequency": frequency,
+    "wave_choices": wave_choices,
+}
 EXPERIMENTS = TABLES | SERIES
 
 

@@ -51,6 +51,7 @@ PROFILES = {
     # Of the series, each its own.
     "tuning": Profile("cpu", 1000, 600, **QUICK, scored_tx=SCORED_SLOW),
     "schedules": Profile("cpu", 2000, 600, validation=True),
+    "frequency": Profile("cpu", 1000, 600, validation=True),
     "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
     "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
 }

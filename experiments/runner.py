@@ -48,7 +48,7 @@ class Command:
     """quick: two CPU cores, hours. paper: full size, a GPU. smoke: minutes, proves that everything works. The series have sizes
     of their own, and are small with smoke too."""
     only: tuple[str, ...] = ()
-    """Experiments (table1, figure7, ..., choices, tuning, schedules, wave_choices); all tables and figures by default."""
+    """Experiments: table1, figure7, ..., or a series such as choices; all tables and figures by default."""
     scenes: tuple[str, ...] = ()
     """Scenes (1, 2, ..., 1_21f); all by default."""
     data: str | None = None

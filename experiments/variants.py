@@ -1,5 +1,6 @@
 """Named changes of a job's settings: those of the tables, and those that the series try one at a time."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from experiments.profiles import Changes
@@ -66,6 +67,18 @@ GAUSSIANS_AND_NETWORKS = {
     "weight_decay_0.1": _of_field(network_weight_decay=0.1),
     "fixed_means": _of_field(means_lr=0.0),
 }
+_WARM: dict[str, Mapping[str, object]] = {"optim": {"warmup": 0.1}}
+_FAST = {"network_lr": 1.6e-2}
+_BLIND = {"attenuation_frequency": False, "radiance_frequency": False}
+FREQUENCY = {
+    "f_off": Variant({"field": _FAST | _BLIND, **_WARM}),
+    "f_input": Variant({"field": _FAST, **_WARM}),
+    "f_degree_4": Variant({"field": _FAST | {"frequency_degree": 4}, **_WARM}),
+    "f_heads_2": Variant({"field": _FAST | _BLIND | {"frequency_heads": 2}, **_WARM}),
+    "f_heads_4": Variant({"field": _FAST | _BLIND | {"frequency_heads": 4}, **_WARM}),
+    "f_both": Variant({"field": _FAST | {"frequency_heads": 3, "frequency_degree": 3}, **_WARM}),
+}
+"""What the frequency is to the networks."""
 SCHEDULES = {
     "warm_8e-3": Variant({"field": {"network_lr": 8e-3}, "optim": {"warmup": 0.1}}),
     "warm_1.6e-2": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1}}),
@@ -107,4 +120,4 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | VOLUME | COHERENT

@@ -1,7 +1,7 @@
 """Write the page of results and the table of all results: `python -m experiments.tables [--profile quick]`.
 
-docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick), and
-experiments/results/results.csv.
+docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick),
+experiments/results/results.csv, and the marked numbers of README.md and all pages (`evidence.py`).
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from experiments import result_table
+from experiments import evidence, result_table
 from experiments.results import FOLDER, Results
 from experiments.tables.page import page
 from wbgs_jax._util.command import run_command
@@ -38,6 +38,9 @@ def main(arguments: list[str] | None = None) -> None:
         stream.write(text.encode())
     print(path)
     print(result_table.write(command.results))
+    if command.docs == DOCS:
+        for changed in evidence.fill_pages(folder=command.results):
+            print(changed)
 
 
 if __name__ == "__main__":

@@ -54,3 +54,11 @@ def test_the_gradient_is_finite_over_six_decades():
     frequency = jnp.asarray(np.logspace(6, 12, 50), jnp.float32)
     gradient = np.asarray(jax.jit(jax.grad(lambda f: jnp.sum(encoding.frequency_encoding(f, 4))))(frequency))
     assert np.isfinite(gradient).all() and (gradient != 0).all()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 5])
+def test_legendre_polynomials_are_numpys(rng, x64, degree):
+    x = rng.uniform(-1, 1, (3, 4))
+    found = encoding.legendre(jnp.asarray(x), degree)
+    assert found.shape == (3, 4, degree)
+    np.testing.assert_allclose(found, np.polynomial.legendre.legvander(x, degree)[..., 1:], rtol=1e-12, atol=1e-14)

@@ -10,6 +10,7 @@ from synthetic import FIELDS
 
 from wbgs_jax.data.surface import surface_from_points
 from wbgs_jax.fields import wideband
+from wbgs_jax.fields.em_features import MAX_ATTENUATION
 from wbgs_jax.fields.wideband import INITIAL_ATTENUATION, WidebandField, make_field
 from wbgs_jax.splat import TileLimits, slots_for
 from wbgs_jax.types import Query, make_query, make_receiver
@@ -103,6 +104,28 @@ def test_frequency_switches_remove_the_dependence(rng, points, query, attenuatio
     d_attenuation, d_signal = slopes(jnp.log(query.frequency_hz))
     assert bool((d_attenuation != 0).any()) == attenuation
     assert bool((d_signal != 0).any()) == (attenuation or radiance)  # h holds the attenuation network's frequency, too
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_heads_make_polynomials_of_the_scaled_frequency(rng, points, query, degree):
+    """Without the frequency among the inputs, delta's and Sig's logits are exactly of that degree, and no lower one."""
+    changes = {"attenuation_frequency": False, "radiance_frequency": False, "frequency_heads": degree}
+    field = start(points, dataclasses.replace(CONFIG, **changes))
+    params = trained(rng, field)
+    ghz = np.geomspace(1, 100, 9)
+    asked = Query(jnp.repeat(query.tx_position[:1], len(ghz), 0), jnp.asarray(1e9 * ghz, jnp.float32))
+    delta, signal = (np.asarray(values, float)[:N] for values in features(field, params, RECEIVER, asked))
+    scaled = np.log10(ghz) - 1
+    for logits in (-np.log(MAX_ATTENUATION / delta - 1), np.log(np.expm1(signal))):
+        size = np.abs(logits).max()
+        residual = [np.abs(logits.T - polynomial(scaled, logits.T, d)).max() / size for d in (degree, degree - 1)]
+        assert residual[0] < 1e-3 and residual[1] > 10 * residual[0]
+
+
+def polynomial(x, y, degree):
+    """The least-squares polynomials through the columns of y, at x."""
+    powers = np.vander(x, degree + 1)
+    return powers @ np.linalg.lstsq(powers, y, rcond=None)[0]
 
 
 @pytest.mark.parametrize("relative", [True, False])

@@ -11,7 +11,7 @@ from synthetic import tiny_dataset, tiny_settings
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import get_field
-from wbgs_jax.training.optim import make_optimizer
+from wbgs_jax.training.optim import make_optimizer, schedule
 
 OPTIM = OptimConfig(steps=6, final_fraction=0.1)
 RATES = {
@@ -97,3 +97,14 @@ def test_equal_settings_share_one_optimiser():
     assert make_optimizer(field, config_of("wideband"), OPTIM) is make_optimizer(field, config_of("wideband"), OPTIM)
     other = dataclasses.replace(OPTIM, final_fraction=0.2)
     assert make_optimizer(field, config_of("wideband"), OPTIM) is not make_optimizer(field, config_of("wideband"), other)
+
+
+def test_a_warm_up_rises_in_a_line_to_where_the_cosine_begins():
+    optim = OptimConfig(steps=100, warmup=0.2, final_fraction=0.1)
+    rate = np.array([schedule(0.5, optim)(step) for step in range(121)])
+    np.testing.assert_allclose(np.diff(rate[:21]), (0.5 - rate[0]) / 20, rtol=1e-3)
+    assert 0 < rate[0] < 0.05 and rate.argmax() == 20 and rate[20] == pytest.approx(0.5)
+    cosine = 0.5 * (1 + np.cos(np.pi * np.clip((np.arange(121) - 20) / 80, 0, 1)))
+    np.testing.assert_allclose(rate[20:], 0.5 * (0.9 * cosine + 0.1)[20:], rtol=1e-4)
+    plain = schedule(0.5, dataclasses.replace(optim, warmup=0.0))
+    assert plain(0) == 0.5 and plain(100) == pytest.approx(0.05)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.fields.encoding import frequency_encoding, positional_encoding
+from wbgs_jax.fields.encoding import frequency_encoding, legendre, positional_encoding, scale_frequency
 from wbgs_jax.fields.networks import (
     AttenuationNetwork,
     GaussianSums,
@@ -50,8 +50,9 @@ class GaussianFeatures:
 
 def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
     """Returns the EM feature networks."""
-    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion)
-    return attenuation, RadianceNetwork(config.radiance_widths)
+    heads = 1 + config.frequency_heads
+    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion, heads)
+    return attenuation, RadianceNetwork(config.radiance_widths, heads)
 
 
 def gaussian_features(
@@ -84,6 +85,10 @@ def query_features(
     outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both, method="of_queries")
     hidden, delta_f = outputs
     signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency])
+    if config.frequency_heads:
+        u = scale_frequency(query.frequency_hz)
+        powers = jnp.concatenate([jnp.ones_like(u)[:, None], legendre(u, config.frequency_heads)], -1)
+        delta_f, signal = (jnp.sum(heads * powers, -1) for heads in (delta_f, signal))
     delta = attenuation_activation(gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
     return delta, signal_activation(signal)
 
@@ -102,10 +107,18 @@ def _query_inputs(
     both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
     if config.relative:
         both.append(_relative_features(means, features, receiver, query, frame.half_extent))
-    encoded = frequency_encoding(query.frequency_hz, config.frequency_octaves, config.frequency_scale)[None, :, :]
+    encoded = encoded_frequency(query.frequency_hz, config)[None, :, :]
     if config.attenuation_frequency:
         both.append(encoded)
     return both, [encoded] if config.radiance_frequency else []
+
+
+def encoded_frequency(frequency_hz: Float[Array, "b"], config: WidebandConfig) -> Float[Array, "b d"]:
+    """Returns what the networks see of the frequency."""
+    encoded = frequency_encoding(frequency_hz, config.frequency_octaves, config.frequency_scale)
+    if config.frequency_degree == 1:
+        return encoded
+    return jnp.concatenate([encoded, legendre(scale_frequency(frequency_hz), config.frequency_degree)[:, 1:]], -1)
 
 
 def _relative_features(

@@ -34,6 +34,14 @@ def frequency_encoding(frequency_hz: Float[Array, "*n"], octaves: int, scale: Fr
     return positional_encoding(scale_frequency(frequency_hz, scale)[..., None], octaves)
 
 
+def legendre(x: Float[Array, "*n"], degree: int) -> Float[Array, "*n d"]:
+    """Returns the Legendre polynomials P_1 ... P_degree of numbers in -1..1: d = degree."""
+    values = [jnp.ones_like(x), x]
+    for k in range(1, degree):
+        values.append(((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1))
+    return jnp.stack(values[1 : degree + 1], -1)
+
+
 def check_octaves(name: str, config: Any, inputs: tuple[str, ...]) -> None:
     """Raises a `UserError` for settings with an encoding of fewer than no octaves; `name` is that of the field."""
     for part in inputs:

@@ -58,11 +58,13 @@ class AttenuationNetwork(nn.Module):
     depth: int
     skip: int
     fusion: int = 0
+    heads: int = 1
+    """Values instead of delta_f alone, along a further axis if there are several."""
 
     def setup(self) -> None:
         self.layers = [PartwiseDense(self.width, name=f"PartwiseDense_{i}") for i in range(self.depth)]
         # Zero at the start: the final attenuation begins as delta_o, and delta_f learns a correction (paper, section 4.5).
-        self.head = nn.Dense(1, kernel_init=nn.initializers.zeros_init(), name="Dense_0")
+        self.head = nn.Dense(self.heads, kernel_init=nn.initializers.zeros_init(), name="Dense_0")
 
     def __call__(self, gaussian: Parts, query: Parts) -> tuple[Float[Array, "... width"], Float[Array, "..."]]:
         """Returns the hidden features h and delta_f, both of shape (N, B, ...)."""
@@ -72,7 +74,7 @@ class AttenuationNetwork(nn.Module):
             if layer == self.fusion or (layer == self.skip and layer > self.fusion):
                 inputs += query
             hidden = [nn.relu(self.layers[layer](inputs))]
-        return hidden[0], self.head(hidden[0])[..., 0]
+        return hidden[0], _values(self.head(hidden[0]))
 
     def gaussian_sums(self, gaussian: Parts) -> GaussianSums:
         """Returns what the Gaussians alone decide: P(G) of shape (N, 1, features) gives sums of shape (N, 1, width)."""
@@ -96,7 +98,7 @@ class AttenuationNetwork(nn.Module):
             if at_skip is not None and layer == self.skip:
                 total = self.layers[layer](query, first=1 + gaussian_parts, total=total + at_skip)
             hidden = nn.relu(total)
-        return hidden, self.head(hidden)[..., 0]
+        return hidden, _values(self.head(hidden))
 
     def _gaussian_inputs(self, layer: int, gaussian: Parts) -> list[Float[Array, "... _"]]:
         return list(gaussian) if layer in (0, self.skip) else []
@@ -106,14 +108,19 @@ class RadianceNetwork(nn.Module):
     """(h, f) -> Sig before its activation."""
 
     widths: tuple[int, ...]
+    heads: int = 1
 
     @nn.compact
     def __call__(self, parts: Parts) -> Float[Array, "..."]:
-        """Returns the logits of Sig."""
+        """Returns the logits of Sig, along a further axis if there are several heads."""
         hidden = nn.relu(PartwiseDense(self.widths[0])(parts))
         for width in self.widths[1:]:
             hidden = nn.relu(PartwiseDense(width)([hidden]))
-        return nn.Dense(1, kernel_init=nn.initializers.normal(0.01))(hidden)[..., 0]
+        return _values(nn.Dense(self.heads, kernel_init=nn.initializers.normal(0.01))(hidden))
+
+
+def _values(heads: Float[Array, "... heads"]) -> Float[Array, "..."]:
+    return heads[..., 0] if heads.shape[-1] == 1 else heads
 
 
 def signal_activation(logits: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -24,11 +24,12 @@ from wbgs_jax.fields.em_features import (
     RELATIVE_FEATURES,
     Frame,
     GaussianFeatures,
+    encoded_frequency,
     gaussian_features,
     make_networks,
     query_features,
 )
-from wbgs_jax.fields.encoding import check_octaves, frequency_encoding, positional_encoding
+from wbgs_jax.fields.encoding import check_octaves, positional_encoding
 from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
 from wbgs_jax.types import (
@@ -95,6 +96,8 @@ class WidebandField(Field):
         if not 0 <= config.fusion < config.depth:
             raise UserError(f"--{name}.fusion is {config.fusion}; it is the number of a layer, 0 to {config.depth - 1}")
         check_octaves(name, config, ("gaussian", "tx", "frequency"))
+        if config.frequency_degree < 1 or config.frequency_heads < 0:
+            raise UserError(f"--{name}.frequency-degree must be at least 1, --{name}.frequency-heads at least 0")
 
     @classmethod
     def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
@@ -224,7 +227,7 @@ def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, An
     attenuation, radiance = make_networks(config)
     gaussian = [positional_encoding(points, config.gaussian_octaves)[:, None, :]]
     tx = [positional_encoding(points[:1], config.tx_octaves)[None]]
-    frequency = frequency_encoding(jnp.full((1,), 1e9, points.dtype), config.frequency_octaves, config.frequency_scale)[None]
+    frequency = encoded_frequency(jnp.full((1,), 1e9, points.dtype), config)[None]
     relative = [jnp.zeros((len(points), 1, RELATIVE_FEATURES), points.dtype)] if config.relative else []
     query = tx + relative + ([frequency] if config.attenuation_frequency else [])
     key_attenuation, key_radiance = jax.random.split(key)

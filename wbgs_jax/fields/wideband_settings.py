@@ -36,6 +36,11 @@ class WidebandConfig:
     frequencies that were trained)."""
     frequency_scale: FrequencyScale = "log"
     """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
+    frequency_degree: int = 1
+    """Degree of the Legendre polynomials of the scaled frequency that enter the networks; 1: the frequency itself."""
+    frequency_heads: int = 0
+    """Degree of the polynomial in the scaled frequency that delta_f and the logit of Sig are, the networks' outputs being its
+    coefficients; 0: no dependence but through the inputs."""
     relative: bool = True
     """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
     attenuation_frequency: bool = True

@@ -19,7 +19,7 @@ from wbgs_jax.types import Scene
 
 def without_frequency(config: WidebandConfig) -> WidebandConfig:
     """Returns the same settings with both frequency embeddings switched off."""
-    return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False)
+    return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False, frequency_heads=0)
 
 
 @register
