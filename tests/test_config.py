@@ -19,9 +19,10 @@ def check_all(field, settings):
     get_field(field).check(settings.field)
 
 
-@pytest.mark.parametrize("field", field_names())
-@pytest.mark.parametrize("preset", list(PRESETS))
-def test_presets_are_valid_and_survive_json(preset, field):
+@pytest.mark.parametrize(
+    ("field", "preset"), [(field, preset) for field in field_names() for preset in get_field(field).presets]
+)
+def test_presets_are_valid_and_survive_json(field, preset):
     settings = get_field(field).presets[preset]
     check_all(field, settings)
     values = json.loads(json.dumps(to_dict(settings, field)))
@@ -30,12 +31,28 @@ def test_presets_are_valid_and_survive_json(preset, field):
 
 @pytest.mark.parametrize("field", field_names())
 def test_a_field_has_its_own_settings_and_those_of_the_controls_that_it_asks_for(field):
-    for preset in PRESETS:
-        settings = get_field(field).presets[preset]
+    assert get_field(field).presets.keys() >= PRESETS.keys()
+    for settings in get_field(field).presets.values():
         parts = sections(settings, field)
         assert parts.keys() == {field, "optim", "loop", *get_field(field).controls}
         assert parts[field] is settings.field
         assert from_sections(parts, field) == settings
+
+
+def test_the_papers_preset_is_its_own_form():
+    """Every value that the paper or the authors' code gives (docs/baselines.md), and as many steps on any data."""
+    paper = get_field("wideband").presets["paper"]
+    inputs = (paper.field.gaussian_octaves, paper.field.tx_octaves, paper.field.frequency_octaves, paper.field.frequency_scale)
+    assert inputs == (10, 10, 10, "ghz") and not paper.field.relative and paper.field.fusion == 0
+    assert (paper.field.width, paper.field.depth, paper.field.skip, paper.field.radiance_widths) == (128, 8, 4, (128, 64))
+    assert (paper.field.network_lr, paper.field.opacity_lr, paper.field.log_scales_lr) == (8e-4, 0.025, 0.005)
+    assert (paper.field.means_lr, paper.field.gaussians, paper.field.ssim_weight) == (0, 0, 0.2)
+    assert paper.field.network_lr * paper.optim.final_fraction == pytest.approx(1e-6)
+    control = paper.density
+    assert (control.every, control.start, control.stop_fraction * paper.optim.steps) == (100, 500, 15_000)
+    assert (control.gradient_threshold, control.prune_attenuation) == (2e-4, 0.005)
+    assert (control.reset_every, control.reset_attenuation) == (3000, 0.01)
+    assert limit_steps(paper, 100).optim.steps == paper.optim.steps == 200_000 and paper.optim.batch == 1
 
 
 def test_small_data_sets_get_fewer_steps():

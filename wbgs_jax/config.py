@@ -1,8 +1,8 @@
 """Settings of a training that every field shares; what belongs to one field stands in its own file under `fields/`.
 
 A run's settings are those of its field, of the optimiser, of the host loop, and of the host controls that the field asks
-for. All can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. Where the
-paper or the authors' code give a value it is the default of the `gpu` preset; docs/decisions.md says what was measured.
+for. All can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. The paper's own
+values are the wideband field's preset `paper`; docs/decisions.md says what was measured.
 """
 
 import dataclasses
@@ -108,7 +108,7 @@ PRESETS: Mapping[str, Settings] = {
     ),
     # The default without a GPU.
     "cpu": Settings(),
-    # The paper's size.
+    # For a GPU: larger networks, and a Gaussian for every vertex.
     "gpu": Settings(optim=OptimConfig(steps=20_000, batch=8), loop=LoopConfig(epoch_steps=100, checkpoint_every=2000)),
 }
 """What the presets of all fields have in common."""

@@ -16,7 +16,7 @@ import tyro
 from wbgs_jax._util.command import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.config import PRESETS, Settings, check, from_sections, sections
+from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, get_field
@@ -39,7 +39,7 @@ class Command:
     field: str = dataclasses.field(default_factory=default_field)
     """The model."""
     preset: str = "cpu"
-    """smoke (less than a minute), cpu (the default without a GPU) or gpu (the paper's size)."""
+    """smoke (less than a minute), cpu (the default without a GPU), gpu, or paper (of the wideband field: the paper's form)."""
     seed: int = 0
     """Seed of everything that is drawn at random."""
     resume: bool = False
@@ -67,8 +67,8 @@ def parse(arguments: list[str]) -> tuple[Command, Settings]:
     field = option_value(arguments, "--field", default_field())
     preset = option_value(arguments, "--preset", default_preset())
     kind = get_field(field)
-    if preset not in PRESETS:
-        raise UserError(f"unknown preset {preset!r}; choose one of: {', '.join(PRESETS)}")
+    if preset not in kind.presets:
+        raise UserError(f"{field} has no preset {preset!r}; choose one of: {', '.join(kind.presets)}")
     parts = sections(kind.presets[preset], field)
     everything = "--help-settings" in arguments
     if everything:

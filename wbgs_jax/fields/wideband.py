@@ -30,7 +30,7 @@ from wbgs_jax.fields.em_features import (
     query_features,
 )
 from wbgs_jax.fields.encoding import check_octaves, positional_encoding
-from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, WidebandConfig
+from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, PAPER, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
 from wbgs_jax.types import (
     Batch,
@@ -81,7 +81,7 @@ class WidebandField(Field):
     config: WidebandConfig = static()
 
     name: ClassVar[str] = "wideband"
-    presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY)
+    presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY) | {"paper": PAPER}
     controls: ClassVar = ("density",)
 
     @classmethod
