@@ -52,6 +52,8 @@ class Command:
     """Train with this number of transmitters; 0: all that are not held out."""
     validation: float = VALIDATION
     """Share of the training transmitters that the curves watch and choices are made by, where the data name none; 0: none."""
+    test_box: tuple[float, ...] = ()
+    """Test at all transmitters in a box, x y z of its lowest and of its highest corner (metres), and train at the others."""
     receiver: int | None = None
     """Look at this receiver alone, of data that have several."""
 
@@ -101,6 +103,10 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
         raise UserError("give either --scene (1, 2, ... or a .npz file) or --data (a folder of spectra)")
     if not 0 <= command.validation < 1:
         raise UserError(f"--validation is {command.validation}; it is a share of the training transmitters, 0 to 1")
+    if len(command.test_box) not in (0, 6):
+        raise UserError(
+            f"--test-box has {len(command.test_box)} numbers; give six: x y z of the lowest corner, then of the highest"
+        )
     check(settings)
     get_field(command.field).check(settings.field)
     source = command.scene if command.data is None else command.data
@@ -116,6 +122,7 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
         train_ghz=tuple(command.train_ghz),
         train_tx=command.train_tx,
         validation=command.validation,
+        test_box=tuple(command.test_box),
         receiver=command.receiver,
     )
 

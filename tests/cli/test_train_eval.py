@@ -213,6 +213,8 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "share"]),
         (["--scene", "SCENE", "--receiver", "1"], ["receivers 0 to 0"]),
         (["--scene", "SCENE", "--train-tx", "5"], ["4 training transmitters"]),
+        (["--scene", "SCENE", "--test-box", "0", "0", "0"], ["--test-box has 3 numbers"]),
+        (["--scene", "SCENE", "--test-box", "90", "90", "90", "91", "91", "91"], ["no transmitter", "choose another"]),
         (["--scene", "SCENE", "--train-ghz", "28"], ["no spectra at 28 GHz"]),
     ],
 )

@@ -13,6 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import (
     fewer_transmitters,
     group_transmitters,
+    hold_out_box,
     hold_out_validation,
     select_frequencies,
     select_receivers,
@@ -182,6 +183,35 @@ def test_validation_keeps_the_training_frequencies(dataset):
     assert set(chosen.frequencies_hz[chosen.validation] / 1e9) == {1, 24.25}
     assert set(chosen.frequencies_hz[chosen.test] / 1e9) == {2.4}
     assert set(chosen.tx_index[chosen.validation]) == set(held.tx_index[held.validation])
+
+
+# Whole rooms
+
+
+def test_a_box_tests_all_that_is_in_it_and_trains_nothing_of_it(three):
+    held = hold_out_validation(three, 0.3)
+    places = np.sort(held.tx_positions[:, 0])
+    low, high = [(places[0] + places[1]) / 2 - 1, -99, -99], [np.median(places), 99, 99]
+    split = hold_out_box(held, low, high)
+    inside = (held.tx_positions[:, 0] >= low[0]) & (held.tx_positions[:, 0] <= high[0])
+    np.testing.assert_array_equal(split.test, np.flatnonzero(inside))
+    for part in ("train", "validation"):
+        before, after = getattr(held, part), getattr(split, part)
+        np.testing.assert_array_equal(after, before[~inside[before]])
+    assert not set(split.tx_index[split.train]) & set(split.tx_index[split.test]) and split.name.startswith("box_box")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ((0, 0, 0), (1, -1, 1), "is empty"),
+        ((90, 90, 90), (91, 91, 91), "no transmitter of five"),
+        ((-99, -99, -99), (99, 99, 99), "every training transmitter of five"),
+    ],
+)
+def test_a_box_of_nothing_or_everything(dataset, low, high, message):
+    with pytest.raises(UserError, match=message):
+        hold_out_box(dataset, low, high)
 
 
 # Receivers

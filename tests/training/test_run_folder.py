@@ -38,7 +38,9 @@ def test_round_trip_through_the_folder(tmp_path, preset, field):
 
 
 def test_what_is_not_a_default_comes_back_too(tmp_path):
-    config = dataclasses.replace(CONFIG, train_ghz=(1.0, 94.0), train_tx=3, validation=0.25, receiver=1)
+    config = dataclasses.replace(
+        CONFIG, train_ghz=(1.0, 94.0), train_tx=3, validation=0.25, receiver=1, test_box=(0.0, 0.0, 0.0, 1.0, 2.0, 3.5)
+    )
     write_config(tmp_path / "run", config)
     assert read_config(tmp_path / "run") == config
     assert isinstance(read_config(tmp_path / "run").train_ghz, tuple)

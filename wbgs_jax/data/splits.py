@@ -94,6 +94,27 @@ def fewer_transmitters(dataset: Dataset, count: int, seed: int) -> Dataset:
     return dataclasses.replace(dataset, train=train, name=f"{dataset.name}_tx{count}")
 
 
+def hold_out_box(dataset: Dataset, low: Sequence[float | int], high: Sequence[float | int]) -> Dataset:
+    """Returns a data set that tests at all transmitters within a box (corners in metres), such as a room, and trains at none of
+    them. Test transmitters elsewhere are left out. The name says so.
+
+    Raises:
+        UserError: the box is empty, or it leaves nothing to train or to test.
+    """
+    lowest, highest = np.asarray(low, float), np.asarray(high, float)
+    if not (lowest < highest).all():
+        raise UserError(f"a box from {list(low)} to {list(high)} is empty; give its lowest corner first, then its highest")
+    inside = np.all((dataset.tx_positions >= lowest) & (dataset.tx_positions <= highest), axis=1)
+    train, validation = (part[~np.take(inside, part)] for part in (dataset.train, dataset.validation))
+    if not inside.any() or not len(train):
+        where = "no" if not inside.any() else "every training"
+        raise UserError(
+            f"{where} transmitter of {dataset.name} lies in the box from {list(low)} to {list(high)}; choose another"
+        )
+    name = f"{dataset.name}_box" + "_".join(f"{x:g}" for x in (*low, *high))
+    return dataclasses.replace(dataset, train=train, validation=validation, test=np.flatnonzero(inside), name=name)
+
+
 def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
     """Returns a data set of the links of some receivers, which are numbered 0, 1, ... in the order given. The name says so.
 

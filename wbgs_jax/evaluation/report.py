@@ -48,6 +48,8 @@ def _training_arguments(config: Any) -> list[str]:
         data += ["--train-ghz", *(f"{f:g}" for f in config.train_ghz)]
     if config.train_tx:
         data += ["--train-tx", str(config.train_tx)]
+    if config.test_box:
+        data += ["--test-box", *(f"{x:g}" for x in config.test_box)]
     if config.validation != VALIDATION:
         data += ["--validation", f"{config.validation:g}"]
     if config.receiver is not None:

@@ -18,7 +18,14 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.config import Settings, from_dict, sections, to_dict
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.splits import VALIDATION, fewer_transmitters, hold_out_validation, select_receivers, unseen_frequencies
+from wbgs_jax.data.splits import (
+    VALIDATION,
+    fewer_transmitters,
+    hold_out_box,
+    hold_out_validation,
+    select_receivers,
+    unseen_frequencies,
+)
 from wbgs_jax.fields import Field, from_arrays, get_field
 from wbgs_jax.training import checkpoint
 
@@ -43,6 +50,8 @@ class RunConfig:
     """Number of training transmitters; 0: all."""
     validation: float = VALIDATION
     """Share of the training transmitters that is held out for validation, where the data name none."""
+    test_box: tuple[float, ...] = ()
+    """Test at the transmitters in a box, lowest and highest corner (metres), and train elsewhere; none: as the data say."""
     receiver: int | None = None
     """Number of the only receiver that is looked at; None: all."""
 
@@ -52,6 +61,8 @@ class RunConfig:
         dataset = load_dataset(self.source, frequency_hz=frequency, seed=self.seed)
         if self.receiver is not None:
             dataset = select_receivers(dataset, [self.receiver])
+        if self.test_box:
+            dataset = hold_out_box(dataset, self.test_box[:3], self.test_box[3:])
         if self.train_ghz:
             dataset = unseen_frequencies(dataset, self.train_ghz)
         if self.train_tx:
@@ -97,7 +108,9 @@ def read_config(folder: Path) -> RunConfig:
         raise UserError(f"{path} lacks {error}; it belongs to another version of wbgs-jax: train again") from error
     default = get_field(values["field"]).presets[FIRST_PRESET]
     settings = from_dict(values["settings"], default, values["field"])
-    return RunConfig(**values | {"settings": settings, "train_ghz": tuple(values["train_ghz"])})
+    return RunConfig(
+        **values | {"settings": settings, "train_ghz": tuple(values["train_ghz"]), "test_box": tuple(values["test_box"])}
+    )
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
