@@ -44,7 +44,9 @@ INVARIANT = {"wave": {".log_gain"}}
 """Leaves that scale all snapshots alike, which a normalised spectrum does not show: zero up to rounding."""
 OUTSIDE = {"wave": {".position"}}
 """Leaves that the promise leaves out."""
-NAMES = [*UNUSED, pytest.param("wave with edges", marks=pytest.mark.slow)]
+SLOW = ("wrfgs", "wave with edges")
+"""The wideband field with less, and what compiles for long."""
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in (*UNUSED, "wave with edges")]
 
 
 SMALL_VOLUME = dict.fromkeys(("skip", "point_octaves", "direction_octaves", "tx_octaves", "frequency_octaves"), 1)
@@ -234,7 +236,7 @@ def relative(a, b):
 DESIGN_HZ = 3e9
 
 
-@pytest.mark.parametrize("name", ["wideband", "nerf2", "wave"])
+@pytest.mark.parametrize("name", ["wideband", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nerf2", "wave"))])
 def test_an_array_in_metres_is_one_in_wavelengths_at_its_design_frequency(rng, x64, name):
     """The same spectrum and the same gradient; that of the frequency has a part more, for the array grows with it."""
     (params, receiver, query), weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))

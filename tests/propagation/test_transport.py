@@ -219,7 +219,9 @@ def quadratic_form(materials, search, traced, receiver, frequency):
     return 1e6 * jnp.sum(y.real**2 + 0.3 * y.imag * y.real)
 
 
+@pytest.mark.slow
 def test_gradients_agree_with_finite_differences(x64):
+    """Of the materials alone; `tests/fields/test_gradients.py` has all leaves of the field."""
     search, receiver = as_float64((search_of(FURNISHED, (1, 1, 1.2)), make_receiver((1, 1, 1.2))))
     rest, materials = (search, trace(search, (4.0, 3.0, 1.0)), receiver, jnp.asarray(3e9)), materials_of(search)
     _, gradient = quadratic_form(materials, *rest)
