@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 import tyro
 from jaxtyping import Float
 
@@ -22,6 +21,7 @@ from wbgs_jax import WaveConfig, make_mesh, pas_directions, wave
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data import Dataset, load_dataset
+from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import Field, Observation
@@ -58,15 +58,17 @@ def main() -> None:
     kept = {"line of sight": reflections == 0, "one reflection": reflections <= 1, "two reflections": reflections <= 2}
     kept |= {"two reflections, nothing passes": (reflections <= 2) & (passes == 0), "no line of sight": reflections > 0}
     scores = {name: ssim(dataset, field, keep(prepared, mask)) for name, mask in kept.items()}
-    local = in_sight(dataset)
+    local = directions_to_tx(dataset)
     sine, sight = local[:, 2], power_in_sight(dataset, local)
     horizon = [
         round(float(np.median(sight[dataset.tx_index == tx])), 3) for tx in np.unique(dataset.tx_index[np.abs(sine) < 0.01])
     ]
+    seen = in_sight(dataset, first)
+    assert seen is not None  # the field has been made of its mesh
     report: dict[str, Any] = {
         "dataset": dataset.name,
         "groups": by_group(dataset, sine, scores),
-        "obstructed_transmitters": [i for i, tx in enumerate(dataset.tx_positions[first]) if obstructed(dataset, tx)],
+        "obstructed_transmitters": np.flatnonzero(~seen).tolist(),
         "power_in_sight_on_the_horizon": horizon,
     }
     write_json(command.out / "sample_account.json", report | environment())
@@ -98,7 +100,7 @@ def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> Float[
     return np.concatenate(found)
 
 
-def in_sight(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
+def directions_to_tx(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
     """Returns the unit vector to every spectrum's transmitter in the receiver's frame; its third component is above the array's
     horizon."""
     receiver = dataset.receiver()
@@ -113,19 +115,6 @@ def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[n
     nearest = np.argmax(np.asarray(pas_directions(), np.float32).reshape(-1, 3) @ local.T, 0)
     spectra = (np.asarray(dataset.pas(np.array([i]))).reshape(-1) for i in range(len(dataset)))
     return np.array([spectrum[pixel] ** 2 for spectrum, pixel in zip(spectra, nearest, strict=True)])
-
-
-def obstructed(dataset: Dataset, tx_position: Float[np.ndarray, "3"]) -> bool:
-    """Returns whether any triangle of the whole mesh lies between a transmitter and the receiver."""
-    start = np.asarray(dataset.receiver().position, np.float64)
-    line, triangles = tx_position - start, dataset.vertices[dataset.faces].astype(np.float64)
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    starts, lines = (np.broadcast_to(vector, normals.shape) for vector in (start, line))
-    points, cut, along = trimesh.intersections.planes_lines(
-        triangles[:, 0], trimesh.unitize(normals), starts, lines, return_distance=True
-    )
-    inside = (trimesh.triangles.points_to_barycentric(triangles[cut], points) >= 0).all(1)
-    return bool((inside & (along > 1e-6) & (along < 1 - 1e-6)).any())
 
 
 def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Lines of sight against trimesh and a wall with a door."""
+"""Lines of sight against plain cases and another search of trimesh's."""
 
 import dataclasses
 
@@ -7,7 +7,6 @@ import pytest
 import trimesh
 from synthetic import RX, tiny_dataset
 
-from wbgs_jax.data import sight
 from wbgs_jax.data.sight import in_sight
 
 
@@ -26,10 +25,14 @@ def of_transmitters(dataset):
     return seen[first]
 
 
-@pytest.mark.parametrize("at_once", [1, sight.AT_ONCE])
-def test_it_agrees_with_trimesh(rng, monkeypatch, at_once):
+def test_a_triangle_in_between_obstructs():
+    wall = trimesh.Trimesh(np.array([[1, -5, -5], [1, 5, -5], [1, 0, 8]]) + RX, [[0, 1, 2]])
+    tx = np.array([[2.0, 0.1, 0.2], [0.9, 0.1, 0.2], [2.0, 30.0, 0.2]]) + RX
+    np.testing.assert_array_equal(of_transmitters(with_mesh(wall, tx)), [False, True, True])
+
+
+def test_it_agrees_with_trimeshs_search(rng):
     pytest.importorskip("rtree")
-    monkeypatch.setattr(sight, "AT_ONCE", at_once)
     boxes = [
         trimesh.creation.box((0.5, 0.4, 0.6), trimesh.transformations.translation_matrix(p))
         for p in rng.uniform(-2, 2, (12, 3))
