@@ -17,6 +17,7 @@ from wbgs_jax._util.errors import UserError
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable that names the library; it is respected when set."""
 MINIMUM_VERSION = 17
+NOT_INSTALLED = "sionna-rt is not installed; install it with: pip install 'wbgs-jax[data]'"
 ADVICE = f"install one (Debian, Ubuntu: apt-get install libllvm19) or set {VARIABLE} to the library file"
 CUDA, LLVM = "cuda", "llvm"
 
@@ -71,7 +72,7 @@ def find_backend() -> tuple[str, str]:
     try:
         importlib.metadata.version("sionna-rt")
     except importlib.metadata.PackageNotFoundError:
-        raise UserError("sionna-rt is not installed; install it with: pip install 'wbgs-jax[data]'") from None
+        raise UserError(NOT_INSTALLED) from None
     # nvidia-smi first: without a driver the CUDA probe would only cost time.
     if _succeeds(["nvidia-smi", "-L"]) and probe(CUDA):
         return CUDA, ""

@@ -67,30 +67,33 @@ GAUSSIANS_AND_NETWORKS = {
     "weight_decay_0.1": _of_field(network_weight_decay=0.1),
     "fixed_means": _of_field(means_lr=0.0),
 }
-_WARM: dict[str, Mapping[str, object]] = {"optim": {"warmup": 0.1}}
-_FAST = {"network_lr": 1.6e-2}
 _BLIND = {"attenuation_frequency": False, "radiance_frequency": False}
+_Values = Mapping[str, object]
+
+
+def _warm(network_lr: float, field: _Values | None = None, optim: _Values | None = None, steps: int | None = None) -> Variant:
+    """A rate of the networks after a warm-up, and further changes."""
+    return Variant(
+        {"field": {"network_lr": network_lr, **(field or {})}, "optim": {"warmup": 0.1, **(optim or {})}}, steps=steps
+    )
+
+
 FREQUENCY = {
-    "f_off": Variant({"field": _FAST | _BLIND, **_WARM}),
-    "f_input": Variant({"field": _FAST, **_WARM}),
-    "f_degree_4": Variant({"field": _FAST | {"frequency_degree": 4}, **_WARM}),
-    "f_heads_2": Variant({"field": _FAST | _BLIND | {"frequency_heads": 2}, **_WARM}),
-    "f_heads_4": Variant({"field": _FAST | _BLIND | {"frequency_heads": 4}, **_WARM}),
-    "f_both": Variant({"field": _FAST | {"frequency_heads": 3, "frequency_degree": 3}, **_WARM}),
+    "f_off": _warm(HIGHER_RATE, _BLIND),
+    "f_input": _warm(HIGHER_RATE),
+    "f_degree_4": _warm(HIGHER_RATE, {"frequency_degree": 4}),
+    "f_heads_2": _warm(HIGHER_RATE, _BLIND | {"frequency_heads": 2}),
+    "f_heads_4": _warm(HIGHER_RATE, _BLIND | {"frequency_heads": 4}),
+    "f_both": _warm(HIGHER_RATE, {"frequency_heads": 3, "frequency_degree": 3}),
 }
 """What the frequency is to the networks."""
 SCHEDULES = {
-    "warm_8e-3": Variant({"field": {"network_lr": 8e-3}, "optim": {"warmup": 0.1}}),
-    "warm_1.6e-2": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1}}),
-    "warm_2.4e-2": Variant({"field": {"network_lr": 2.4e-2}, "optim": {"warmup": 0.1}}),
-    "warm_1.6e-2_to_0": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1, "final_fraction": 1e-3}}),
-    "warm_1.6e-2_gaussians": Variant(
-        {
-            "field": {"network_lr": 1.6e-2, "means_lr": 3e-3, "log_scales_lr": 1.5e-2, "quats_lr": 3e-3, "opacity_lr": 7.5e-2},
-            "optim": {"warmup": 0.1},
-        }
-    ),
-    "warm_1.6e-2_batch_4": Variant({"field": {"network_lr": 1.6e-2}, "optim": {"warmup": 0.1, "batch": 4}}, steps=4000),
+    "warm_8e-3": _warm(8e-3),
+    "warm_1.6e-2": _warm(1.6e-2),
+    "warm_2.4e-2": _warm(2.4e-2),
+    "warm_1.6e-2_to_0": _warm(1.6e-2, optim={"final_fraction": 1e-3}),
+    "warm_1.6e-2_gaussians": _warm(1.6e-2, {"means_lr": 3e-3, "log_scales_lr": 1.5e-2, "quats_lr": 3e-3, "opacity_lr": 7.5e-2}),
+    "warm_1.6e-2_batch_4": _warm(1.6e-2, optim={"batch": 4}, steps=4000),
     "steps_6000": Variant(steps=6000),
 }
 """How fast, and how long."""

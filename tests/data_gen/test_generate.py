@@ -239,7 +239,7 @@ def test_another_array_is_in_the_file(simulator_backend, tmp_path):
     np.testing.assert_array_equal(scene.rx_orientation, [[0, 0, 0, 1]])
 
 
-@pytest.mark.skipif(importlib.util.find_spec("sionna") is None, reason="sionna-rt is not installed")
+@pytest.mark.skipif(importlib.util.find_spec("sionna") is None, reason=llvm.NOT_INSTALLED)
 def test_no_usable_libllvm_is_told_in_one_line(monkeypatch):
     monkeypatch.setattr(llvm, "probe", lambda *_: False)
     monkeypatch.setattr(llvm, "_succeeds", lambda *_: False)

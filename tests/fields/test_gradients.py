@@ -133,7 +133,8 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
     kind = name.split()[0]
     arguments, weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
     (value, spectra), gradients = differentiated(name)(arguments, weights)
-    assert np.isfinite(float(value)) and np.asarray(spectra).std(axis=(1, 2)).min() > 1e-3
+    pixels = np.asarray(spectra).reshape(2, -1)
+    assert np.isfinite(float(value)) and (pixels.std(1) > 0.01 * pixels.mean(1)).all()  # a uniform picture would test nothing
     leaves, structure = jax.tree.flatten(arguments)
     for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
         leaf, gradient, where = leaves[i], np.asarray(gradient), jax.tree_util.keystr(path)

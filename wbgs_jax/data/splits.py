@@ -49,9 +49,8 @@ def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Datas
     tx_index = dataset.tx_index[dataset.train]
     if len(dataset.validation) or len(np.unique(tx_index)) < 2:
         return dataset
-    moved = _draw(
-        tx_index, fraction, np.random.default_rng(zlib.crc32(np.unique(tx_index).astype("<i8").tobytes())), "validation"
-    )
+    seed = zlib.crc32(np.unique(tx_index).astype("<i8").tobytes())
+    moved = _draw(tx_index, fraction, np.random.default_rng(seed), "validation")
     return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])
 
 
@@ -136,9 +135,14 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
     )
 
 
+def training_links(dataset: Dataset) -> Int[np.ndarray, "n"]:
+    """Returns the indices of all links that a training may look at, ascending."""
+    return np.sort(np.concatenate([dataset.train, dataset.validation]))
+
+
 def without_test(dataset: Dataset) -> Dataset:
-    """Returns the data set without its test links: what a training may look at."""
-    return _keep_links(dataset, np.sort(np.concatenate([dataset.train, dataset.validation])))
+    """Returns the data set of its `training_links` alone."""
+    return _keep_links(dataset, training_links(dataset))
 
 
 def _keep_links(dataset: Dataset, kept: Int[np.ndarray, "n"]) -> Dataset:

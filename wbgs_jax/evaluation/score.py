@@ -30,12 +30,16 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     index = held_out(dataset, part)
     seen = observe_links(trained.field, trained.params, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
-    report |= figures(seen, dataset, index) | time_queries(trained, dataset)
-    if dataset.kind != "power":
-        known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
-        report["baselines"] = {
-            name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()
-        }
+    if dataset.kind == "power":
+        return report | power_figures(seen, dataset, index) | time_queries(trained, dataset), np.asarray(seen.pas)
+    known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
+    report |= metrics.score(np.asarray(seen.pas), *known)
+    if seen.snapshots is not None and dataset.snapshots is not None:
+        report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
+    report |= time_queries(trained, dataset)
+    report["baselines"] = {
+        name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()
+    }
     return report, np.asarray(seen.pas)
 
 
@@ -47,18 +51,11 @@ def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
     return index
 
 
-def figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any]:
-    """Returns the figures of observed links: of spectra, snapshots where both have them, power where it is all there is."""
-    frequencies = dataset.frequencies_hz[index]
-    if dataset.kind == "power":
-        if seen.power_db is None or dataset.power_db is None:
-            raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
-        return metrics.score_power(np.asarray(seen.power_db), dataset.power_db[index], frequencies)
-    truth, sight = np.asarray(dataset.pas(index)), in_sight(dataset, index)
-    report = metrics.score(np.asarray(seen.pas), truth, frequencies, sight)
-    if seen.snapshots is not None and dataset.snapshots is not None:
-        report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
-    return report
+def power_figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any]:
+    """Returns the figures of links of which received power is all that was observed."""
+    if seen.power_db is None or dataset.power_db is None:
+        raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
+    return metrics.score_power(np.asarray(seen.power_db), dataset.power_db[index], dataset.frequencies_hz[index])
 
 
 def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
@@ -75,7 +72,7 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     if dataset.kind == "power":
-        return {"held_out_power_error_db": figures(seen, dataset, index)["power_error_db"]}
+        return {"held_out_power_error_db": power_figures(seen, dataset, index)["power_error_db"]}
     return {"held_out_ssim": float(np.median(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index)))))}
 
 

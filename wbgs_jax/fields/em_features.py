@@ -116,8 +116,6 @@ def _query_inputs(
 def encoded_frequency(frequency_hz: Float[Array, "b"], config: WidebandConfig) -> Float[Array, "b d"]:
     """Returns what the networks see of the frequency."""
     encoded = frequency_encoding(frequency_hz, config.frequency_octaves, config.frequency_scale)
-    if config.frequency_degree == 1:
-        return encoded
     return jnp.concatenate([encoded, legendre(scale_frequency(frequency_hz), config.frequency_degree)[:, 1:]], -1)
 
 

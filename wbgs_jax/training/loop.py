@@ -20,7 +20,7 @@ from jaxtyping import Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.splits import without_test
+from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, field_names, from_arrays, get_field
@@ -60,7 +60,7 @@ class Run:
     """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
 
     def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path):
-        self.numbers = np.sort(np.concatenate([dataset.train, dataset.validation]))  # of the links, as the data count them
+        self.numbers = training_links(dataset)  # of the links, as the data count them
         dataset = without_test(dataset)  # nothing in a training can look at the test
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
@@ -74,8 +74,8 @@ class Run:
         self.data: TrainingData = training_data(dataset)
         self.cache = self.field.prepare(self.data.links, self.data.receivers)
         rng = np.random.default_rng([seed, 1])
-        part = dataset.validation
-        self.watched = np.sort(rng.choice(part, min(settings.loop.evaluate_spectra, len(part)), replace=False))
+        watched = min(settings.loop.evaluate_spectra, len(dataset.validation))
+        self.watched = np.sort(rng.choice(dataset.validation, watched, replace=False))
 
     @property
     def step(self) -> int:
