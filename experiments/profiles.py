@@ -52,6 +52,8 @@ PROFILES = {
     "tuning": Profile("cpu", 1000, 600, **QUICK, scored_tx=SCORED_SLOW),
     "schedules": Profile("cpu", 2000, 600, validation=True),
     "frequency": Profile("cpu", 1000, 600, validation=True),
+    # What an hour on one core allows of the preset `paper`, Gaussians and steps.
+    "paper_form": Profile("paper", 30_000, 4000, {"density": {"max_gaussians": 4000}}, {"wideband": {"gaussians": 3000}}),
     "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
     "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
 }
