@@ -27,6 +27,7 @@ from .inference.maps import map_queries as map_queries
 from .inference.maps import predict_blocks as predict_blocks
 from .inference.maps import predict_many as predict_many
 from .inference.maps import predict_map as predict_map
+from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
 from .radio.array import cbf as cbf
 from .radio.array import pas_directions as pas_directions

@@ -33,7 +33,7 @@ from wbgs_jax.fields import Field, Observation, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.maps import predict_many
-from wbgs_jax.inference.predictor import BLOCK, predictor, trained_band
+from wbgs_jax.inference.predictor import BLOCK, check_power, predictor, trained_band
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
@@ -149,6 +149,8 @@ def ask_channel(
     if not enough & set(trained.field.gives):
         able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
         raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field {able}")
+    if what == "power":
+        check_power(trained.field, dataset)
     plan = trained.field.plan(trained.params, dataset.receiver())
     name, function = CHANNEL[what]
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Key
 from wbgs_jax._util.checks import check_array, concrete
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
+from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.radio.patterns import pattern_exponent
 
 ElementUnit = Literal["wavelengths", "metres"]
@@ -105,6 +106,11 @@ class Batch:
     """Received power relative to the transmitted power, dB."""
     key: Key[Array, ""]
     """Randomness of this training step."""
+
+    @property
+    def received_db(self) -> Float[Array, "b"] | None:
+        """The received power (dB), observed or of the snapshots; None where spectra alone are known."""
+        return self.power_db if self.snapshots is None else received_power_db(self.snapshots)
 
 
 @pytree

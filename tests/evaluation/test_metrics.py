@@ -9,7 +9,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.evaluation.beams import angle_error_deg, beam_loss_db
-from wbgs_jax.evaluation.metrics import PSNR_LIMIT_DB, mae, psnr_db, score, score_power, ssim
+from wbgs_jax.evaluation.metrics import PSNR_LIMIT_DB, mae, psnr_db, score, ssim
 
 
 @pytest.fixture
@@ -102,29 +102,6 @@ def test_a_prediction_that_is_no_number_is_refused(pair, value):
 def test_nothing_to_score():
     with pytest.raises(UserError, match="no spectrum"):
         score(np.zeros((0, 90, 360), np.float32), np.zeros((0, 90, 360), np.float32), np.zeros(0))
-
-
-def test_powers_are_scored_in_decibels():
-    truth = np.array([-60.0, -70, -80, -90])
-    frequencies = np.array([1e9, 94e9, 1e9, 1e9])
-    report = score_power((truth + np.array([1, -7, 2, -4])).astype(np.float32), truth, frequencies)
-    assert report == {
-        "n": 4,
-        "power_error_db": 3.0,
-        "per_frequency": [
-            {"frequency_ghz": 1.0, "n": 3, "power_error_db": 2.0},
-            {"frequency_ghz": 94.0, "n": 1, "power_error_db": 7.0},
-        ],
-    }
-    assert json.loads(json.dumps(report, allow_nan=False)) == report
-
-
-@pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_a_power_that_is_no_number_is_refused(value):
-    with pytest.raises(UserError, match="1 of 3 predicted powers"):
-        score_power(np.array([1, value, 2]), np.zeros(3), np.ones(3))
-    with pytest.raises(UserError, match="no link"):
-        score_power(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 def test_a_scene_is_scored_in_seconds(rng):

@@ -17,6 +17,7 @@ from wbgs_jax.data.sight import in_sight
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.power import power_figures
 from wbgs_jax.evaluation.score import evaluate, held_out, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
@@ -90,12 +91,13 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
         assert report[key] == value
     for key, value in score_snapshots(seen.snapshots, dataset.snapshots[dataset.test]).items():
         assert report[key] == value
+    assert report["power"] == power_figures(seen.power_db, dataset, dataset.test)
     assert report["baselines"].keys() == baselines(dataset).keys()
     nearest = metrics.score(baselines(dataset)["nearest_tx"](dataset.test), truth, frequencies, sight)
     assert report["baselines"]["nearest_tx"] == nearest
     assert report["ms_per_pas"] > 0 and report["ms_per_pas_single"] > 0
     json.dumps(report, allow_nan=False)
-    assert not {"snapshot_correlation", "power_error_db"} & evaluate(blind, dataset)[0].keys()
+    assert not {"snapshot_correlation", "power_error_db", "power"} & evaluate(blind, dataset)[0].keys()
 
 
 def test_powers_are_scored_where_there_is_nothing_else(knowing, blind):
@@ -103,7 +105,7 @@ def test_powers_are_scored_where_there_is_nothing_else(knowing, blind):
     report, _ = evaluate(knowing, powers)
     error = np.abs(-60 + powers.tx_positions[powers.test, 0] - powers.power_db[powers.test])
     assert report["power_error_db"] == pytest.approx(np.median(error), rel=1e-5)
-    assert "median_ssim" not in report and "baselines" not in report
+    assert "median_ssim" not in report and report["baselines"].keys() == {"free_space", "nearest_tx"}
     assert [row["frequency_ghz"] for row in report["per_frequency"]] == (FREQUENCIES_HZ / 1e9).tolist()
     assert watch(knowing.field, knowing.params, powers, powers.test) == {"held_out_power_error_db": report["power_error_db"]}
     with pytest.raises(UserError, match="received powers, of which this field knows nothing"):

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 from wbgs_jax.fields import losses
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation, pixel_loss, snapshot_losses
 
-ssim, image_loss = jax.jit(losses.ssim), jax.jit(losses.image_loss, static_argnums=2)
+ssim, image_loss = jax.jit(losses.ssim, static_argnums=2), jax.jit(losses.image_loss, static_argnums=(2, 3))
 
 
 @pytest.fixture
@@ -46,6 +46,17 @@ def test_ssim_equals_scikit_image_with_the_gaussian_window(images):
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     expected = [structural_similarity(np.asarray(a), np.asarray(b), **options) for a, b in zip(*images, strict=True)]
     np.testing.assert_allclose(ssim(*images), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("stride", [2, 3])
+def test_a_stride_leaves_out_windows(images, stride):
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "full": True}
+    for i, (a, b) in enumerate(zip(*images, strict=True)):
+        _, everywhere = structural_similarity(np.asarray(a), np.asarray(b), **options)
+        windows = everywhere[5:-5, 5:-5]  # those that lie within the picture
+        expected = windows[::stride, ::stride].mean()
+        assert float(ssim(*images, stride)[i]) == pytest.approx(expected, rel=1e-10)
+        assert abs(expected - windows.mean()) > 1e-9
 
 
 def test_identical_images_give_one(images):

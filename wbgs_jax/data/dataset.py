@@ -10,6 +10,7 @@ from jaxtyping import Array, Complex, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas
+from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.types import Links, Query, Receiver
 
 Kind = Literal["snapshot", "pas", "power"]
@@ -125,6 +126,13 @@ class Dataset:
             chosen = which == number
             spectra[chosen] = snapshot_to_pas(jnp.asarray(snapshots[chosen]), element_positions)
         return jnp.asarray(spectra)
+
+    def received_db(self, index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"] | None:
+        """Returns the received power of some links (dB, relative to the transmitted power), observed or of the snapshots; None
+        where spectra alone are known, which have no scale."""
+        if self.power_db is not None:
+            return self.power_db[index]
+        return None if self.snapshots is None else np.asarray(received_power_db(jnp.asarray(self.snapshots[index])))
 
     def _arrays(self, index: Int[np.ndarray, "b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, "b"]]:
         """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""

@@ -57,13 +57,20 @@ def nearest_tx(dataset: Dataset) -> Baseline:
 
     def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
-        for chosen, neighbours in _by_frequency(dataset, index):
-            nearest = neighbours[_squared_distances(dataset, index[chosen], neighbours).argmin(1)]
-            for part, block in zip(_blocks(chosen), _blocks(nearest), strict=True):
-                predicted[part] = dataset.pas(block)
+        nearest = nearest_links(dataset, index, dataset.train)
+        for part in _blocks(np.arange(len(index))):
+            predicted[part] = dataset.pas(nearest[part])
         return predicted
 
     return predict
+
+
+def nearest_links(dataset: Dataset, index: Int[np.ndarray, "b"], known: Int[np.ndarray, "m"]) -> Int[np.ndarray, "b"]:
+    """Returns for every link the one among `known` of the nearest transmitter, at the same frequency and receiver."""
+    nearest = np.zeros(len(index), int)
+    for chosen, neighbours in _by_frequency(dataset, index, known):
+        nearest[chosen] = neighbours[_squared_distances(dataset, index[chosen], neighbours).argmin(1)]
+    return nearest
 
 
 def inverse_distance(dataset: Dataset) -> Baseline:
@@ -71,7 +78,7 @@ def inverse_distance(dataset: Dataset) -> Baseline:
 
     def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
-        for chosen, neighbours in _by_frequency(dataset, index):
+        for chosen, neighbours in _by_frequency(dataset, index, dataset.train):
             # A square micrometre keeps a transmitter that itself trained (at another frequency) from dividing by zero.
             weights = 1 / np.maximum(_squared_distances(dataset, index[chosen], neighbours), 1e-12)
             weights = (weights / weights.sum(1, keepdims=True)).astype(np.float32)
@@ -106,11 +113,11 @@ def line_of_sight(dataset: Dataset) -> Baseline:
     return predict
 
 
-def _by_frequency(dataset: Dataset, index: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields for every receiver and frequency asked: places in `index`, and the training spectra to predict them from."""
+def _by_frequency(dataset: Dataset, index: np.ndarray, among: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields for every receiver and frequency asked: places in `index`, and the links `among` which to predict them from."""
     asked, asked_of = dataset.frequencies_hz[index], dataset.receiver_index[index]
     for number in np.unique(asked_of):
-        own = dataset.train[dataset.receiver_index[dataset.train] == number]
+        own = among[dataset.receiver_index[among] == number]
         if not len(own):
             raise UserError(f"{dataset.name} has no training spectra of receiver {number}; choose another split")
         trained = dataset.frequencies_hz[own]

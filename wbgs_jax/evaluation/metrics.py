@@ -78,29 +78,6 @@ def score(
     return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | figures for f, figures in by_frequency]}
 
 
-def score_power(
-    predicted: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"], frequencies_hz: Float[np.ndarray, "n"]
-) -> dict[str, Any]:
-    """Returns a report of received powers (dB), ready for JSON: n, power_error_db (median absolute error), per_frequency.
-
-    Raises:
-        UserError: there is no link, or a prediction is NaN or infinite.
-    """
-    if len(predicted) == 0:
-        raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
-    error = np.abs(predicted.astype(np.float64) - truth)
-    if not np.isfinite(error).all():
-        raise UserError(
-            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged"
-        )
-
-    def summary(chosen: np.ndarray) -> dict[str, Any]:
-        return {"n": len(chosen), "power_error_db": float(np.median(chosen))}
-
-    rows = [{"frequency_ghz": float(f / 1e9)} | summary(error[frequencies_hz == f]) for f in np.unique(frequencies_hz)]
-    return summary(error) | {"per_frequency": rows}
-
-
 def _summary(values: dict[str, np.ndarray]) -> dict[str, Any]:
     return {
         "n": len(values["ssim"]),

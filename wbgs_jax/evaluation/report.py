@@ -97,12 +97,18 @@ def table(report: dict[str, Any]) -> Table:
 
 def _power_table(report: dict[str, Any]) -> Table:
     result = Table(title=f"{report['scene']}, {report['field']}: received power of {report['n']} held-out links")
-    for column in ("GHz", "median error dB"):
+    names = list(report["baselines"])
+    for column in ("GHz", "median error dB", "mean", *(name.replace("_", " ") for name in names)):
         result.add_column(column, justify="right")
-    for own in report["per_frequency"]:
-        result.add_row(f"{own['frequency_ghz']:g}", f"{own['power_error_db']:.2f}")
+
+    def row(label: str, own: dict[str, Any], others: list[dict[str, Any]]) -> None:
+        means = [f"{figures['power_mae_db']:.2f}" for figures in (own, *others)]
+        result.add_row(label, f"{own['power_error_db']:.2f}", *means)
+
+    for i, own in enumerate(report["per_frequency"]):
+        row(f"{own['frequency_ghz']:g}", own, [report["baselines"][name]["per_frequency"][i] for name in names])
     result.add_section()
-    result.add_row("all", f"{report['power_error_db']:.2f}")
+    row("all", report, [report["baselines"][name] for name in names])
     return result
 
 
@@ -121,5 +127,8 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
     if "snapshot_correlation" in report:
         alike, error = report["snapshot_correlation"], report["power_error_db"]
         lines.append(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")
+    if power := report.get("power"):
+        others = ", ".join(f"{name.replace('_', ' ')} {own['power_mae_db']:.2f} dB" for name, own in power["baselines"].items())
+        lines.append(f"received power: {power['power_mae_db']:.2f} dB off ({others}; means)")
     single = report["ms_per_pas_single"]
     return [*lines, f"{report['ms_per_pas']:.2f} ms a PAS in blocks of {block}, {single:.2f} ms for a single query"]

@@ -13,6 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.power import power_figures
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.predictor import BLOCK, Trained, observe_links, render_pas
 from wbgs_jax.radio import channel
@@ -30,12 +31,14 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     index = held_out(dataset, part)
     seen = observe_links(trained.field, trained.params, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
+    power = power_of(seen, dataset, index)
     if dataset.kind == "power":
-        return report | power_figures(seen, dataset, index) | time_queries(trained, dataset), np.asarray(seen.pas)
+        return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
     known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
     report |= metrics.score(np.asarray(seen.pas), *known)
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
+    report |= {"power": power} if power else {}
     report |= time_queries(trained, dataset)
     report["baselines"] = {
         name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()
@@ -51,11 +54,17 @@ def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
     return index
 
 
-def power_figures(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any]:
-    """Returns the figures of links of which received power is all that was observed."""
-    if seen.power_db is None or dataset.power_db is None:
+def power_of(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
+    """Returns the figures of received power (`power.power_figures`); None where field or data know none.
+
+    Raises:
+        UserError: the data know power alone, and the field nothing of it.
+    """
+    if seen.power_db is not None:
+        return power_figures(np.asarray(seen.power_db), dataset, index)
+    if dataset.kind == "power":
         raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
-    return metrics.score_power(np.asarray(seen.power_db), dataset.power_db[index], dataset.frequencies_hz[index])
+    return None
 
 
 def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
@@ -72,7 +81,7 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     if dataset.kind == "power":
-        return {"held_out_power_error_db": power_figures(seen, dataset, index)["power_error_db"]}
+        return {"held_out_power_error_db": (power_of(seen, dataset, index) or {})["power_error_db"]}
     return {"held_out_ssim": float(np.median(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index)))))}
 
 

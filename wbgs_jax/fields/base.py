@@ -20,7 +20,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves
 from wbgs_jax.config import PRESETS, Settings
 from wbgs_jax.fields.losses import image_loss
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
 
 Quantity = Literal["pas", "snapshots", "power", "paths"]
@@ -149,14 +149,24 @@ class Field(ABC):
         return jax.tree.map(lambda _: "all", params)
 
 
-def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2) -> tuple[Float[Array, ""], Aux]:
+def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stride: int = 1) -> tuple[Float[Array, ""], Aux]:
     """Returns the image loss (paper, equation 5) of observed spectra, or the mean squared error in dB of received power."""
     if batch.pas is not None:
-        loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight)
+        loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight, ssim_stride)
         return loss, Aux({"batch_ssim": similarity})
     if seen.power_db is None or batch.power_db is None:
         raise UserError("these data are received powers, of which this field knows nothing; choose another field")
     return jnp.mean((seen.power_db - batch.power_db) ** 2), Aux({})
+
+
+def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
+    """Returns the mean absolute error of received power (dB) over the links that are heard; None where one side does not know
+    it."""
+    received = batch.received_db
+    if seen.power_db is None or received is None:
+        return None
+    heard = received > NOT_HEARD_DB
+    return jnp.sum(jnp.abs(seen.power_db - received) * heard) / jnp.maximum(jnp.sum(heard), 1)
 
 
 def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any = None) -> Float[Array, "b 90 360"]:

@@ -1,7 +1,7 @@
 """What the EM feature networks say of every Gaussian and query (paper, sections 4.2 and 4.5), in two steps: what depends on the
 Gaussian alone, once for all queries, and the rest."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
@@ -11,19 +11,33 @@ from wbgs_jax.fields.encoding import frequency_encoding, legendre, positional_en
 from wbgs_jax.fields.networks import (
     AttenuationNetwork,
     GaussianSums,
+    PowerNetwork,
     RadianceNetwork,
     attenuation_activation,
     signal_activation,
 )
 from wbgs_jax.fields.wideband_settings import WidebandConfig
 from wbgs_jax.radio.array import EXACT, array_response, steering_vector
+from wbgs_jax.radio.channel import free_space_db
 from wbgs_jax.radio.geometry import smooth_length, to_local
 from wbgs_jax.types import Gaussians, Query, Receiver
 
 MAX_ATTENUATION = 0.99
 RELATIVE_FEATURES = 7
+POWER_UNIT_DB = 10.0
 Weights = dict[str, Any]
-"""Of both networks, by name."""
+"""Of all networks, by name."""
+
+
+class QueryFeatures(NamedTuple):
+    """What the networks say of N Gaussians and B queries."""
+
+    attenuation: Float[Array, "n b"]
+    """The final attenuation delta."""
+    signal: Float[Array, "n b"]
+    """Sig."""
+    summary: Float[Array, "b width"]
+    """The mean over the Gaussians of the hidden features h."""
 
 
 @pytree
@@ -48,11 +62,11 @@ class GaussianFeatures:
     """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
 
 
-def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork]:
-    """Returns the EM feature networks."""
+def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork, PowerNetwork]:
+    """Returns the EM feature networks, and that of the received power."""
     heads = 1 + config.frequency_heads
     attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion, heads)
-    return attenuation, RadianceNetwork(config.radiance_widths, heads)
+    return attenuation, RadianceNetwork(config.radiance_widths, heads), PowerNetwork(config.width)
 
 
 def gaussian_features(
@@ -77,10 +91,10 @@ def query_features(
     receiver: Receiver,
     config: WidebandConfig,
     query: Query,
-) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
+) -> QueryFeatures:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
-    4.5)."""
-    attenuation, radiance = make_networks(config)
+    4.5), and a summary of every query."""
+    attenuation, radiance, _ = make_networks(config)
     both, frequency = _query_inputs(gaussians.means, features, frame, receiver, config, query)
     outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both, method="of_queries")
     hidden, delta_f = outputs
@@ -90,7 +104,21 @@ def query_features(
         powers = jnp.concatenate([jnp.ones_like(u)[:, None], legendre(u, config.frequency_heads)], -1)
         delta_f, signal = (jnp.sum(heads * powers, -1) for heads in (delta_f, signal))
     delta = attenuation_activation(gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
-    return delta, signal_activation(signal)
+    shares = gaussians.alive / jnp.sum(gaussians.alive)
+    return QueryFeatures(delta, signal_activation(signal), jnp.einsum("n,nbw->bw", shares, hidden))
+
+
+def received_power_db(
+    summary: Float[Array, "b width"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig, query: Query
+) -> Float[Array, "b"]:
+    """Returns the power that an element receives, relative to the transmitted power (dB): free space, and what the network adds
+    to it."""
+    distance = smooth_length(query.tx_position - receiver.position)[:, 0]
+    scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
+    known = [scale_frequency(query.frequency_hz)[:, None]] if config.sees_frequency else []
+    parts = [summary, positional_encoding(scaled_tx, config.tx_octaves), *known]
+    correction: Any = make_networks(config)[2].apply(weights["power"], parts)
+    return free_space_db(distance, query.frequency_hz) + POWER_UNIT_DB * correction
 
 
 def _query_inputs(

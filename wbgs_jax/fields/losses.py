@@ -30,20 +30,26 @@ def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
     return matrix
 
 
-def _blur(images: Float[Array, "*n h w"]) -> Float[Array, "*n h_valid w_valid"]:
-    """Returns the separable Gaussian blur as two matrix products: forward and backward 16-30 times faster than convolutions or
-    shifted sums on a CPU. Full precision: variances are differences of large numbers."""
-    rows, columns = (jnp.asarray(_blur_matrix(n), images.dtype) for n in images.shape[-2:])
+def _blur(images: Float[Array, "*n h w"], stride: int) -> Float[Array, "*n h_valid w_valid"]:
+    """Returns the separable Gaussian blur at every `stride`-th place along both axes, as two matrix products: forward and
+    backward 16-30 times faster than convolutions or shifted sums on a CPU. Full precision: variances are differences of large
+    numbers."""
+    rows, columns = (jnp.asarray(_blur_matrix(n)[::stride], images.dtype) for n in images.shape[-2:])
     return jnp.matmul(jnp.matmul(rows, images, precision=EXACT), columns.T, precision=EXACT)
 
 
-def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"]) -> Float[Array, "*n"]:
-    """Returns the differentiable mean SSIM of images, data range 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004)."""
-    mean_a, mean_b = _blur(a), _blur(b)
-    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
-    covariance = _blur(a * b) - mean_a * mean_b
-    luminance = (2 * mean_a * mean_b + _C1) / (mean_a**2 + mean_b**2 + _C1)
-    structure = (2 * covariance + _C2) / (var_a + var_b + _C2)
+def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"], stride: int = 1) -> Float[Array, "*n"]:
+    """Returns the differentiable mean SSIM of images, data range 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004).
+
+    A `stride` of k looks at every k-th window along both axes alone. Neighbours overlap by 10 of 11 pixels and say nearly the
+    same, so that a training loses nothing with 2, at a third of the time.
+    """
+    mean_a, mean_b = _blur(a, stride), _blur(b, stride)
+    squared_means, product = mean_a**2 + mean_b**2, mean_a * mean_b
+    variances = _blur(a * a + b * b, stride) - squared_means
+    covariance = _blur(a * b, stride) - product
+    luminance = (2 * product + _C1) / (squared_means + _C1)
+    structure = (2 * covariance + _C2) / (variances + _C2)
     return jnp.mean(luminance * structure, axis=(-2, -1))
 
 
@@ -77,11 +83,11 @@ def _correlation_and_power(
 
 
 def image_loss(
-    predicted: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], ssim_weight: float = 0.2
+    predicted: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], ssim_weight: float = 0.2, ssim_stride: int = 1
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the mean loss over the images (paper, equation 5), and their mean SSIM."""
+    """Returns the mean loss over the images (paper, equation 5), and their mean SSIM (`ssim`) at every so many-th window."""
     l1 = jnp.mean(jnp.abs(predicted - truth))
-    similarity = jnp.mean(ssim(predicted, truth))
+    similarity = jnp.mean(ssim(predicted, truth, ssim_stride))
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity), similarity
 
 

@@ -2,6 +2,7 @@
 
     attenuation network  (P(G), P(TX), f) -> (h, delta_f)
     radiance network     (h, f)           -> Sig
+    power network        (mean of h, P(TX), f) -> received power relative to free space
 
 A layer whose input is a concatenation of parts that depend on the Gaussian only, on the query only, or on both is evaluated
 part by part and added: the same function as a dense layer on the concatenation, without forming it N x B times. What depends
@@ -117,6 +118,18 @@ class RadianceNetwork(nn.Module):
         for width in self.widths[1:]:
             hidden = nn.relu(PartwiseDense(width)([hidden]))
         return _values(nn.Dense(self.heads, kernel_init=nn.initializers.normal(0.01))(hidden))
+
+
+class PowerNetwork(nn.Module):
+    """(mean of h over the Gaussians, P(TX), f) -> received power relative to free space, in units of 10 dB."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, parts: Parts) -> Float[Array, "..."]:
+        """Returns a value for every query; free space at the start."""
+        hidden = nn.relu(PartwiseDense(self.width)(parts))
+        return nn.Dense(1, kernel_init=nn.initializers.zeros_init())(hidden)[..., 0]
 
 
 def _values(heads: Float[Array, "... heads"]) -> Float[Array, "..."]:

@@ -18,16 +18,18 @@ from jaxtyping import Array, Float, Int, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
 from wbgs_jax.config import PRESETS, check_positive, check_share
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, with_field
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, power_error_db, register, with_field
 from wbgs_jax.fields.em_features import (
     MAX_ATTENUATION,
     RELATIVE_FEATURES,
     Frame,
     GaussianFeatures,
+    QueryFeatures,
     encoded_frequency,
     gaussian_features,
     make_networks,
     query_features,
+    received_power_db,
 )
 from wbgs_jax.fields.encoding import check_octaves, positional_encoding
 from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, PAPER, WidebandConfig
@@ -82,6 +84,7 @@ class WidebandField(Field):
 
     name: ClassVar[str] = "wideband"
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY) | {"paper": PAPER}
+    gives: ClassVar = ("pas", "power")
     controls: ClassVar = ("density",)
 
     @classmethod
@@ -89,7 +92,8 @@ class WidebandField(Field):
         """Raises a `UserError` for settings that cannot work."""
         widths = min(config.radiance_widths, default=0)
         name = cls.name
-        check_positive({f"{name}.width": config.width, f"{name}.depth": config.depth, f"{name}.radiance-widths": widths})
+        sizes = {"width": config.width, "depth": config.depth, "radiance-widths": widths, "ssim-stride": config.ssim_stride}
+        check_positive({f"{name}.{option}": size for option, size in sizes.items()})
         check_share(f"{name}.ssim-weight", config.ssim_weight)
         if 0 < config.gaussians < 4 or config.gaussians < 0:
             raise UserError(f"--{name}.gaussians is {config.gaussians}; give at least 4, or 0 for the size of the mesh")
@@ -134,8 +138,12 @@ class WidebandField(Field):
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
-        """Returns the spectra of B queries."""
-        return Observation(render(params, plan, query))
+        """Returns the spectra of B queries, and their received power."""
+        check_query(query)
+        features = _features(params, plan, query)
+        spectra = render_splats(plan.geometry, features.attenuation, features.signal)
+        known = plan.frame, plan.receiver, plan.config
+        return Observation(spectra, power_db=received_power_db(features.summary, params.networks, *known, query))
 
     def probe(self, params: WidebandParams) -> Float[Array, "n 2"]:
         """Returns zero offsets (pixels) of the projected centres: density control watches their gradient."""
@@ -144,9 +152,12 @@ class WidebandField(Field):
     def loss(
         self, params: WidebandParams, cache: None, batch: Batch, limits: TileLimits | None = None, probe: Any = None
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the image loss of a batch (paper, equation 5)."""
+        """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
         planned = self._plan(params, batch.receiver, limits, probe, gaussian_features)
-        loss, aux = compare(self.render(params, planned, batch.links.query), batch, self.config.ssim_weight)
+        seen = self.render(params, planned, batch.links.query)
+        loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
+        if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
+            loss += self.config.power_weight * error_db
         jobs = planned.geometry.jobs
         required = jnp.stack([jobs.required_entries, jobs.required_jobs])
         return loss, aux._replace(required=required, overflow=jobs.overflow)
@@ -224,7 +235,7 @@ def _initial_gaussians(surface: Surface) -> Gaussians:
 def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, Any]:
     """Returns initial weights; the inputs matter by their shapes only."""
     config, points = field.config, field.surface.points
-    attenuation, radiance = make_networks(config)
+    attenuation, radiance, power = make_networks(config)
     gaussian = [positional_encoding(points, config.gaussian_octaves)[:, None, :]]
     tx = [positional_encoding(points[:1], config.tx_octaves)[None]]
     frequency = encoded_frequency(jnp.full((1,), 1e9, points.dtype), config)[None]
@@ -234,7 +245,13 @@ def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, An
     outputs: Any
     outputs, weights = attenuation.init_with_output(key_attenuation, gaussian, query)
     inputs = [outputs[0], *([frequency] if config.radiance_frequency else [])]
-    return {"attenuation": weights, "radiance": radiance.init(key_radiance, inputs)}
+    summary, scaled_frequency = (jnp.zeros((1, size), points.dtype) for size in (config.width, 1))
+    known = [summary, tx[0][0], *([scaled_frequency] if config.sees_frequency else [])]
+    return {
+        "attenuation": weights,
+        "radiance": radiance.init(key_radiance, inputs),
+        "power": power.init(jax.random.fold_in(key, 2), known),
+    }
 
 
 def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Array, "b 90 360"]:
@@ -244,13 +261,17 @@ def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Ar
     plans inside.
     """
     check_query(query)
-    attenuation, signal = em_features(params, plan, query)
-    return render_splats(plan.geometry, attenuation, signal)
+    return render_splats(plan.geometry, *em_features(params, plan, query))
 
 
 def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
     4.5)."""
+    features = _features(params, plan, query)
+    return features.attenuation, features.signal
+
+
+def _features(params: WidebandParams, plan: WidebandPlan, query: Query) -> QueryFeatures:
     known = plan.frame, plan.receiver, plan.config
     features = plan.features or gaussian_features(params.gaussians.means, params.networks, *known)
     return query_features(params.gaussians, params.networks, features, *known, query)

@@ -51,6 +51,10 @@ class WidebandConfig:
     """Zenith range on the image rows: "hemisphere" 0..90 degrees (paper), "sphere" 0..180 (authors' code)."""
     ssim_weight: float = 0.2
     """lambda of the paper's equation 5."""
+    ssim_stride: int = 2
+    """The loss looks at every so many-th window of the SSIM along both axes (paper: 1)."""
+    power_weight: float = 0.01
+    """Weight of the mean absolute error (dB) of the received power, where the data say what it was; not in the paper."""
     network_lr: float = 4e-3
     """Learning rate of the networks (authors: 8e-4)."""
     network_weight_decay: float = 0.0
@@ -63,6 +67,11 @@ class WidebandConfig:
     """Learning rate of the rotations."""
     opacity_lr: float = 2.5e-2
     """Learning rate of delta_o."""
+
+    @property
+    def sees_frequency(self) -> bool:
+        """Whether anything but the array's response depends on the frequency."""
+        return self.attenuation_frequency or self.radiance_frequency or self.frequency_heads > 0
 
 
 CONFIGS = {
@@ -89,6 +98,8 @@ PAPER = Settings(
         frequency_octaves=10,
         frequency_scale="ghz",
         relative=False,
+        ssim_stride=1,
+        power_weight=0.0,
         network_lr=8e-4,
         network_weight_decay=5e-5,
         means_lr=0.0,

@@ -7,13 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from wbgs_jax.inference.predictor import BLOCK, Predictor
-from wbgs_jax.radio.array import PAS_SHAPE
 
 
 def predict_blocks(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
-) -> Iterator[Float[np.ndarray, "k 90 360"]]:
-    """Returns spectra (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
+) -> Iterator[Float[np.ndarray, "k *answer"]]:
+    """Returns spectra or powers (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
 
     Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation.
     """
@@ -21,7 +20,7 @@ def predict_blocks(
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
     n = len(positions)
 
-    def part(start: int) -> Float[np.ndarray, "k 90 360"]:
+    def part(start: int) -> Float[np.ndarray, "k *answer"]:
         index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up
         return np.asarray(predict(positions[index], frequencies[index]))[: n - start]
 
@@ -30,14 +29,15 @@ def predict_blocks(
 
 def predict_many(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
-) -> Float[np.ndarray, "n 90 360"]:
+) -> Float[np.ndarray, "n *answer"]:
     """Returns all blocks of `predict_blocks` in one array."""
-    images = np.empty((len(np.atleast_2d(tx_positions)), *PAS_SHAPE), np.float32)
-    done = 0
+    n, done = len(np.atleast_2d(tx_positions)), 0
+    answers = None
     for part in predict_blocks(predict, tx_positions, frequencies_hz, block):
-        images[done : done + len(part)] = part
+        answers = np.empty((n, *part.shape[1:]), np.float32) if answers is None else answers
+        answers[done : done + len(part)] = part
         done += len(part)
-    return images
+    return np.asarray(predict(np.zeros((0, 3), np.float32), np.zeros(0, np.float32))) if answers is None else answers
 
 
 def map_queries(
@@ -53,6 +53,6 @@ def map_queries(
 
 def predict_map(
     predict: Predictor, xs: Any, ys: Any, height: float, frequencies_hz: Any, block: int = BLOCK
-) -> Float[np.ndarray, "n 90 360"]:
-    """Returns the spectra (float32, 130 kB each) of a map of transmitters, in the order of `map_queries`."""
+) -> Float[np.ndarray, "n *answer"]:
+    """Returns the spectra (float32, 130 kB each) or powers of a map of transmitters, in the order of `map_queries`."""
     return predict_many(predict, *map_queries(xs, ys, height, frequencies_hz), block)

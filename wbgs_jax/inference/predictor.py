@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.radio.array import PAS_SHAPE
@@ -17,7 +18,7 @@ BLOCK = 16
 """Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
 
 Predictor = Callable[[Any, Any], Array]
-"""(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360); leading axes broadcast like NumPy's."""
+"""(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360) or power (*b,); leading axes broadcast like NumPy's."""
 
 
 @runtime_checkable
@@ -55,6 +56,36 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     return on_any_shape(lambda query: render_pas(trained.field, trained.params, plan, query))
 
 
+def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
+    """Returns a trained field as a pure function (tx_position, frequency_hz) -> received power relative to the transmitted
+    power (dB); otherwise as `predictor`.
+
+    Raises:
+        UserError: the field knows nothing of power, or its data were spectra without a scale.
+    """
+    dataset = trained.dataset()
+    check_power(trained.field, dataset)
+    plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
+    return on_any_shape(lambda query: _render_power(trained.field, trained.params, plan, query), ())
+
+
+def check_power(field: Field, dataset: Dataset) -> None:
+    """Raises a `UserError` where a field cannot say what power a receiver gets."""
+    if "power" not in field.gives:
+        raise UserError(f"the {field.name} field has no power, only spectra; train another field")
+    if dataset.kind == "pas" and "paths" not in field.gives:
+        raise UserError(
+            f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
+        )
+
+
+@jax.jit
+def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, "b"]:
+    power = field.render(params, plan, query).power_db
+    assert power is not None  # `check_power`
+    return power
+
+
 @jax.jit
 def render_pas(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
@@ -66,10 +97,11 @@ def _observe(field: Field, params: Any, plan: Any, cache: Any, links: Links) -> 
     return field.render_links(params, plan, cache, links)
 
 
-def on_any_shape(render: Callable[[Query], Any]) -> Predictor:
-    """Lets a function of a flat batch of queries take positions (*b, 3) and frequencies (*b,) whose leading axes broadcast."""
+def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:
+    """Lets a function of a flat batch of queries, with an answer of known shape to each, take positions (*b, 3) and frequencies
+    (*b,) whose leading axes broadcast."""
 
-    def predict(tx_position: Any, frequency_hz: Any) -> Float[Array, "*b 90 360"]:
+    def predict(tx_position: Any, frequency_hz: Any) -> Float[Array, "..."]:
         position, frequency = jnp.asarray(tx_position, jnp.float32), jnp.asarray(frequency_hz, jnp.float32)
         if position.shape[-1:] != (3,):
             raise ValueError(f"tx_position has shape {position.shape}; expected (3,) or (..., 3)")
@@ -78,8 +110,8 @@ def on_any_shape(render: Callable[[Query], Any]) -> Predictor:
         query = Query(position.reshape(-1, 3), frequency.reshape(-1))
         check_query(query)
         if 0 in shape:
-            return jnp.zeros((*shape, *PAS_SHAPE), jnp.float32)
-        return render(query).reshape(*shape, *PAS_SHAPE)
+            return jnp.zeros((*shape, *answer), jnp.float32)
+        return render(query).reshape(*shape, *answer)
 
     return predict
 

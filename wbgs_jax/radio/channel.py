@@ -25,6 +25,8 @@ class Arrivals(NamedTuple):
 
 SMALLEST = 1e-30
 """Power that stands for nothing, so that decibels stay finite."""
+NOT_HEARD_DB = -250.0
+"""Received powers at or below it say that no path was found, not how weak one is."""
 
 
 def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -35,6 +37,12 @@ def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
     """Returns the mean power an element receives, relative to the transmitted power (dB): the negative path loss."""
     return decibels(jnp.mean(squared_magnitude(snapshot), -1))
+
+
+def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Returns the power that an isotropic element receives over a line of sight (metres, hertz), relative to the transmitted
+    power (dB; Friis)."""
+    return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
 
 
 def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Array, "*b"]) -> Float[Array, "*b"]:

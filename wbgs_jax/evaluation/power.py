@@ -1,0 +1,70 @@
+"""How good predicted received powers are, beside what free space and the nearest transmitter say."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.evaluation.baselines import nearest_links
+from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
+
+
+def score_power(
+    predicted: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"], frequencies_hz: Float[np.ndarray, "n"]
+) -> dict[str, Any]:
+    """Returns a report of received powers (dB), ready for JSON: n, power_error_db (median absolute error), power_mae_db (mean),
+    and the same in per_frequency, a list by ascending frequency_ghz.
+
+    Raises:
+        UserError: there is no link, or a prediction is NaN or infinite.
+    """
+    if len(predicted) == 0:
+        raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
+    error = np.abs(predicted.astype(np.float64) - truth)
+    if not np.isfinite(error).all():
+        raise UserError(
+            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged"
+        )
+    rows = [{"frequency_ghz": float(f / 1e9)} | _summary(error[frequencies_hz == f]) for f in np.unique(frequencies_hz)]
+    return _summary(error) | {"per_frequency": rows}
+
+
+def power_figures(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
+    """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
+    line) and nearest_tx (the power of the nearest training transmitter at the same frequency). Links without any power are left
+    out. None where the data know no power.
+
+    Raises:
+        UserError: as `score_power`.
+    """
+    truth = dataset.received_db(index)
+    if truth is None:
+        return None
+    heard = truth > NOT_HEARD_DB
+    truth, index, known = truth[heard], index[heard], dataset.frequencies_hz[index[heard]]
+    others = {"free_space": free_space(dataset, index), "nearest_tx": nearest_power(dataset, index)}
+    return score_power(predicted[heard], truth, known) | {
+        "baselines": {name: score_power(values, truth, known) for name, values in others.items()}
+    }
+
+
+def free_space(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Returns the power (dB) over the straight line, whatever stands in its way."""
+    receivers = np.asarray(dataset.receivers.position, np.float64)[dataset.receiver_index[index]]
+    distance = np.linalg.norm(dataset.tx_positions[index] - receivers, axis=-1)
+    return np.asarray(free_space_db(jnp.asarray(np.maximum(distance, 1e-3)), jnp.asarray(dataset.frequencies_hz[index])))
+
+
+def nearest_power(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver."""
+    everything = dataset.received_db(np.arange(len(dataset)))
+    assert everything is not None
+    heard = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
+    return everything[nearest_links(dataset, index, heard)]
+
+
+def _summary(error: Float[np.ndarray, "n"]) -> dict[str, Any]:
+    return {"n": len(error), "power_error_db": float(np.median(error)), "power_mae_db": float(error.mean())}
