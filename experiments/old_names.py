@@ -16,12 +16,22 @@ MOVED = {
     "wave.plain_kept": "wave.specular_kept",
     "wave.survival": "wave.excess_amplitude",
 }
+BEFORE_MUON = {
+    "wideband": {"network_optimizer": "adam", "network_lr": 4e-3, "ssim_stride": 1, "power_weight": 0.0},
+}
+BEFORE_MUON["wrfgs"] = BEFORE_MUON["wideband"]
+"""What the presets of a field had until then: results that do not say otherwise (`EDITION`) were made so."""
+EDITION = 2
+"""Of the presets; results are written with it."""
 NOT_OF = {"density": ("wave", "nerf2"), "search": ("wideband", "wrfgs", "nerf2")}
 """Sections that all fields had, and the fields that took no notice."""
 
 
-def todays(settings: dict[str, Any], field: str) -> dict[str, Any]:
-    """Returns a result's settings by today's names, without those that changed nothing."""
+def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
+    """Returns the settings of a result by today's names and against today's presets, without those that changed nothing."""
+    settings = result.get("settings", {})
+    if result.get("presets", 1) < EDITION and result.get("preset") != "paper":
+        settings = {f"{field}.{name}": value for name, value in BEFORE_MUON.get(field, {}).items()} | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value

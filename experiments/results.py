@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from experiments.jobs import PICTURED_GHZ, Job
-from experiments.old_names import todays
+from experiments.old_names import EDITION, todays
 from experiments.settings import differences
 from wbgs_jax._util.files import atomic_write, read_json
 
@@ -54,7 +54,7 @@ class Result:
 
     def belongs_to(self, job: Job) -> bool:
         """Whether it was made with the settings that the job has today."""
-        return todays(self.values.get("settings", {}), job.field) == differences(job)
+        return todays(self.values, job.field) == differences(job)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Results:
         if pictures is not None:
             with atomic_write(self.pictures_path(job)) as stream:
                 Image.fromarray(pictures.reshape(-1, pictures.shape[-1])).save(stream, format="png", optimize=True)
-        whole = {"job": dataclasses.asdict(job)} | values | {"settings": differences(job)}
+        whole = {"job": dataclasses.asdict(job)} | values | {"presets": EDITION, "settings": differences(job)}
         text = json.dumps(whole, indent=2, allow_nan=False)
         with atomic_write(self.path(job)) as stream:
             stream.write((one_line_lists(text) + "\n").encode())

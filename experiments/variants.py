@@ -97,6 +97,13 @@ SCHEDULES = {
     "steps_6000": Variant(steps=6000),
 }
 """How fast, and how long."""
+OPTIMIZERS = {
+    "adam_4e-3": _of_field(network_optimizer="adam", network_lr=4e-3),
+    "adam_1.6e-2": _of_field(network_optimizer="adam", network_lr=1.6e-2),
+    "muon_1e-2": _of_field(network_optimizer="muon", network_lr=1e-2),
+    "muon_2e-2": _of_field(network_optimizer="muon", network_lr=2e-2),
+}
+"""Optimisers of the networks of every trained model."""
 VOLUME = {
     "l2": _of_field(pixel_loss="l2"),
     "directions_384": _of_field(directions=384),
@@ -123,4 +130,4 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | VOLUME | COHERENT

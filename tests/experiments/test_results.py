@@ -11,7 +11,7 @@ import pytest
 from experiments import result_table
 from experiments.catalogue import EXPERIMENTS, unique_jobs
 from experiments.jobs import BASELINES, Job
-from experiments.old_names import MOVED, todays
+from experiments.old_names import BEFORE_MUON, EDITION, MOVED, todays
 from experiments.results import FOLDER, Results
 from experiments.settings import differences
 from wbgs_jax.config import to_dict
@@ -39,8 +39,9 @@ def test_all_results_of_the_first_version_count_as_run():
 
 def test_settings_that_have_moved_are_found_under_todays_names():
     old = {"optim.network_lr": 0.016, "optim.steps": 100, "loop.checkpoint_every": 200, "density.every": 75}
-    assert todays(old, "wrfgs") == {"wrfgs.network_lr": 0.016, "optim.steps": 100, "density.every": 75}
-    assert todays(old, "nerf2") == {"nerf2.network_lr": 0.016, "optim.steps": 100}
+    wrfgs = {"wrfgs.network_lr": 0.016, "optim.steps": 100, "density.every": 75}
+    assert todays({"settings": old, "presets": EDITION}, "wrfgs") == wrfgs
+    assert todays({"settings": old}, "nerf2") == {"nerf2.network_lr": 0.016, "optim.steps": 100}
     old = {
         "wave.survival": 0.5,
         "optim.residual_lr": 0.1,
@@ -49,8 +50,17 @@ def test_settings_that_have_moved_are_found_under_todays_names():
         "search.rounds": 0,
     }
     new = {"wave.excess_amplitude": 0.5, "wave.corrections_lr": 0.1, "wave.correlation_weight": 0.2, "search.rounds": 0}
-    assert todays(old, "wave") == new
-    assert todays(new, "wave") == new
+    assert todays({"settings": old}, "wave") == new
+    assert todays({"settings": new}, "wave") == new
+
+
+def test_results_of_before_muon_say_so():
+    adam = {f"wrfgs.{name}": value for name, value in BEFORE_MUON["wrfgs"].items()}
+    assert adam["wrfgs.network_optimizer"] == "adam" and adam["wrfgs.network_lr"] == 4e-3
+    slower = {"optim.network_lr": 1e-3, "optim.steps": 100}
+    assert todays({"settings": slower}, "wrfgs") == adam | {"wrfgs.network_lr": 1e-3, "optim.steps": 100}
+    assert todays({"settings": slower, "preset": "paper"}, "wrfgs") == {"wrfgs.network_lr": 1e-3, "optim.steps": 100}
+    assert todays({"presets": EDITION}, "wrfgs") == {}
 
 
 def test_moved_settings_exist_under_their_new_names():

@@ -11,7 +11,7 @@ from experiments.jobs import Job
 from experiments.results import FOLDER, Results
 from experiments.series import choices, tuning, wave_choices
 from experiments.settings import settings
-from experiments.variants import VARIANTS
+from experiments.variants import OPTIMIZERS, VARIANTS
 from wbgs_jax.config import check
 from wbgs_jax.fields import get_field
 

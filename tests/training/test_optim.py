@@ -5,13 +5,14 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.fields import get_field
-from wbgs_jax.training.optim import make_optimizer, schedule
+from wbgs_jax.fields import Group, get_field
+from wbgs_jax.training.optim import ADAMS_RMS, make_muon, make_optimizer, schedule
 
 OPTIM = OptimConfig(steps=6, final_fraction=0.1)
 RATES = {
@@ -41,8 +42,10 @@ PLACES = {
 
 
 def config_of(name, **changes):
+    """By Adam, whose steps under a constant gradient are known."""
     rates = {f"{rate}_lr": value for rate, value in RATES[name].items()}
-    return dataclasses.replace(tiny_settings(name).field, **rates, **changes)
+    adam = {} if name == "wave" else {"network_optimizer": "adam"}
+    return dataclasses.replace(tiny_settings(name).field, **rates, **(adam | changes))
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +92,43 @@ def test_weight_decay_is_decoupled_and_for_the_networks_only(params):
     for path, update in decayed.items():
         shrink = 0.5 * 0.01 * values[path] if "networks" in path else 0
         np.testing.assert_allclose(update, plain[path] - shrink, atol=1e-6, err_msg=path)
+
+
+def test_muon_makes_the_singular_values_of_a_step_equal(params, rng):
+    """Newton-Schulz's five iterations take them to between 0.7 and 1.2 (Jordan et al. 2024), whatever the gradient's are."""
+    config, networks = config_of("wideband", network_optimizer="muon"), params["wideband"].networks
+    optimizer = make_optimizer(get_field("wideband"), config, OPTIM)
+
+    def skewed(leaf):
+        rows = 10 ** rng.uniform(-1, 1, leaf.shape[:1] + (1,) * (leaf.ndim - 1))
+        return jnp.asarray(rng.normal(size=leaf.shape) * rows)
+
+    gradients = dataclasses.replace(jax.tree.map(jnp.ones_like, params["wideband"]), networks=jax.tree.map(skewed, networks))
+    updates, _ = jax.jit(optimizer.update)(gradients, optimizer.init(params["wideband"]), params["wideband"])
+    sides = [leaf.shape for leaf in jax.tree.leaves(networks) if leaf.ndim == 2]
+    unit = 0.5 * ADAMS_RMS * np.sqrt(np.max(sides))
+    for path, update in by_place(updates.networks).items():
+        if update.ndim == 1:
+            np.testing.assert_allclose(np.abs(update), 0.5, rtol=1e-3, err_msg=path)  # Adam's first step
+            continue
+        values = np.linalg.svd(update, compute_uv=False) / unit
+        assert values.min() > 0.65 and values.max() < 1.25, path
+    for path, update in by_place(updates.gaussians).items():
+        np.testing.assert_allclose(update, -RATES["wideband"][PLACES["wideband"][f".gaussians{path}"]], rtol=1e-4)
+
+
+def test_a_stack_of_matrices_is_moved_like_each_by_itself(rng):
+    shapes = ((8, 8), (3, 8), (8, 1), (5, 8))  # one side in common: the unit of a step is the longest
+    weights, gradients = ([jnp.asarray(rng.normal(size=shape)) for shape in shapes] for _ in range(2))
+    together = make_muon(Group(0.1, weight_decay=0.02), OPTIM)
+    alone = optax.contrib.muon(schedule(0.1, OPTIM), consistent_rms=ADAMS_RMS, weight_decay=0.02)
+    states = together.init(weights), alone.init(weights)
+    for _ in range(3):
+        moved, expected = together.update(gradients, states[0], weights), alone.update(gradients, states[1], weights)
+        states = moved[1], expected[1]
+        for own, other in zip(moved[0], expected[0], strict=True):
+            np.testing.assert_allclose(own, other, atol=1e-5)
+        gradients = [gradient[::-1] for gradient in gradients]
 
 
 def test_equal_settings_share_one_optimiser():

@@ -49,10 +49,15 @@ class Aux(NamedTuple):
     """The limits were too small: the step must not be used."""
 
 
+Optimizer = Literal["adam", "muon"]
+
+
 class Group(NamedTuple):
-    """How a group of parameters is optimised, by Adam."""
+    """How a group of parameters is optimised."""
 
     learning_rate: float
+    optimizer: Optimizer = "adam"
+    """"muon": matrices by Muon, whose steps have Adam's size, and everything else by Adam."""
     weight_decay: float = 0.0
     """Decoupled weight decay."""
     eps: float = 1e-15

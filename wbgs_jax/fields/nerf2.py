@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.config import PRESETS, check_positive
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, register, with_field
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, Optimizer, register, with_field
 from wbgs_jax.fields.encoding import check_octaves, frequency_encoding, positional_encoding
 from wbgs_jax.fields.losses import pixel_loss
 from wbgs_jax.fields.networks import AttenuationNetwork, RadianceNetwork, signal_activation
@@ -59,6 +59,8 @@ class Nerf2Config:
     """Also encode the TX relative to the place, the direction and the receiver array, as the wideband field does."""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Mean absolute or squared error of the sampled pixels, which make no image and have no SSIM."""
+    network_optimizer: Optimizer = "adam"
+    """What moves the networks' matrices (`base.Group`)."""
     network_lr: float = 4e-3
     """Learning rate of the networks (authors: 5e-4)."""
     network_weight_decay: float = 0.0
@@ -156,7 +158,7 @@ class Nerf2Field(Field):
     @classmethod
     def groups(cls, config: Nerf2Config) -> dict[str, Group]:
         """Returns one group, the networks."""
-        return {"all": Group(config.network_lr, config.network_weight_decay, eps=1e-8)}
+        return {"all": Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8)}
 
 
 @jax.jit

@@ -192,7 +192,7 @@ class WidebandField(Field):
             "log_scales": Group(config.log_scales_lr),
             "quats": Group(config.quats_lr),
             "opacity_logits": Group(config.opacity_lr),
-            "networks": Group(config.network_lr, config.network_weight_decay, eps=1e-8),
+            "networks": Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8),
         }
 
     @classmethod

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from wbgs_jax.config import DensityConfig, LoopConfig, OptimConfig, Settings
+from wbgs_jax.fields.base import Optimizer
 from wbgs_jax.fields.encoding import FrequencyScale
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.types import SurfaceSampling
@@ -55,7 +56,9 @@ class WidebandConfig:
     """The loss looks at every so many-th window of the SSIM along both axes (paper: 1)."""
     power_weight: float = 0.01
     """Weight of the mean absolute error (dB) of the received power, where the data say what it was; not in the paper."""
-    network_lr: float = 4e-3
+    network_optimizer: Optimizer = "muon"
+    """What moves the networks' matrices (`base.Group`; authors: Adam)."""
+    network_lr: float = 1e-2
     """Learning rate of the networks (authors: 8e-4)."""
     network_weight_decay: float = 0.0
     """Decoupled weight decay of the networks."""
@@ -78,7 +81,7 @@ CONFIGS = {
     "smoke": WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
     "cpu": WidebandConfig(),
     # A Gaussian for every vertex of the mesh and the authors' networks, with the inputs, schedule and batches of the others.
-    "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64), network_lr=8e-4),
+    "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64)),
 }
 DENSITY = {
     "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
@@ -100,6 +103,7 @@ PAPER = Settings(
         relative=False,
         ssim_stride=1,
         power_weight=0.0,
+        network_optimizer="adam",
         network_lr=8e-4,
         network_weight_decay=5e-5,
         means_lr=0.0,

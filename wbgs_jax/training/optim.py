@@ -1,19 +1,67 @@
-"""The optimiser: Adam for every group of a field's parameters, each with its own learning rate; all rise and decay together."""
+"""The optimiser: Adam, or Muon and Adam, for every group of a field's parameters, each with its own learning rate; all rise and
+decay together.
+
+Muon (Jordan et al. 2024) takes the steps of matrices in the direction of steepest descent under the spectral norm: the
+networks learn in 2,000 steps what Adam teaches them in 6,000 (docs/decisions.md).
+"""
 
 import functools
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.fields import Field, Group
+
+ADAMS_RMS = 0.2
+"""Root mean square of an entry of Muon's steps, in learning rates: about that of Adam's, so that one rate serves both (Liu et
+al. 2025)."""
 
 
 @functools.lru_cache
 def make_optimizer(field: type[Field], config: Any, optim: OptimConfig) -> optax.GradientTransformation:
     """Returns the optimiser of a field with some settings. Equal arguments share one, and with it the compiled epoch."""
-    groups = {name: _adam(group, optim) for name, group in field.groups(config).items()}
+    made = {"adam": _adam, "muon": make_muon}
+    groups = {name: made[group.optimizer](group, optim) for name, group in field.groups(config).items()}
     return optax.multi_transform(groups, field.labels)
+
+
+def make_muon(group: Group, optim: OptimConfig) -> optax.GradientTransformation:
+    """Returns Muon for the matrices among a group's parameters, and Adam for the others."""
+    rate = schedule(group.learning_rate, optim)
+    all_axes = {"matrices": optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2)}
+    matrices = optax.contrib.muon(
+        rate, consistent_rms=ADAMS_RMS, weight_decay=group.weight_decay, muon_weight_dimension_numbers=all_axes
+    )
+    kinds = {"matrix": _stacked(matrices), "other": _adam(group, optim)}
+    return optax.multi_transform(kinds, lambda tree: jax.tree.map(lambda leaf: "matrix" if leaf.ndim == 2 else "other", tree))
+
+
+def _stacked(inner: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Lets a transformation see a tree of matrices as one stack, zeros around the smaller ones: Newton-Schulz iterations of
+    their own would take ten seconds to compile. Zeros stay zeros, so that steps are the same, but in units of the stack's
+    longest side."""
+
+    def init(params: Any) -> Any:
+        return inner.init({"matrices": _stack(params)})
+
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        known = None if params is None else {"matrices": _stack(params)}
+        steps, state = inner.update({"matrices": _stack(updates)}, state, known)
+        leaves, structure = jax.tree.flatten(updates)
+        pairs = zip(leaves, steps["matrices"], strict=True)
+        return jax.tree.unflatten(structure, [step[: leaf.shape[0], : leaf.shape[1]] for leaf, step in pairs]), state
+
+    return optax.GradientTransformation(init, update)
+
+
+def _stack(tree: Any) -> Float[Array, "matrices rows columns"]:
+    leaves = jax.tree.leaves(tree)
+    rows, columns = (max(leaf.shape[axis] for leaf in leaves) for axis in (0, 1))
+    return jnp.stack([jnp.pad(leaf, ((0, rows - leaf.shape[0]), (0, columns - leaf.shape[1]))) for leaf in leaves])
 
 
 def _adam(group: Group, optim: OptimConfig) -> optax.GradientTransformation:
