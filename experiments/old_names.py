@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from experiments.profiles import BY_ADAM
 from experiments.settings import HOUSEKEEPING
 
 MOVED = {
@@ -16,10 +17,15 @@ MOVED = {
     "wave.plain_kept": "wave.specular_kept",
     "wave.survival": "wave.excess_amplitude",
 }
-BEFORE_MUON = {
-    "wideband": {"network_optimizer": "adam", "network_lr": 4e-3, "ssim_stride": 1, "power_weight": 0.0},
+BEFORE_MUON: dict[str, dict[str, Any]] = {
+    "wideband": {
+        **{f"wideband.{name}": list(value) if isinstance(value, tuple) else value for name, value in BY_ADAM.items()},
+        "optim.steps": 6000,
+        "density.every": 500,
+        "density.start": 500,
+    },
 }
-BEFORE_MUON["wrfgs"] = BEFORE_MUON["wideband"]
+BEFORE_MUON["wrfgs"] = {name.replace("wideband.", "wrfgs."): value for name, value in BEFORE_MUON["wideband"].items()}
 """What the presets of a field had until then: results that do not say otherwise (`EDITION`) were made so."""
 EDITION = 2
 """Of the presets; results are written with it."""
@@ -31,7 +37,7 @@ def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
     """Returns the settings of a result by today's names and against today's presets, without those that changed nothing."""
     settings = result.get("settings", {})
     if result.get("presets", 1) < EDITION and result.get("preset") != "paper":
-        settings = {f"{field}.{name}": value for name, value in BEFORE_MUON.get(field, {}).items()} | settings
+        settings = BEFORE_MUON.get(field, {}) | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value

@@ -34,7 +34,15 @@ QUICK: dict[str, Any] = {
     "changes": {"loop": {"epoch_steps": 25}},
     "fields": {"wideband": GAUSSIANS, "wrfgs": GAUSSIANS},
 }
-BY_ADAM: dict[str, Any] = {"network_optimizer": "adam", "network_lr": 4e-3, "ssim_stride": 1, "power_weight": 0.0}
+BY_ADAM: dict[str, Any] = {
+    "network_optimizer": "adam",
+    "network_lr": 4e-3,
+    "ssim_stride": 1,
+    "power_weight": 0.0,
+    "features": 0,
+    "features_lr": 0.0,
+    "radiance_widths": (64, 32),
+}
 """What the splatting fields had until Muon came: the series of that time, which chose other settings, keep it."""
 QUICK_BY_ADAM = QUICK | {"fields": {"wideband": GAUSSIANS | BY_ADAM, "wrfgs": GAUSSIANS | BY_ADAM}}
 BEFORE = BY_ADAM | {"network_lr": 1e-3, "fusion": 0}
@@ -53,6 +61,7 @@ PROFILES = {
     ),
     # Of the series, each its own. `rates` and `curve` are of today's presets.
     "tuning": Profile("cpu", 1000, 600, **QUICK_BY_ADAM, scored_tx=SCORED_SLOW),
+    "main": Profile("cpu", 2400, 600, validation=True),
     "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_SLOW),
     "curve": Profile("cpu", 1000, 600, **QUICK),
     "schedules": Profile("cpu", 2000, 600, fields={"wideband": BY_ADAM}, validation=True),

@@ -15,7 +15,7 @@ from PIL import Image
 
 from experiments.jobs import PICTURED_GHZ, Job
 from experiments.old_names import EDITION, todays
-from experiments.settings import differences
+from experiments.settings import differences, unlike_preset
 from wbgs_jax._util.files import atomic_write, read_json
 
 FOLDER = Path(__file__).parent / "results"
@@ -54,7 +54,7 @@ class Result:
 
     def belongs_to(self, job: Job) -> bool:
         """Whether it was made with the settings that the job has today."""
-        return todays(self.values, job.field) == differences(job)
+        return unlike_preset(job, todays(self.values, job.field)) == differences(job)
 
 
 @dataclass(frozen=True)

@@ -54,13 +54,23 @@ def differences(job: Job) -> dict[str, Any]:
     """Returns what determines a job's result and is not the preset's, as JSON has it."""
     if job.field == BASELINES:
         return {}
-    chosen, base = to_dict(settings(job), job.field), to_dict(preset_of(job), job.field)
-    found = {
-        f"{section}.{name}": list(value) if isinstance(value, tuple) else value
-        for section, values in chosen.items()
-        for name, value in values.items()
-        if value != base[section][name]
-    }
+    found = unlike_preset(job, _flat(settings(job), job.field))
     if displacement := VARIANTS[job.variant].displacement:
         found["mesh.displacement"] = displacement
-    return {name: value for name, value in found.items() if name not in HOUSEKEEPING}
+    return found
+
+
+def unlike_preset(job: Job, values: dict[str, Any]) -> dict[str, Any]:
+    """Returns settings without those that the preset has, and those that change no result."""
+    if job.field == BASELINES:
+        return values
+    base = _flat(preset_of(job), job.field)
+    return {name: value for name, value in values.items() if name not in HOUSEKEEPING and value != base.get(name)}
+
+
+def _flat(values: Settings, field: str) -> dict[str, Any]:
+    return {
+        f"{section}.{name}": list(value) if isinstance(value, tuple) else value
+        for section, own in to_dict(values, field).items()
+        for name, value in own.items()
+    }

@@ -104,6 +104,12 @@ OPTIMIZERS = {
     "muon_2e-2": _of_field(network_optimizer="muon", network_lr=2e-2),
 }
 """Optimisers of the networks of every trained model."""
+POOLED = {
+    "pooled": Variant({"field": _BLIND}),
+    "pooled_long": Variant({"field": _BLIND}, budget=5),
+    "pooled_longest": Variant({"field": _BLIND}, budget=10),
+}
+"""WRF-GS as one model for all frequencies: the wideband field, blind to them."""
 VOLUME = {
     "l2": _of_field(pixel_loss="l2"),
     "directions_384": _of_field(directions=384),
@@ -130,4 +136,4 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | POOLED | VOLUME | COHERENT

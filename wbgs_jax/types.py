@@ -44,6 +44,8 @@ class Gaussians:
     """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
     opacity_logits: Float[Array, "n"]
     """delta_o of the paper (section 4.5), before the sigmoid."""
+    features: Float[Array, "n k"] | None = None
+    """What networks know of a Gaussian beside its place; splatting takes no notice."""
 
     @property
     def alive(self) -> Bool[Array, "n"]:

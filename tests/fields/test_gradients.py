@@ -33,13 +33,13 @@ STEPS = (1e-7, 2e-8, 3e-9)
 RELATIVE, ROUNDING = 2e-5, 1e-5
 """Tolerances: of the derivative and of the terms that it is the sum of; and what differences of sums over all pixels lose."""
 UNUSED = {
-    "wideband": {".pattern_exponent"},
-    "wrfgs": {".pattern_exponent", ".frequency_hz"},
+    "wideband": {".pattern_exponent", "['power']"},
+    "wrfgs": {".pattern_exponent", ".frequency_hz", "['power']"},
     "nerf2": {".pattern_exponent"},
     "wave": set(),
 }
-"""Leaves that do not enter, by the end of their names: what a model that sees no single paths knows of elements is where they
-are, and WRF-GS knows no frequency."""
+"""Leaves that do not enter, by a part of their names: what a model that sees no single paths knows of elements is where they
+are, the network of the received power is none of the spectra's, and WRF-GS knows no frequency."""
 INVARIANT = {"wave": {".log_gain"}}
 """Leaves that scale all snapshots alike, which a normalised spectrum does not show: zero up to rounding."""
 OUTSIDE = {"wave": {".position"}}
@@ -124,8 +124,8 @@ def random_arguments(rng, name):
     return jax.tree.map(np.asarray, (params, receiver, Query(*map(jnp.asarray, places))))
 
 
-def ends_with(path, names):
-    return any(jax.tree_util.keystr(path).endswith(name) for name in names)
+def has(path, names):
+    return any(name in jax.tree_util.keystr(path) for name in names)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -139,7 +139,7 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
     for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
         leaf, gradient, where = leaves[i], np.asarray(gradient), jax.tree_util.keystr(path)
         assert np.isfinite(gradient).all(), where
-        if ends_with(path, OUTSIDE.get(kind, ())):
+        if has(path, OUTSIDE.get(kind, ())):
             continue
         direction = rng.normal(size=leaf.shape) * (np.abs(leaf) if ".frequency_hz" in where else 1)
 
@@ -148,11 +148,11 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
             high, low = (float(evaluated(name)(jax.tree.unflatten(structure, m), weights)[0]) for m in moved)
             return (high - low) / (2 * step)
 
-        if ends_with(path, UNUSED[kind]):
+        if has(path, UNUSED[kind]):
             assert not gradient.any() and slope(STEPS[0]) == 0, where
             continue
         exact, magnitude = np.sum(gradient * direction), np.linalg.norm(gradient * direction)
-        if ends_with(path, INVARIANT.get(kind, ())):
+        if has(path, INVARIANT.get(kind, ())):
             assert abs(exact) < 1e-9 and abs(slope(1e-3)) < 1e-7, where
             continue
         assert gradient.any(), where

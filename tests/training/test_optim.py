@@ -16,7 +16,7 @@ from wbgs_jax.training.optim import ADAMS_RMS, make_muon, make_optimizer, schedu
 
 OPTIM = OptimConfig(steps=6, final_fraction=0.1)
 RATES = {
-    "wideband": {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity": 0.4, "network": 0.5},
+    "wideband": {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity": 0.4, "features": 0.6, "network": 0.5},
     "wave": {"materials": 0.1, "thickness": 0.2, "corrections": 0.3},
     "nerf2": {"network": 0.1},
 }
@@ -27,6 +27,7 @@ PLACES = {
         ".gaussians.log_scales": "log_scales",
         ".gaussians.quats": "quats",
         ".gaussians.opacity_logits": "opacity",
+        ".gaussians.features": "features",
         ".networks": "network",
     },
     "wave": {

@@ -70,10 +70,14 @@ def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceN
 
 
 def gaussian_features(
-    means: Float[Array, "n 3"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
+    gaussians: Gaussians, weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
 ) -> GaussianFeatures:
     """Returns what the networks' inputs need of every Gaussian, whatever is asked."""
-    encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)[:, None, :]
+    means = gaussians.means
+    encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)
+    if gaussians.features is not None:
+        encoded = jnp.concatenate([encoded, gaussians.features], -1)
+    encoded = encoded[:, None, :]
     sums: Any = make_networks(config)[0].apply(weights["attenuation"], [encoded], method="gaussian_sums")
     direction = to_local(means - receiver.position, receiver.orientation)
     direction = direction / smooth_length(direction)

@@ -32,7 +32,7 @@ from wbgs_jax.fields.em_features import (
     received_power_db,
 )
 from wbgs_jax.fields.encoding import check_octaves, positional_encoding
-from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, PAPER, WidebandConfig
+from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, OPTIM, PAPER, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
 from wbgs_jax.types import (
     Batch,
@@ -83,7 +83,7 @@ class WidebandField(Field):
     config: WidebandConfig = static()
 
     name: ClassVar[str] = "wideband"
-    presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY) | {"paper": PAPER}
+    presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
     gives: ClassVar = ("pas", "power")
     controls: ClassVar = ("density",)
 
@@ -134,7 +134,7 @@ class WidebandField(Field):
         check_receiver(receiver)
         geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
-        features = features_of(params.gaussians.means, params.networks, frame, receiver, self.config)
+        features = features_of(params.gaussians, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
@@ -192,14 +192,15 @@ class WidebandField(Field):
             "log_scales": Group(config.log_scales_lr),
             "quats": Group(config.quats_lr),
             "opacity_logits": Group(config.opacity_lr),
+            "features": Group(config.features_lr),
             "networks": Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8),
         }
 
     @classmethod
     def labels(cls, params: WidebandParams) -> Any:
         """Returns the group of every parameter."""
-        networks = ["networks"] * len(jax.tree.leaves(params.networks))
-        return with_leaves(params, "means", "log_scales", "quats", "opacity_logits", *networks)
+        gaussians = ["means", "log_scales", "quats", "opacity_logits", "features"][: len(jax.tree.leaves(params.gaussians))]
+        return with_leaves(params, *gaussians, *["networks"] * len(jax.tree.leaves(params.networks)))
 
 
 def make_field(
@@ -214,10 +215,10 @@ def make_field(
 
 @jax.jit
 def _init(field: WidebandField, key: Key[Array, ""]) -> WidebandParams:
-    return WidebandParams(_initial_gaussians(field.surface), _initial_networks(key, field))
+    return WidebandParams(_initial_gaussians(field.surface, field.config.features), _initial_networks(key, field))
 
 
-def _initial_gaussians(surface: Surface) -> Gaussians:
+def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
     points = surface.points
     n = points.shape[0]
     slots = slots_for(n)
@@ -229,6 +230,7 @@ def _initial_gaussians(surface: Surface) -> Gaussians:
         log_scales=jnp.pad(log_scales, ((0, pad), (0, 0))),
         quats=jnp.zeros((slots, 4), points.dtype).at[:, 0].set(1),
         opacity_logits=jnp.where(jnp.arange(slots) < n, logit, -jnp.inf).astype(points.dtype),
+        features=jnp.zeros((slots, features), points.dtype) if features else None,
     )
 
 
@@ -236,7 +238,8 @@ def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, An
     """Returns initial weights; the inputs matter by their shapes only."""
     config, points = field.config, field.surface.points
     attenuation, radiance, power = make_networks(config)
-    gaussian = [positional_encoding(points, config.gaussian_octaves)[:, None, :]]
+    encoded = positional_encoding(points, config.gaussian_octaves)
+    gaussian = [jnp.pad(encoded, ((0, 0), (0, config.features)))[:, None, :]]
     tx = [positional_encoding(points[:1], config.tx_octaves)[None]]
     frequency = encoded_frequency(jnp.full((1,), 1e9, points.dtype), config)[None]
     relative = [jnp.zeros((len(points), 1, RELATIVE_FEATURES), points.dtype)] if config.relative else []
@@ -273,5 +276,5 @@ def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tup
 
 def _features(params: WidebandParams, plan: WidebandPlan, query: Query) -> QueryFeatures:
     known = plan.frame, plan.receiver, plan.config
-    features = plan.features or gaussian_features(params.gaussians.means, params.networks, *known)
+    features = plan.features or gaussian_features(params.gaussians, params.networks, *known)
     return query_features(params.gaussians, params.networks, features, *known, query)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from wbgs_jax.config import DensityConfig, LoopConfig, OptimConfig, Settings
+from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings
 from wbgs_jax.fields.base import Optimizer
 from wbgs_jax.fields.encoding import FrequencyScale
 from wbgs_jax.radio.geometry import Projection
@@ -17,6 +17,8 @@ class WidebandConfig:
     """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
     sampling: SurfaceSampling = "solid_angle"
     """Spread them evenly over the receiver's directions, or over the area of the surface."""
+    features: int = 16
+    """Trained numbers of every Gaussian that its networks see beside its place (authors: 0)."""
     width: int = 64
     """Units of the attenuation network's layers (authors: 128)."""
     depth: int = 4
@@ -26,7 +28,7 @@ class WidebandConfig:
     fusion: int = 1
     """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
     all queries. 0: the paper's form."""
-    radiance_widths: tuple[int, ...] = (64, 32)
+    radiance_widths: tuple[int, ...] = (32,)
     """Units of the radiance network's layers (authors: 128, 64)."""
     gaussian_octaves: int = 6
     """Octaves of P(G) (authors: 10)."""
@@ -56,6 +58,8 @@ class WidebandConfig:
     """The loss looks at every so many-th window of the SSIM along both axes (paper: 1)."""
     power_weight: float = 0.01
     """Weight of the mean absolute error (dB) of the received power, where the data say what it was; not in the paper."""
+    features_lr: float = 1e-2
+    """Learning rate of the Gaussians' features."""
     network_optimizer: Optimizer = "muon"
     """What moves the networks' matrices (`base.Group`; authors: Adam)."""
     network_lr: float = 1e-2
@@ -85,12 +89,18 @@ CONFIGS = {
 }
 DENSITY = {
     "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
-    "cpu": DensityConfig(),
+    "cpu": DensityConfig(every=200, start=200),
     "gpu": DensityConfig(max_gaussians=100_000, reset_every=3000),
+}
+OPTIM = {
+    "smoke": PRESETS["smoke"].optim,
+    "cpu": OptimConfig(steps=2400),
+    "gpu": PRESETS["gpu"].optim,
 }
 PAPER = Settings(
     field=WidebandConfig(
         gaussians=0,
+        features=0,
         width=128,
         depth=8,
         skip=4,

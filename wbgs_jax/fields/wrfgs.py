@@ -13,7 +13,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import PRESETS
 from wbgs_jax.fields.base import register, with_field
-from wbgs_jax.fields.wideband import CONFIGS, DENSITY, WidebandConfig, WidebandField
+from wbgs_jax.fields.wideband import CONFIGS, DENSITY, OPTIM, WidebandConfig, WidebandField
 from wbgs_jax.types import Scene
 
 
@@ -28,7 +28,9 @@ class WrfgsField(WidebandField):
     """The wideband field without a frequency."""
 
     name: ClassVar[str] = "wrfgs"
-    presets: ClassVar = with_field(PRESETS, {name: without_frequency(c) for name, c in CONFIGS.items()}, density=DENSITY)
+    presets: ClassVar = with_field(
+        PRESETS, {name: without_frequency(c) for name, c in CONFIGS.items()}, density=DENSITY, optim=OPTIM
+    )
 
     @classmethod
     def check(cls, config: WidebandConfig) -> None:

@@ -186,4 +186,5 @@ def _edit(
     rotation = np.asarray(rotation_matrix(jnp.asarray(quats[halves])))
     means[halves] += np.einsum("nij,nj->ni", rotation, draw).astype(means.dtype)
     log_scales[halves] -= math.log(SPLIT_SHRINK)
-    return Gaussians(*map(jnp.asarray, (means, log_scales, quats, logits)))
+    features = None if gaussians.features is None else jnp.asarray(np.asarray(gaussians.features)[source])
+    return dataclasses.replace(Gaussians(*map(jnp.asarray, (means, log_scales, quats, logits))), features=features)
