@@ -55,7 +55,7 @@ def test_settings_that_have_moved_are_found_under_todays_names():
 
 
 def test_results_of_before_muon_say_so():
-    adam = {f"wrfgs.{name}": value for name, value in BEFORE_MUON["wrfgs"].items()}
+    adam = BEFORE_MUON["wrfgs"]
     assert adam["wrfgs.network_optimizer"] == "adam" and adam["wrfgs.network_lr"] == 4e-3
     slower = {"optim.network_lr": 1e-3, "optim.steps": 100}
     assert todays({"settings": slower}, "wrfgs") == adam | {"wrfgs.network_lr": 1e-3, "optim.steps": 100}
