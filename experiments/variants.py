@@ -71,11 +71,9 @@ _BLIND = {"attenuation_frequency": False, "radiance_frequency": False}
 _Values = Mapping[str, object]
 
 
-def _warm(network_lr: float, field: _Values | None = None, optim: _Values | None = None, steps: int | None = None) -> Variant:
+def _warm(network_lr: float, field: _Values | None = None) -> Variant:
     """A rate of the networks after a warm-up, and further changes."""
-    return Variant(
-        {"field": {"network_lr": network_lr, **(field or {})}, "optim": {"warmup": 0.1, **(optim or {})}}, steps=steps
-    )
+    return Variant({"field": {"network_lr": network_lr, **(field or {})}, "optim": {"warmup": 0.1}})
 
 
 FREQUENCY = {
@@ -86,14 +84,15 @@ FREQUENCY = {
     "f_heads_4": _warm(HIGHER_RATE, _BLIND | {"frequency_heads": 4}),
     "f_both": _warm(HIGHER_RATE, {"frequency_heads": 3, "frequency_degree": 3}),
 }
-"""What the frequency is to the networks."""
+FORMS = {
+    "degree_4": _of_field(frequency_degree=4),
+    "heads_4": _of_field(**_BLIND, frequency_heads=4),
+}
+"""What the frequency is to the networks, by Adam after a warm-up and by today's presets."""
 SCHEDULES = {
     "warm_8e-3": _warm(8e-3),
     "warm_1.6e-2": _warm(1.6e-2),
     "warm_2.4e-2": _warm(2.4e-2),
-    "warm_1.6e-2_to_0": _warm(1.6e-2, optim={"final_fraction": 1e-3}),
-    "warm_1.6e-2_gaussians": _warm(1.6e-2, {"means_lr": 3e-3, "log_scales_lr": 1.5e-2, "quats_lr": 3e-3, "opacity_lr": 7.5e-2}),
-    "warm_1.6e-2_batch_4": _warm(1.6e-2, optim={"batch": 4}, steps=4000),
     "steps_6000": Variant(steps=6000),
 }
 """How fast, and how long."""
@@ -136,4 +135,6 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | POOLED | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = (
+    TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | FORMS | OPTIMIZERS | POOLED | VOLUME | COHERENT
+)

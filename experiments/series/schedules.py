@@ -6,12 +6,10 @@ from experiments.series.series import Series, jobs_of_all, render_all
 
 TITLE = "Schedules"
 RATES = ("", "lr_8e-3", "lr_1.6e-2", "warm_8e-3", "warm_1.6e-2", "warm_2.4e-2")
-OTHERS = ("warm_1.6e-2_to_0", "warm_1.6e-2_gaussians", "warm_1.6e-2_batch_4")
 SERIES = (
     Series("The `cpu` preset of today", "wideband", ("",), "main", ("1", "2", "4")),
     Series("Behind walls, beside the former 6,000 steps", "wideband", ("", "warm_8e-3", "steps_6000"), "schedules", ("2", "4")),
-    Series("Learning rates", "wideband", (*RATES, "steps_6000"), "schedules"),
-    Series("Other rates, the end, the batch", "wideband", OTHERS, "schedules"),
+    Series("Learning rates", "wideband", RATES, "schedules"),
 )
 
 
