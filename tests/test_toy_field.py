@@ -96,7 +96,7 @@ def trained(tmp_path_factory):
         if (kind, n_rx) not in runs:
             folder = tmp_path_factory.mktemp("toy")
             save_scene(folder / "box.npz", tiny_scene(N_TX, n_rx=n_rx, kind=kind))
-            arguments = ["--scene", folder / "box.npz", "--validation", 0.2, *TRAIN]
+            arguments = ["--scene", folder / "box.npz", "--validation", 0.2, "--no-neighbours", *TRAIN]
             result = call(train_command.main, *arguments, "--toy.brightness", 0.4, "--out", folder / "run")
             assert (result.code, result.out) == (0, ""), result.err
             assert f"trained {STEPS} steps" in result.err
@@ -151,7 +151,7 @@ def test_its_data_are_split_by_transmitter_and_its_batches_are_of_one_receiver(t
     run = wb.load_trained(trained(kind, n_rx))
     dataset = run.dataset()
     parts = [set(dataset.tx_index[part]) for part in (dataset.train, dataset.validation, dataset.test)]
-    assert [len(part) for part in parts] == [5, 1, 3] and len(set.union(*parts)) == N_TX
+    assert [len(part) for part in parts] == [4, 2, 3] and len(set.union(*parts)) == N_TX
     assert all(len(dataset.receiver_index[part]) % n_rx == 0 for part in (dataset.train, dataset.validation, dataset.test))
     again = Run(dataset, "toy", run.config.settings, 0, tmp_path)
     batches = again.numbers[again.batches(0, 30)]
@@ -168,7 +168,7 @@ def test_it_is_evaluated_by_the_command_line(trained, kind, n_rx, part):
     assert result.code == 0, result.err
     report, dataset = json.loads(result.out), wb.load_trained(folder).dataset()
     assert (report["scene"], report["field"], report["part"]) == ("box", "toy", part)
-    assert report["n"] == len(getattr(dataset, part)) == {"test": 3, "validation": 1}[part] * n_rx * len(FREQUENCIES_HZ)
+    assert report["n"] == len(getattr(dataset, part)) == {"test": 3, "validation": 2}[part] * n_rx * len(FREQUENCIES_HZ)
     assert [row["n"] for row in report["per_frequency"]] == [report["n"] // 3] * 3
     if kind == "power":
         assert report["power_error_db"] > 0 and report["baselines"].keys() == {"free_space", "nearest_tx"}
@@ -194,7 +194,18 @@ def test_it_resumes_bit_for_bit(trained, tmp_path, kind, n_rx):
     shutil.copytree(whole, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints" / str(STEPS))
     scene = wb.load_trained(whole).config.source
-    arguments = ["--scene", scene, "--validation", 0.2, *TRAIN, "--toy.brightness", 0.4, "--out", tmp_path / "run"]
+    arguments = [
+        "--scene",
+        scene,
+        "--validation",
+        0.2,
+        "--no-neighbours",
+        *TRAIN,
+        "--toy.brightness",
+        0.4,
+        "--out",
+        tmp_path / "run",
+    ]
     assert_error_for_people(call(train_command.main, *arguments), "--resume")
     other = call(train_command.main, *arguments, "--resume", "--toy.learning-rate", 0.1)
     assert_error_for_people(other, "settings.toy.learning_rate: 0.05, not 0.1")

@@ -20,7 +20,9 @@ from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, get_field
+from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.loop import TrainResult, check_data, train
+from wbgs_jax.training.neighbours import learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 PROGRAM = "wbgs-jax train"
@@ -56,6 +58,8 @@ class Command:
     """Test at all transmitters in a box, x y z of its lowest and of its highest corner (metres), and train at the others."""
     receiver: int | None = None
     """Look at this receiver alone, of data that have several."""
+    neighbours: bool = True
+    """Ask known spectra nearby beside the field, where that gains on validation (docs/inference.md)."""
 
 
 def default_preset() -> str:
@@ -124,6 +128,7 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
         validation=command.validation,
         test_box=tuple(command.test_box),
         receiver=command.receiver,
+        neighbours=command.neighbours,
     )
 
 
@@ -144,6 +149,10 @@ def main(arguments: list[str] | None = None) -> None:
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
     result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
+    if config.neighbours:
+        neighbours, line = learn_neighbours(result.field, result.params, dataset)
+        write_neighbours(folder, neighbours)
+        say(line) if line else None
     say(summary(result, folder))
 
 

@@ -14,6 +14,8 @@ from wbgs_jax.data.dataset import Dataset
 
 VALIDATION = 0.1
 """Share of the training transmitters that decide between settings, where the data do not name them."""
+FEW_TX, LARGEST_SHARE = 8, 0.25
+"""Fewer validation transmitters decide little; but no more than this share for the sake of that number."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
@@ -38,7 +40,8 @@ def tx_disjoint_split(
 
 
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
-    """Returns the data set with `fraction` of its training transmitters moved to the validation part.
+    """Returns the data set with `fraction` of its training transmitters moved to the validation part; with fewer than
+    `FEW_TX` of them, as many, but no more than a quarter of all: less decides nothing.
 
     Which ones depends on the split alone: neither a run's seed nor what is trained changes them. Data that name a validation
     part themselves, and data of a single training transmitter, stay as they are.
@@ -49,7 +52,10 @@ def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Datas
     tx_index = dataset.tx_index[dataset.train]
     if len(dataset.validation) or len(np.unique(tx_index)) < 2:
         return dataset
-    seed = zlib.crc32(np.unique(tx_index).astype("<i8").tobytes())
+    known = np.unique(tx_index)
+    if 0 < fraction < 1:  # others are refused below
+        fraction = max(fraction, min(FEW_TX / len(known), LARGEST_SHARE))
+    seed = zlib.crc32(known.astype("<i8").tobytes())
     moved = _draw(tx_index, fraction, np.random.default_rng(seed), "validation")
     return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])
 

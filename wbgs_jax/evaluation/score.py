@@ -15,7 +15,8 @@ from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.power import power_figures
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.predictor import BLOCK, Trained, observe_links, render_pas
+from wbgs_jax.inference.neighbours import for_receiver
+from wbgs_jax.inference.predictor import BLOCK, Trained, observe, observe_links, render_pas
 from wbgs_jax.radio import channel
 
 Part = Literal["test", "validation"]
@@ -29,7 +30,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
         UserError: nothing is held out, or the field knows nothing of what was observed.
     """
     index = held_out(dataset, part)
-    seen = observe_links(trained.field, trained.params, dataset, index)
+    seen = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     power = power_of(seen, dataset, index)
     if dataset.kind == "power":
@@ -88,13 +89,14 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n
 def time_queries(trained: Trained, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
     """Returns milliseconds a PAS, for single queries and in blocks: medians over repeats after compilation."""
     plan = trained.field.plan(trained.params, dataset.receiver())
+    neighbours = for_receiver(trained.neighbours, dataset.receiver())
     result = {}
     for name, size in (("ms_per_pas", BLOCK), ("ms_per_pas_single", 1)):
         query = dataset.query(np.resize(dataset.test if len(dataset.test) else dataset.train, size))
         seconds = []
         for _ in range(repeats + 1):
             begin = time.perf_counter()
-            jax.block_until_ready(render_pas(trained.field, trained.params, plan, query))
+            jax.block_until_ready(render_pas(trained.field, trained.params, plan, query, neighbours))
             seconds.append(time.perf_counter() - begin)
         result[name] = round(1e3 * float(np.median(seconds[1:])) / size, 3)  # the first call compiles
     return result

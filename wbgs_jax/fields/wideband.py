@@ -139,11 +139,16 @@ class WidebandField(Field):
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
         """Returns the spectra of B queries, and their received power."""
+        return self._render(params, plan, query)
+
+    def _render(self, params: WidebandParams, plan: WidebandPlan, query: Query, detached: bool = False) -> Observation:
+        """Detached power has no gradient with respect to what the spectra are made of."""
         check_query(query)
         features = _features(params, plan, query)
         spectra = render_splats(plan.geometry, features.attenuation, features.signal)
+        summary = jax.lax.stop_gradient(features.summary) if detached else features.summary
         known = plan.frame, plan.receiver, plan.config
-        return Observation(spectra, power_db=received_power_db(features.summary, params.networks, *known, query))
+        return Observation(spectra, power_db=received_power_db(summary, params.networks, *known, query))
 
     def probe(self, params: WidebandParams) -> Float[Array, "n 2"]:
         """Returns zero offsets (pixels) of the projected centres: density control watches their gradient."""
@@ -154,7 +159,7 @@ class WidebandField(Field):
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
         planned = self._plan(params, batch.receiver, limits, probe, gaussian_features)
-        seen = self.render(params, planned, batch.links.query)
+        seen = self._render(params, planned, batch.links.query, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
             loss += self.config.power_weight * error_db

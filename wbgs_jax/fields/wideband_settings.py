@@ -57,7 +57,8 @@ class WidebandConfig:
     ssim_stride: int = 2
     """The loss looks at every so many-th window of the SSIM along both axes (paper: 1)."""
     power_weight: float = 0.01
-    """Weight of the mean absolute error (dB) of the received power, where the data say what it was; not in the paper."""
+    """Weight of the mean absolute error (dB) of the received power, where the data say what it was. It moves nothing that the
+    spectra are made of. Not in the paper."""
     features_lr: float = 1e-2
     """Learning rate of the Gaussians' features."""
     network_optimizer: Optimizer = "muon"

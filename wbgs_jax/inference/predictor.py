@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.neighbours import Neighbours, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
@@ -35,6 +36,11 @@ class Trained(Protocol):
         """Its parameters."""
         ...
 
+    @property
+    def neighbours(self) -> Neighbours | None:
+        """Known spectra that are asked beside it."""
+        ...
+
     def dataset(self) -> Dataset:
         """Returns the data."""
         ...
@@ -52,8 +58,8 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     trained on, which are read for it). Compiles for every new number of queries; `maps.predict_many` keeps that number fixed.
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
-    plan = trained.field.plan(trained.params, receiver)
-    return on_any_shape(lambda query: render_pas(trained.field, trained.params, plan, query))
+    plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
+    return on_any_shape(lambda query: render_pas(trained.field, trained.params, plan, query, neighbours))
 
 
 def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
@@ -87,9 +93,11 @@ def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[A
 
 
 @jax.jit
-def render_pas(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, "b 90 360"]:
+def render_pas(
+    field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None = None
+) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
-    return field.render(params, plan, query).pas
+    return correct(neighbours, field.render(params, plan, query).pas, query)
 
 
 @jax.jit
@@ -134,6 +142,21 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
             total = _like(seen, len(index)) if total is None else total
             _put(total, block, seen)
     return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
+
+
+def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
+    """Returns what `observe_links` does, the spectra with what the neighbours say."""
+    seen = observe_links(trained.field, trained.params, dataset, index)
+    neighbours = for_receiver(trained.neighbours, dataset.receiver()) if dataset.n_receivers == 1 else None
+    if neighbours is not None:
+        spectra = np.asarray(seen.pas)
+        for start in range(0, len(index), BLOCK):
+            block = slice(start, start + BLOCK)
+            spectra[block] = _correct(neighbours, spectra[block], dataset.query(index[block]))
+    return seen
+
+
+_correct = jax.jit(correct)
 
 
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:

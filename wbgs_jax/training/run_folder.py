@@ -1,6 +1,6 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
-config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
+config.json   metrics.jsonl   checkpoints/STEP/   neighbours.npz   eval.json   pictures/*.png
 """
 
 import dataclasses
@@ -27,6 +27,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, from_arrays, get_field
+from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
 from wbgs_jax.training import checkpoint
 
 FIRST_PRESET = "cpu"
@@ -54,6 +55,8 @@ class RunConfig:
     """Test at the transmitters in a box, lowest and highest corner (metres), and train elsewhere; none: as the data say."""
     receiver: int | None = None
     """Number of the only receiver that is looked at; None: all."""
+    neighbours: bool = True
+    """Whether known spectra are asked beside the field, where that gains on validation."""
 
     def dataset(self) -> Dataset:
         """Returns the data that the run was trained on."""
@@ -80,6 +83,8 @@ class TrainedField:
     step: int
     seconds: float
     """Training time."""
+    neighbours: Neighbours | None = None
+    """Known spectra that are asked beside it."""
 
     def dataset(self) -> Dataset:
         """Returns the data that it was trained on."""
@@ -150,4 +155,5 @@ def load_trained(folder: Path | str) -> TrainedField:
     saved = checkpoint.read(folder / "checkpoints", steps[-1])
     field = from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
-    return TrainedField(config, field, params, steps[-1], float(saved.metadata["seconds"]))
+    seconds = float(saved.metadata["seconds"])
+    return TrainedField(config, field, params, steps[-1], seconds, read_neighbours(folder))

@@ -1,0 +1,96 @@
+"""Whether neighbours are asked is found on the validation part, and nothing else is looked at."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_dataset
+from toys import RippleConfig, RippleField
+
+from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.inference.neighbours import correct
+from wbgs_jax.training import neighbours as module
+from wbgs_jax.training.neighbours import FEWEST, MOST, Choice, choose, learn_neighbours
+
+
+@pytest.fixture(scope="module")
+def field():
+    return RippleField(RippleConfig())
+
+
+@pytest.fixture(scope="module")
+def params(field):
+    return field.init(jax.random.key(1))
+
+
+def alike(dataset, rng, spread):
+    """All transmitters within `spread` metres: neighbours see nearly the same."""
+    _, first = np.unique(dataset.tx_index, return_index=True)
+    base = {f: dataset.snapshots[np.flatnonzero(dataset.frequencies_hz == f)[0]] for f in np.unique(dataset.frequencies_hz)}
+    snapshots = np.stack([base[f] for f in dataset.frequencies_hz])
+    offsets = rng.uniform(-spread, spread, (len(first), 3))[dataset.tx_index]
+    return dataclasses.replace(dataset, snapshots=snapshots, tx_positions=dataset.tx_positions[0] + offsets)
+
+
+def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
+    dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
+    neighbours, line = learn_neighbours(field, params, dataset)
+    assert neighbours is not None and "gain +" in line
+    assert len(neighbours.frequency_hz) == len(dataset.train) + len(dataset.validation)
+    own = jax.jit(lambda query: field.render(params, field.plan(params, dataset.receiver()), query).pas)
+    query, truth = dataset.query(dataset.test), np.asarray(dataset.pas(dataset.test))
+    alone = np.asarray(own(query))
+    corrected = np.asarray(correct(neighbours, jnp.asarray(alone), query))
+    assert ssim(corrected, truth).mean() > ssim(alone, truth).mean() + 0.2
+
+
+def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
+    dataset = tiny_dataset(24)
+    plan = field.plan(params, dataset.receiver())
+    images = np.asarray(jax.jit(lambda query: field.render(params, plan, query).pas)(dataset.query(np.arange(len(dataset)))))
+    told = np.clip(255 * images + rng.normal(0, 3, images.shape), 0, 255).astype(np.uint8)  # what the field says already
+    noisy = dataclasses.replace(dataset, snapshots=None, images=told)
+    neighbours, line = learn_neighbours(field, params, hold_out_validation(noisy))
+    assert neighbours is None and "the field answers alone" in line
+
+
+def test_the_smoothest_of_what_is_no_worse_is_chosen(rng):
+    tx = np.arange(8)
+    noise = rng.normal(0, 0.01, 8)
+    sharp, smooth, smoothest, harmful = (Choice("spectra", length, 1.0) for length in (0.1, 1.0, 10.0, 100.0))
+    tried = {
+        sharp: 0.1 + noise,
+        smooth: 0.1 + noise + rng.normal(0, 0.03, 8) - 0.001,
+        smoothest: 0.05 + noise,  # worse for sure
+        harmful: -0.2 + noise,
+        Choice("residuals", 50.0, 1.0): 0.1 + noise - 1e-4 * np.array([1, -1] * 4),
+    }
+    within = abs(np.mean(tried[sharp] - tried[smooth])) <= np.std(tried[sharp] - tried[smooth], ddof=1) / 8**0.5
+    best = max(tried, key=lambda choice: tried[choice].mean())
+    chosen, gain = choose(tried, tx)
+    assert chosen == (smooth if within or best == smooth else sharp) and gain == pytest.approx(tried[chosen].mean())
+    assert choose({harmful: tried[harmful]}, tx)[0] is None
+    assert choose({sharp: np.array([1, -0.9, 0.2, -0.2])}, np.arange(4))[0] is None  # not sure
+    assert choose({}, tx) == (None, 0.0)
+
+
+def test_the_test_part_changes_nothing(field, params, rng):
+    dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
+    poisoned = dataset.snapshots.copy()
+    poisoned[dataset.test] = np.nan
+    found, _ = learn_neighbours(field, params, dataset)
+    again, _ = learn_neighbours(field, params, dataclasses.replace(dataset, snapshots=poisoned))
+    jax.tree.map(np.testing.assert_array_equal, found, again)
+
+
+def test_data_that_cannot_have_any_have_none(field, params, monkeypatch):
+    dataset = hold_out_validation(tiny_dataset(24))
+    fewer = dataclasses.replace(dataset, validation=dataset.validation[: FEWEST - 1])
+    others = hold_out_validation(tiny_dataset(24, n_rx=2)), hold_out_validation(tiny_dataset(24, kind="power"))
+    for data in (fewer, *others):
+        assert learn_neighbours(field, params, data) == (None, "")
+    monkeypatch.setattr(module, "MOST", len(dataset.train))
+    assert learn_neighbours(field, params, dataset) == (None, "") and len(dataset.train) < MOST

@@ -1,0 +1,109 @@
+"""What known spectra nearby say about a spectrum, beside the field: simple kriging over the transmitter's position.
+
+    k(x) = exp(-|x - x_j| / L) at the same frequency,   a = (K + noise)^-1
+    residuals:  f(x) + w k(x) a (y - f)
+    spectra:    f(x) + w k(x) a (y - f(x))
+
+The first adds what the field left unexplained at its neighbours; the second moves towards their spectra themselves, which helps
+where the field has learned them by heart and their residuals are zero. Which, how far (L) and how much (w) is found on the
+validation part (training/neighbours.py), nothing at all included.
+"""
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.radio.array import EXACT
+from wbgs_jax.types import Query, Receiver
+
+SAME_FREQUENCY = 1e-4
+"""Relative difference of two frequencies that are the same."""
+SAME_PLACE_M = 1e-3
+"""Distance of two receivers that are the same."""
+FILE = "neighbours.npz"
+
+
+@pytree
+class Neighbours:
+    """M known spectra of one receiver, ready to be asked."""
+
+    rx_position: Float[Array, "3"]
+    tx_position: Float[Array, "m 3"]
+    """Metres, world frame."""
+    frequency_hz: Float[Array, "m"]
+    images: Float[Array, "m 90 360"]
+    """w a (y - f), or w a y."""
+    own: Float[Array, "m"]
+    """What is taken away of the field's own spectrum: w a 1 for spectra, 0 for residuals."""
+    length: Float[Array, ""]
+    """L in metres."""
+
+
+def nearness(
+    tx_position: Float[Array, "b 3"],
+    frequency_hz: Float[Array, "b"],
+    known_position: Float[Array, "m 3"],
+    known_frequency: Float[Array, "m"],
+    length: Any,
+) -> Float[Array, "b m"]:
+    """Returns the kernel: exp(-distance / length) at equal frequencies, else 0."""
+    offset = tx_position[:, None] - known_position[None]
+    distance = jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12)  # differentiable at a neighbour itself
+    same = jnp.abs(jnp.log(frequency_hz[:, None] / known_frequency[None])) < SAME_FREQUENCY
+    return jnp.where(same, jnp.exp(-distance / length), 0)
+
+
+def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
+    """Returns a field's spectra with what the neighbours say; at frequencies or places far from all of them they stay."""
+    if neighbours is None:
+        return pas
+    known = neighbours.tx_position, neighbours.frequency_hz, neighbours.length
+    k = nearness(query.tx_position, query.frequency_hz, *known)
+    said = jnp.tensordot(k, neighbours.images, 1, precision=EXACT)
+    corrected = pas + said - (k @ neighbours.own)[:, None, None] * pas
+    heard = jnp.any(k > 0, 1)[:, None, None]
+    return jnp.where(heard, jnp.clip(corrected, 0, 1), pas)
+
+
+def for_receiver(neighbours: Neighbours | None, receiver: Receiver) -> Neighbours | None:
+    """Returns the neighbours if they are of this receiver, else None (host)."""
+    if neighbours is None:
+        return None
+    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(neighbours.rx_position))
+    return neighbours if distance < SAME_PLACE_M else None
+
+
+def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:
+    """Leaves them in a run folder, or nothing; images in half precision."""
+    if neighbours is None:
+        (folder / FILE).unlink(missing_ok=True)
+        return
+    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(neighbours).items()}
+    arrays["images"] = arrays["images"].astype(np.float16)
+    with atomic_write(folder / FILE) as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def read_neighbours(folder: Path) -> Neighbours | None:
+    """Returns those of a run folder; None if it has none.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    path = folder / FILE
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as archive:
+            arrays = {name: jnp.asarray(value, jnp.float32) for name, value in archive.items()}
+        return Neighbours(**arrays)
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{path} is damaged ({error}); remove it to ask the field alone, or train again") from error

@@ -1,0 +1,127 @@
+"""Whether known spectra nearby are to be asked beside a trained field, and how: found on the validation part, on the host.
+
+The training part is what is asked, at the transmitters of the validation part, which the field has not seen. If the best way
+gains more than a standard error, the smoothest one is kept that is no worse than it by more than a standard error (Breiman et
+al. 1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
+parts are asked.
+"""
+
+import itertools
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import training_links
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.fields import Field
+from wbgs_jax.inference.neighbours import Neighbours, correct, nearness
+from wbgs_jax.inference.predictor import predict_spectra
+
+Kind = Literal["residuals", "spectra"]
+FEWEST, MOST = 4, 1000
+"""Validation spectra below which nothing is decided; known spectra above which nothing is kept (130 kB each)."""
+SCORED = 60
+"""Validation spectra that are looked at."""
+SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
+"""Lengths that are tried, in median distances of a training transmitter to the next one."""
+WEIGHTS = (0.5, 1.0)
+NOISE = 1e-2
+"""Variance of what is no function of the position, beside 1."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How neighbours are asked."""
+
+    kind: Kind
+    length: float
+    """Metres."""
+    weight: float
+
+
+def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> tuple[Neighbours | None, str]:
+    """Returns the neighbours that improve a trained field (None: it is better by itself), and a line that says what was found.
+
+    Data of several receivers, of received powers, with fewer than `FEWEST` validation or more than `MOST` known spectra have
+    none.
+    """
+    links = training_links(dataset)
+    if dataset.kind == "power" or dataset.n_receivers > 1 or len(dataset.validation) < FEWEST or len(links) > MOST:
+        return None, ""
+    truth, predicted = np.asarray(dataset.pas(links)), predict_spectra(field, params, dataset, links)
+    known, asked = (np.flatnonzero(np.isin(links, part)) for part in (dataset.train, dataset.validation))
+    asked = np.random.default_rng(0).permutation(asked)[:SCORED]
+    alone = ssim(predicted[asked], truth[asked])
+    query = dataset.query(links[asked])
+
+    def gains(choice: Choice) -> Float[np.ndarray, "n"]:
+        neighbours = make_neighbours(choice, dataset, links[known], truth[known], predicted[known])
+        return ssim(np.asarray(correct(neighbours, jnp.asarray(predicted[asked]), query)), truth[asked]) - alone
+
+    tx = dataset.tx_index[links[asked]]
+    chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, links[known])}, tx)
+    if chosen is None:
+        return None, f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone"
+    line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
+    return make_neighbours(chosen, dataset, links, truth, predicted), line
+
+
+def choices(dataset: Dataset, known: Int[np.ndarray, "n"]) -> list[Choice]:
+    """Returns what is tried."""
+    positions = np.unique(dataset.tx_positions[known], axis=0)
+    if len(positions) < 2:
+        return []
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    spacing = float(np.median(np.sort(distances, axis=1)[:, 1]))
+    kinds: tuple[Kind, ...] = ("residuals", "spectra")
+    return [Choice(kind, scale * spacing, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
+
+
+def choose(tried: dict[Choice, Float[np.ndarray, "n"]], tx_index: Int[np.ndarray, "n"]) -> tuple[Choice | None, float]:
+    """Returns the choice by its gains over the field alone (None: nothing sure), and its mean gain.
+
+    Of two, the one with the full weight is smoother, then the one of spectra, then the longer one.
+    """
+    if not tried:
+        return None, 0.0
+    best = max(tried, key=lambda choice: float(tried[choice].mean()))
+    gain, error = standard_error(tried[best], tx_index)
+    if gain <= error:
+        return None, gain
+    enough = []
+    for choice, gains in tried.items():
+        worse, doubt = standard_error(tried[best] - gains, tx_index)
+        if worse <= doubt or choice == best:
+            enough.append(choice)
+    smoothest = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", choice.length))
+    return smoothest, standard_error(tried[smoothest], tx_index)[0]
+
+
+def standard_error(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> tuple[float, float]:
+    """Returns the mean gain and its standard error, transmitters being what was drawn."""
+    by_tx = np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])
+    error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
+    return float(by_tx.mean()), float(error)
+
+
+def make_neighbours(
+    choice: Choice,
+    dataset: Dataset,
+    index: Int[np.ndarray, "m"],
+    truth: Float[np.ndarray, "m 90 360"],
+    predicted: Float[np.ndarray, "m 90 360"],
+) -> Neighbours:
+    """Returns known links as neighbours."""
+    positions = jnp.asarray(dataset.tx_positions[index], jnp.float32)
+    frequencies = jnp.asarray(dataset.frequencies_hz[index], jnp.float32)
+    kernel = np.asarray(nearness(positions, frequencies, positions, frequencies, choice.length), np.float64)
+    inverse = choice.weight * np.linalg.inv(kernel + NOISE * np.eye(len(index)))
+    said = truth if choice.kind == "spectra" else truth - predicted
+    images = (inverse @ said.reshape(len(index), -1).astype(np.float64)).reshape(said.shape)
+    own = inverse.sum(1) if choice.kind == "spectra" else np.zeros(len(index))
+    as_float32 = [jnp.asarray(array, jnp.float32) for array in (images, own, choice.length)]
+    return Neighbours(dataset.receiver().position, positions, frequencies, *as_float32)
