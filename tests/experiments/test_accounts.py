@@ -1,0 +1,56 @@
+"""What is no series: laws of the frequency against what they are exact for, trained fields with and without neighbours."""
+
+import json
+
+import numpy as np
+import pytest
+from synthetic import tiny_scene
+from untrained import make_run
+
+from experiments import frequency_account, neighbours_account
+from experiments.frequency_account import LAWS, polynomial
+from wbgs_jax.data.scene_file import save_scene
+
+LOGS = np.log10([1e9, 2.4e9, 10e9, 28e9, 60e9, 94e9])
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_polynomial_of_its_degree_is_continued_exactly(rng, degree):
+    places = LOGS - LOGS.mean()
+    spectra = 0.5 + sum(0.05 * rng.normal(size=(1, 90, 360)) * places[:, None, None] ** k for k in range(1, degree + 1))
+    spectra = np.clip(spectra, 0.01, 0.99) if spectra.min() > 0.01 and spectra.max() < 0.99 else 0.5 + (spectra - 0.5) / 4
+    for i in range(len(LOGS)):
+        rest = np.arange(len(LOGS)) != i
+        predicted = polynomial(degree)(spectra[rest], LOGS[rest], LOGS[i])
+        np.testing.assert_allclose(predicted, np.clip(spectra[i], 0, 1), atol=1e-9)
+
+
+def test_half_a_line_lies_between_the_mean_and_the_line(rng):
+    spectra, asked = rng.uniform(0.4, 0.6, (5, 90, 360)), LOGS[-1]
+    mean, half, line = (LAWS[name](spectra, LOGS[:5], asked) for name in ("mean", "half_a_line", "line"))
+    inside = (line > 0) & (line < 1)  # a line is cut where it leaves the range of spectra
+    np.testing.assert_allclose(half[inside], (mean + line)[inside] / 2, atol=1e-9)
+
+
+def test_neighbours_in_frequency_are_the_nearest_and_the_farthest(rng):
+    spectra = rng.uniform(size=(6, 90, 360))
+    np.testing.assert_allclose(LAWS["nearest"](spectra, LOGS, LOGS[0]), spectra[:4].mean(0))
+    np.testing.assert_allclose(LAWS["farthest"](spectra, LOGS, LOGS[0]), spectra[2:].mean(0))
+
+
+def test_the_account_of_a_scene(tmp_path, monkeypatch):
+    save_scene(tmp_path / "box.npz", tiny_scene(24))
+    monkeypatch.setattr("sys.argv", ["frequency_account", str(tmp_path / "box.npz"), "--out", str(tmp_path)])
+    frequency_account.main()
+    scores = json.loads((tmp_path / "frequency_account.json").read_text())["scenes"]["box"]
+    assert scores.keys() == LAWS.keys() and all(0 < score < 1 for score in scores.values())
+    assert scores["nearest"] == pytest.approx(scores["mean"])  # of three frequencies the others are two
+
+
+def test_a_run_without_neighbours_scores_the_same_twice(tmp_path, monkeypatch):
+    run = make_run(tmp_path)
+    monkeypatch.setattr("sys.argv", ["neighbours_account", str(run), "--out", str(tmp_path)])
+    neighbours_account.main()
+    (scores,) = (value for value in json.loads((tmp_path / "neighbours.json").read_text()).values() if isinstance(value, dict))
+    assert scores["alone"] == scores["asked"] and scores["neighbours"] == 0
+    assert 0 < scores["nearest_tx"]["median_ssim"] < 1
