@@ -63,7 +63,6 @@ PROFILES = {
     "tuning": Profile("cpu", 1000, 600, **QUICK_BY_ADAM, scored_tx=SCORED_SLOW),
     "main": Profile("cpu", 2400, 600, validation=True),
     "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_SLOW),
-    "forms": Profile("cpu", 1000, 600, **QUICK, validation=True),
     "curve": Profile("cpu", 1000, 600, **QUICK),
     "schedules": Profile("cpu", 2000, 600, fields={"wideband": BY_ADAM}, validation=True),
     "frequency": Profile("cpu", 1000, 600, fields={"wideband": BY_ADAM}, validation=True),

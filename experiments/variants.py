@@ -84,11 +84,7 @@ FREQUENCY = {
     "f_heads_4": _warm(HIGHER_RATE, _BLIND | {"frequency_heads": 4}),
     "f_both": _warm(HIGHER_RATE, {"frequency_heads": 3, "frequency_degree": 3}),
 }
-FORMS = {
-    "degree_4": _of_field(frequency_degree=4),
-    "heads_4": _of_field(**_BLIND, frequency_heads=4),
-}
-"""What the frequency is to the networks, by Adam after a warm-up and by today's presets."""
+"""What the frequency is to the networks."""
 SCHEDULES = {
     "warm_8e-3": _warm(8e-3),
     "warm_1.6e-2": _warm(1.6e-2),
@@ -135,6 +131,4 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = (
-    TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | FORMS | OPTIMIZERS | POOLED | VOLUME | COHERENT
-)
+VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | POOLED | VOLUME | COHERENT

@@ -1,6 +1,6 @@
 """What the frequency is to the networks of the wideband field, where it matters: behind walls. On validation.
 
-All but the first of a table see it; `variants.py` says how.
+All but the first see it; `variants.FREQUENCY` says how.
 """
 
 from experiments.jobs import Job
@@ -9,10 +9,7 @@ from experiments.series.series import Series, jobs_of_all, render_all
 
 TITLE = "Frequency"
 FORMS = ("f_off", "f_input", "f_degree_4", "f_heads_2", "f_heads_4", "f_both")
-SERIES = (
-    Series("1,000 steps of Adam", "wideband", FORMS, "frequency", scenes=("2",)),
-    Series("1,000 steps of Muon", "wideband", ("pooled", "", "degree_4", "heads_4"), "forms", scenes=("2", "3", "4", "5")),
-)
+SERIES = (Series("1,000 steps of Adam", "wideband", FORMS, "frequency", scenes=("2",)),)
 
 
 def jobs() -> list[Job]:

@@ -6,10 +6,11 @@ from experiments.series.series import Series, jobs_of_all, render_all
 from experiments.variants import OPTIMIZERS
 
 TITLE = "Optimisers and learning rates"
+BOTH = ("adam_4e-3", "muon_1e-2")
 SERIES = (
     Series("Wideband", "wideband", tuple(OPTIMIZERS), "rates", scenes=("4",)),
-    Series("WRF-GS, a model a frequency", "wrfgs", tuple(OPTIMIZERS), "rates", scenes=("4",)),
-    Series("NeRF2", "nerf2", tuple(OPTIMIZERS), "rates", scenes=("4",)),
+    Series("WRF-GS, a model a frequency", "wrfgs", BOTH, "rates", scenes=("4",)),
+    Series("NeRF2", "nerf2", BOTH, "rates", scenes=("4",)),
 )
 
 
