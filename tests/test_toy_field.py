@@ -300,3 +300,21 @@ def test_what_it_does_not_know_is_an_error_for_people(tmp_path):
         assert not (tmp_path / "run").exists()
     finally:
         del base._FIELDS["blind"]
+
+
+def test_neighbours_are_asked_unless_their_file_is_gone(tmp_path):
+    """By the command line: the toy knows little of the room, the transmitters next door more."""
+    save_scene(tmp_path / "box.npz", tiny_scene(24))
+    run = tmp_path / "run"
+    result = call(train_command.main, "--scene", tmp_path / "box.npz", *TRAIN, "--out", run)
+    assert result.code == 0 and "of neighbours within about" in result.err, result.err
+
+    def median() -> float:
+        report = json.loads(call(eval_command.main, "--run", run, "--json", "--no-pictures").out)
+        return float(report["median_ssim"])
+
+    asked = median()
+    (run / "neighbours.npz").unlink()
+    assert asked > median() + 0.05
+    again = call(train_command.main, "--scene", tmp_path / "box.npz", *TRAIN, "--out", run, "--resume")
+    assert again.code == 0 and (run / "neighbours.npz").exists() and median() == pytest.approx(asked)

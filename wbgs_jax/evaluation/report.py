@@ -54,6 +54,8 @@ def _training_arguments(config: Any) -> list[str]:
         data += ["--validation", f"{config.validation:g}"]
     if config.receiver is not None:
         data += ["--receiver", str(config.receiver)]
+    if not config.neighbours:
+        data += ["--no-neighbours"]
     return [*data, "--field", config.field, "--preset", config.preset, "--seed", str(config.seed)]
 
 
