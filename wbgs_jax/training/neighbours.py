@@ -1,8 +1,8 @@
 """Whether known spectra nearby are to be asked beside a trained field, and how: found on the validation part, on the host.
 
 The training part is what is asked, at the transmitters of the validation part, which the field has not seen. If the best way
-gains more than a standard error, the smoothest one is kept that is no worse than it by more than a standard error (Breiman et
-al. 1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
+gains more than a standard error, the smoothest one is kept that gains no less by more than a standard error (Breiman et al.
+1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
 parts are asked.
 """
 
@@ -92,11 +92,7 @@ def choose(tried: dict[Choice, Float[np.ndarray, "n"]], tx_index: Int[np.ndarray
     gain, error = standard_error(tried[best], tx_index)
     if gain <= error:
         return None, gain
-    enough = []
-    for choice, gains in tried.items():
-        worse, doubt = standard_error(tried[best] - gains, tx_index)
-        if worse <= doubt or choice == best:
-            enough.append(choice)
+    enough = [choice for choice, gains in tried.items() if standard_error(gains, tx_index)[0] >= gain - error]
     smoothest = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", choice.length))
     return smoothest, standard_error(tried[smoothest], tx_index)[0]
 
