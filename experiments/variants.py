@@ -94,11 +94,9 @@ SCHEDULES = {
 """How fast, and how long."""
 OPTIMIZERS = {
     "adam_4e-3": _of_field(network_optimizer="adam", network_lr=4e-3),
-    "adam_1.6e-2": _of_field(network_optimizer="adam", network_lr=1.6e-2),
     "muon_1e-2": _of_field(network_optimizer="muon", network_lr=1e-2),
-    "muon_2e-2": _of_field(network_optimizer="muon", network_lr=2e-2),
 }
-"""Optimisers of the networks of every trained model."""
+"""Optimisers of the networks."""
 POOLED = {
     "pooled": Variant({"field": _BLIND}),
     "pooled_long": Variant({"field": _BLIND}, budget=5),
