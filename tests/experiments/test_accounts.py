@@ -4,12 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from synthetic import tiny_scene
+from synthetic import tiny_dataset, tiny_scene, tiny_settings
 from untrained import make_run
 
 from experiments import frequency_account, neighbours_account
+from experiments.bench.main_job import measure
 from experiments.frequency_account import LAWS, polynomial
+from wbgs_jax.config import changed
 from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.data.splits import hold_out_validation
 
 LOGS = np.log10([1e9, 2.4e9, 10e9, 28e9, 60e9, 94e9])
 
@@ -54,3 +57,13 @@ def test_a_run_without_neighbours_scores_the_same_twice(tmp_path, monkeypatch):
     (scores,) = (value for value in json.loads((tmp_path / "neighbours.json").read_text()).values() if isinstance(value, dict))
     assert scores["alone"] == scores["asked"] and scores["neighbours"] == 0
     assert 0 < scores["nearest_tx"]["median_ssim"] < 1
+
+
+def test_the_main_job_is_timed_against_another(tmp_path):
+    settings = tiny_settings()
+    versions = {"today": settings, "longer": changed(settings, {"optim": {"steps": 3 * settings.optim.steps}})}
+    report = measure(hold_out_validation(tiny_dataset()), versions, 2, tmp_path)
+    assert report["today"]["steps"] * 3 == report["longer"]["steps"]
+    whole = [report[name]["step_cpu_ms"] * report[name]["steps"] for name in versions]
+    assert report["share_of_training"] == pytest.approx(whole[0] / whole[1], rel=0.1)
+    assert all(report[name]["first_epoch_s"] > 0 for name in versions)
