@@ -58,8 +58,8 @@ def test_the_papers_preset_is_its_own_form():
 def test_small_data_sets_get_fewer_steps():
     assert limit_steps(SETTINGS, 10**6).optim.steps == SETTINGS.optim.steps
     assert limit_steps(SETTINGS, 8).optim.steps == SETTINGS.optim.min_steps
-    some = limit_steps(SETTINGS, 1500).optim.steps
-    assert some == SETTINGS.optim.max_epochs * 1500 / SETTINGS.optim.batch and some % SETTINGS.loop.epoch_steps == 0
+    some = limit_steps(SETTINGS, 1000).optim.steps
+    assert some == SETTINGS.optim.max_epochs * 1000 / SETTINGS.optim.batch and some % SETTINGS.loop.epoch_steps == 0
 
 
 @pytest.mark.parametrize(

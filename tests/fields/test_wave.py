@@ -84,7 +84,7 @@ def folder(scene, tmp_path_factory):
     """What the command leaves: a run, and the scene beside it."""
     folder = tmp_path_factory.mktemp("trained")
     save_scene(folder / "plaster.npz", scene)
-    train.main(["--scene", str(folder / "plaster.npz"), "--out", str(folder / "run"), *flags()])
+    train.main(["--scene", str(folder / "plaster.npz"), "--out", str(folder / "run"), "--validation", "0", *flags()])
     return folder
 
 

@@ -21,6 +21,7 @@ from wbgs_jax.training.step import TrainState
 from wbgs_jax.types import Gaussians
 
 STEP, SLOTS = 7, 64
+NAMES = ("means", "log_scales", "quats", "opacity_logits", "features")
 CONFIG = DensityConfig(every=STEP, start=1, gradient_threshold=1.0, split_scale=0.5, prune_attenuation=0.005, max_gaussians=100)
 OPTIMIZER = make_optimizer(WidebandField, GROWING.field, GROWING.optim)
 CALM, CLONED, SPLIT, USELESS, UNSEEN, DEAD = range(6)  # the Gaussians of `state`
@@ -34,7 +35,8 @@ def make_state(rng, means, log_scales, quats, logits, gradient, visible) -> Trai
         pad = [(0, SLOTS - len(values))] + [(0, 0)] * (values.ndim - 1)
         return jnp.asarray(np.pad(values, pad, constant_values=fill))
 
-    gaussians = Gaussians(padded(means), padded(log_scales), padded(quats), padded(logits, -np.inf))
+    features = padded(rng.normal(size=(len(means), GROWING.field.features)))
+    gaussians = Gaussians(padded(means), padded(log_scales), padded(quats), padded(logits, -np.inf), features)
     networks = {"attenuation": {"kernel": jnp.asarray(rng.normal(size=(3, 2)), jnp.float32)}, "radiance": jnp.ones(4)}
     params = WidebandParams(gaussians, networks)
     statistics = DensityStatistics(padded(gradient), padded(rng.normal(size=(len(means), 3))), padded(visible))
@@ -77,7 +79,7 @@ def control(state, config=CONFIG, seed=0) -> Done:
 
 
 def rows(gaussians):
-    return {name: np.asarray(getattr(gaussians, name)) for name in ("means", "log_scales", "quats", "opacity_logits")}
+    return {name: np.asarray(getattr(gaussians, name)) for name in NAMES}
 
 
 def per_gaussian(state):
