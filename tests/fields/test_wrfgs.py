@@ -17,8 +17,8 @@ from wbgs_jax.training.loop import train
 SETTINGS = tiny_settings(
     "wrfgs",
     field={"network_lr": 1e-2},
-    optim={"steps": 40},
-    loop={"epoch_steps": 20, "checkpoint_every": 40, "evaluate_spectra": 0},
+    optim={"steps": 80},
+    loop={"epoch_steps": 20, "checkpoint_every": 80, "evaluate_spectra": 0},
 )
 
 

@@ -129,6 +129,7 @@ class PowerNetwork(nn.Module):
     def __call__(self, parts: Parts) -> Float[Array, "..."]:
         """Returns a value for every query; free space at the start."""
         hidden = nn.relu(PartwiseDense(self.width)(parts))
+        hidden = nn.relu(PartwiseDense(self.width)([hidden]))
         return nn.Dense(1, kernel_init=nn.initializers.zeros_init())(hidden)[..., 0]
 
 
