@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from experiments.results import FOLDER
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data import Dataset, load_dataset
@@ -23,7 +24,6 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.report import environment
 
-RESULTS = Path(__file__).parent / "results"
 NEIGHBOURS = 4
 Spectra = Float[np.ndarray, "f 90 360"]
 Others = Callable[[Spectra, Float[np.ndarray, "f"], float], Float[np.ndarray, "90 360"]]
@@ -36,7 +36,7 @@ class Command:
 
     data: tyro.conf.Positional[tuple[str, ...]] = ("1", "2", "3", "4", "5", "6")
     """Released scenes, scene files or folders of the published layout."""
-    out: Path = RESULTS
+    out: Path = FOLDER
 
 
 def main() -> None:

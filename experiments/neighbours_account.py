@@ -12,13 +12,13 @@ from typing import Any
 
 import tyro
 
+from experiments.results import FOLDER
 from wbgs_jax import load_trained
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.evaluation.score import evaluate
 
-RESULTS = Path(__file__).parent / "results"
 KEPT = ("n", "median_ssim", "mean_ssim", "p10_ssim")
 
 
@@ -28,7 +28,7 @@ class Command:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders."""
-    out: Path = RESULTS
+    out: Path = FOLDER
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
         alone, _ = evaluate(dataclasses.replace(trained, neighbours=None), dataset)
         scores = {"alone": alone, "asked": asked, "nearest_tx": asked["baselines"]["nearest_tx"]}
         report[dataset.name] = {name: {key: values[key] for key in KEPT} for name, values in scores.items()}
-        report[dataset.name]["neighbours"] = 0 if trained.neighbours is None else len(trained.neighbours.own)
+        report[dataset.name]["neighbours"] = 0 if trained.neighbours is None else len(trained.neighbours.images)
         print(dataset.name, report[dataset.name], file=sys.stderr)
     write_json(command.out / "neighbours.json", report | environment())
 

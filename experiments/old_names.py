@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from experiments.profiles import BY_ADAM
-from experiments.settings import HOUSEKEEPING
+from experiments.profiles import BY_ADAM, STEPS_BY_ADAM
+from experiments.settings import HOUSEKEEPING, plain
 
 MOVED = {
     # Until 0.2 learning rates and weights of all fields were settings of the optimiser.
@@ -19,8 +19,8 @@ MOVED = {
 }
 BEFORE_MUON: dict[str, dict[str, Any]] = {
     "wideband": {
-        **{f"wideband.{name}": list(value) if isinstance(value, tuple) else value for name, value in BY_ADAM.items()},
-        "optim.steps": 6000,
+        **{f"wideband.{name}": plain(value) for name, value in BY_ADAM.items()},
+        "optim.steps": STEPS_BY_ADAM,
         "density.every": 500,
         "density.start": 500,
     },

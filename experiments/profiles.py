@@ -44,6 +44,8 @@ BY_ADAM: dict[str, Any] = {
     "radiance_widths": (64, 32),
 }
 """What the splatting fields had until Muon came: the series of that time, which chose other settings, keep it."""
+STEPS_BY_ADAM = 6000
+"""Of the `cpu` preset until then."""
 QUICK_BY_ADAM = QUICK | {"fields": {"wideband": GAUSSIANS | BY_ADAM, "wrfgs": GAUSSIANS | BY_ADAM}}
 BEFORE = BY_ADAM | {"network_lr": 1e-3, "fusion": 0}
 """What the `cpu` preset had when its inputs and sizes were chosen."""

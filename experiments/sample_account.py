@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from experiments.results import FOLDER
 from wbgs_jax import WaveConfig, make_mesh, pas_directions, wave
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
@@ -29,7 +30,6 @@ from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Links
 
-RESULTS = Path(__file__).parent / "results"
 CONFIG = WaveConfig(
     diffracted_tried=1, diffracted_kept=1, mirror_areas=(0.01, 0.2), permittivity=2.73, conductivity=0.0085, slope=0.94
 )
@@ -43,7 +43,7 @@ class Command:
 
     data: tyro.conf.Positional[str]
     """Folder of the published layout."""
-    out: Path = RESULTS
+    out: Path = FOLDER
 
 
 def main() -> None:

@@ -69,8 +69,9 @@ def unlike_preset(job: Job, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(values: Settings, field: str) -> dict[str, Any]:
-    return {
-        f"{section}.{name}": list(value) if isinstance(value, tuple) else value
-        for section, own in to_dict(values, field).items()
-        for name, value in own.items()
-    }
+    return {f"{section}.{name}": plain(value) for section, own in to_dict(values, field).items() for name, value in own.items()}
+
+
+def plain(value: Any) -> Any:
+    """Returns a setting as JSON has it."""
+    return list(value) if isinstance(value, tuple) else value

@@ -152,7 +152,8 @@ def main(arguments: list[str] | None = None) -> None:
     if config.neighbours:
         neighbours, line = learn_neighbours(result.field, result.params, dataset)
         write_neighbours(folder, neighbours)
-        say(line) if line else None
+        if line:
+            say(line)
     say(summary(result, folder))
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.profiles import BY_ADAM
+from experiments.profiles import BY_ADAM, STEPS_BY_ADAM
+from experiments.results import FOLDER
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import Settings, changed
@@ -23,9 +24,6 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import get_field
 from wbgs_jax.training.loop import Run
-
-RESULTS = Path(__file__).parents[1] / "results"
-STEPS_BY_ADAM = 6000
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Command:
     """Released scene or scene file."""
     epochs: int = 6
     """Of 50 steps each, after the first, which compiles."""
-    out: Path = RESULTS
+    out: Path = FOLDER
 
 
 def main() -> None:

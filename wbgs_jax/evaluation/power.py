@@ -34,21 +34,26 @@ def score_power(
 
 def power_figures(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
-    line) and nearest_tx (the power of the nearest training transmitter at the same frequency). Links without any power are left
-    out. None where the data know no power.
+    line) and nearest_tx (the power of the nearest training transmitter at the same frequency). None where the data know no
+    power.
 
     Raises:
         UserError: as `score_power`.
     """
+    report = score_heard(predicted, dataset, index)
+    if report is None:
+        return None
+    others = {"free_space": free_space(dataset, index), "nearest_tx": nearest_power(dataset, index)}
+    return report | {"baselines": {name: score_heard(values, dataset, index) for name, values in others.items()}}
+
+
+def score_heard(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
+    """Returns the report of predicted powers of some links, those without any power left out; None where the data know none."""
     truth = dataset.received_db(index)
     if truth is None:
         return None
     heard = truth > NOT_HEARD_DB
-    truth, index, known = truth[heard], index[heard], dataset.frequencies_hz[index[heard]]
-    others = {"free_space": free_space(dataset, index), "nearest_tx": nearest_power(dataset, index)}
-    return score_power(predicted[heard], truth, known) | {
-        "baselines": {name: score_power(values, truth, known) for name, values in others.items()}
-    }
+    return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
 
 
 def free_space(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

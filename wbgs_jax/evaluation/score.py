@@ -13,7 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
-from wbgs_jax.evaluation.power import power_figures
+from wbgs_jax.evaluation.power import power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import BLOCK, Trained, observe, observe_links, render_pas
@@ -32,7 +32,8 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     index = held_out(dataset, part)
     seen = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
-    power = power_of(seen, dataset, index)
+    said = power_of(seen, dataset)
+    power = None if said is None else power_figures(said, dataset, index)
     if dataset.kind == "power":
         return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
     known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
@@ -55,17 +56,15 @@ def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
     return index
 
 
-def power_of(seen: Observation, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
-    """Returns the figures of received power (`power.power_figures`); None where field or data know none.
+def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, "n"] | None:
+    """Returns the received powers that a field says; None where it knows none.
 
     Raises:
         UserError: the data know power alone, and the field nothing of it.
     """
-    if seen.power_db is not None:
-        return power_figures(np.asarray(seen.power_db), dataset, index)
-    if dataset.kind == "power":
+    if seen.power_db is None and dataset.kind == "power":
         raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
-    return None
+    return None if seen.power_db is None else np.asarray(seen.power_db)
 
 
 def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
@@ -81,8 +80,9 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
 def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
-    if dataset.kind == "power":
-        return {"held_out_power_error_db": (power_of(seen, dataset, index) or {})["power_error_db"]}
+    said = power_of(seen, dataset)
+    if dataset.kind == "power" and said is not None and (report := score_heard(said, dataset, index)):
+        return {"held_out_power_error_db": report["power_error_db"]}
     return {"held_out_ssim": float(np.median(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index)))))}
 
 

@@ -40,9 +40,11 @@ class Neighbours:
     """Metres, world frame."""
     frequency_hz: Float[Array, "m"]
     images: Float[Array, "m 90 360"]
-    """w a (y - f), or w a y."""
-    own: Float[Array, "m"]
-    """What is taken away of the field's own spectrum: w a 1 for spectra, 0 for residuals."""
+    """y - f, or y."""
+    weights: Float[Array, "m m"]
+    """w a."""
+    own: Float[Array, ""]
+    """Whether the field's own spectrum gives way: 1 for spectra, 0 for residuals."""
     length: Float[Array, ""]
     """L in metres."""
 
@@ -67,8 +69,9 @@ def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query:
         return pas
     known = neighbours.tx_position, neighbours.frequency_hz, neighbours.length
     k = nearness(query.tx_position, query.frequency_hz, *known)
-    said = jnp.tensordot(k, neighbours.images, 1, precision=EXACT)
-    corrected = pas + said - (k @ neighbours.own)[:, None, None] * pas
+    shares = jnp.matmul(k, neighbours.weights, precision=EXACT)
+    said = jnp.tensordot(shares, neighbours.images, 1, precision=EXACT)
+    corrected = pas + said - (neighbours.own * shares.sum(1))[:, None, None] * pas
     heard = jnp.any(k > 0, 1)[:, None, None]
     return jnp.where(heard, jnp.clip(corrected, 0, 1), pas)
 

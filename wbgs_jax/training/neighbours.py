@@ -115,9 +115,7 @@ def make_neighbours(
     positions = jnp.asarray(dataset.tx_positions[index], jnp.float32)
     frequencies = jnp.asarray(dataset.frequencies_hz[index], jnp.float32)
     kernel = np.asarray(nearness(positions, frequencies, positions, frequencies, choice.length), np.float64)
-    inverse = choice.weight * np.linalg.inv(kernel + NOISE * np.eye(len(index)))
-    said = truth if choice.kind == "spectra" else truth - predicted
-    images = (inverse @ said.reshape(len(index), -1).astype(np.float64)).reshape(said.shape)
-    own = inverse.sum(1) if choice.kind == "spectra" else np.zeros(len(index))
-    as_float32 = [jnp.asarray(array, jnp.float32) for array in (images, own, choice.length)]
-    return Neighbours(dataset.receiver().position, positions, frequencies, *as_float32)
+    weights = choice.weight * np.linalg.inv(kernel + NOISE * np.eye(len(index)))
+    spectra = choice.kind == "spectra"
+    arrays = truth if spectra else truth - predicted, weights, float(spectra), choice.length
+    return Neighbours(dataset.receiver().position, positions, frequencies, *(jnp.asarray(a, jnp.float32) for a in arrays))
