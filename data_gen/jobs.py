@@ -141,13 +141,18 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
     """Returns the arrays of `Results` for one transmitter, of its paths at every frequency."""
     from data_gen import ceilings
 
-    elements, nothing = job.array.element_positions(), np.full(len(ceilings.NAMES), np.nan)
+    nothing = np.full(len(ceilings.NAMES), np.nan)
     return {
         "snapshots": np.stack([p.snapshot() for p in paths]),
         "n_paths": np.array([len(p.delays) for p in paths]),
         "line_of_sight": np.array([bool((p.order == 0).any()) for p in paths]),
         "delay_spread_s": np.array([p.delay_spread() for p in paths]),
-        "ceilings": np.stack([ceilings.measure(p, elements) if tx in job.ceiling_tx else nothing for p in paths]),
+        "ceilings": np.stack(
+            [
+                ceilings.measure(p, job.array.element_wavelengths(f)) if tx in job.ceiling_tx else nothing
+                for p, f in zip(paths, job.frequencies_hz, strict=True)
+            ]
+        ),
     }
 
 

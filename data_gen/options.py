@@ -155,7 +155,7 @@ def _check_numbers(options: Options) -> None:
                 f"--{name.replace('_', '-')} is {value}; it must be {'at least 1' if isinstance(value, int) else 'positive'}"
             )
     if array.spacing <= 0:
-        raise UserError(f"--array.spacing is {array.spacing} wavelengths; it must be positive")
+        raise UserError(f"--array.spacing is {array.spacing} {array.unit}; it must be positive")
 
 
 def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:

@@ -6,7 +6,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from wbgs_jax.radio.array import planar_array
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
+from wbgs_jax.types import ElementUnit
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,10 @@ class ArraySettings:
     rows: int = 4
     columns: int = 4
     spacing: float = 0.5
-    """Between neighbouring elements, in wavelengths: the array follows the frequency."""
+    """Between neighbouring elements, in `unit`."""
+    unit: ElementUnit = "wavelengths"
+    """wavelengths: the array follows the frequency, half a wavelength stays half a wavelength. metres: it has a fixed size, as
+    a real one, and what it resolves changes with the frequency."""
     plane: Literal["yz", "xy", "xz"] = "yz"
     """Plane of the receiver's local frame that the elements lie in."""
     pattern: Literal["tr38901", "iso", "dipole", "hw_dipole"] = "tr38901"
@@ -49,10 +53,15 @@ class ArraySettings:
     polarization: Literal["V", "H"] = "V"
 
     def element_positions(self) -> Float[np.ndarray, "elements 3"]:
-        """Returns the local positions in wavelengths, centred on the origin.
+        """Returns the local positions in `unit`, centred on the origin.
 
         In the y-z plane columns run along +y and rows down -z; in the x-y plane rows run along -x, in the x-z plane columns
         along +x instead.
         """
         x, y, z = planar_array(self.rows, self.columns, self.spacing).T
         return np.stack({"yz": (x, y, z), "xy": (z, y, x), "xz": (y, x, z)}[self.plane], -1)
+
+    def element_wavelengths(self, frequency_hz: float) -> Float[np.ndarray, "elements 3"]:
+        """Returns the local positions in wavelengths at a frequency."""
+        positions = self.element_positions()
+        return positions if self.unit == "wavelengths" else positions * (frequency_hz / SPEED_OF_LIGHT)

@@ -95,6 +95,8 @@ class Simulator:
         read_back = float(np.array(self._scene.frequency).item())
         if abs(read_back / frequency_hz - 1) > FREQUENCY_TOLERANCE:
             raise RuntimeError(f"asked Sionna RT for {frequency_hz} Hz, it reports {read_back} Hz")
+        elements = self.array.element_wavelengths(frequency_hz)  # what Sionna's "normalized" means
+        self._scene.rx_array.normalized_positions = mi.Point3f(np.asarray(elements, np.float32).T)
         self.read_back_hz[frequency_hz] = read_back
 
 
@@ -112,7 +114,6 @@ def _load(spec: SceneSpec, array: ArraySettings) -> rt.Scene:
     one = {"num_rows": 1, "num_cols": 1}
     scene.tx_array = rt.PlanarArray(**one, pattern="iso", polarization="V")
     scene.rx_array = rt.PlanarArray(**one, pattern=array.pattern, polarization=array.polarization)
-    scene.rx_array.normalized_positions = mi.Point3f(np.asarray(array.element_positions(), np.float32).T)
     scene.add(
         rt.Receiver(
             "rx", position=[float(value) for value in spec.rx_position], orientation=_yaw_pitch_roll(spec.rx_orientation)

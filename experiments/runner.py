@@ -1,9 +1,9 @@
 """Run experiments: `python -m experiments.runner [--profile quick] [--only table1] [--minutes 9]`.
 
 Without `--only` these are the tables and figures of the paper; the series (`--only choices`, `tuning`, `wave_choices`) are run
-by name. Jobs come in the order of importance: every experiment's first seed, then further ones. What is done is skipped, what
-was cut goes on where it stopped, however it was cut; runners side by side never do the same job. `make tables` shows the
-results.
+by name. Jobs come in the order of importance: every experiment's first seed, then further ones, of those that see more spectra
+after the others. What is done is skipped, what was cut goes on where it stopped, however it was cut; runners side by side never
+do the same job. `make tables` shows the results.
 """
 
 import os
@@ -104,11 +104,11 @@ class Clock:
 
 
 def all_jobs(names: tuple[str, ...] = (), profile: str = "quick") -> list[Job]:
-    """Returns the jobs of some experiments, each once, first seeds first, repetitions of costly jobs last."""
+    """Returns the jobs of some experiments, each once: short ones first, then first seeds; repetitions of costly jobs last."""
     if unknown := [name for name in names if name not in EXPERIMENTS]:
         raise UserError(f"there is no experiment {unknown[0]!r}; choose among: {', '.join(EXPERIMENTS)}")
     jobs = list(dict.fromkeys(job.sized(profile) for job in unique_jobs(names)))
-    return sorted(jobs, key=lambda job: (job.seed > 0 and (job.budget > 1 or job.field == "wave"), job.seed))
+    return sorted(jobs, key=lambda job: (job.seed > 0 and (job.budget > 1 or job.field == "wave"), job.budget, job.seed))
 
 
 def chosen_jobs(command: Command) -> list[Job]:

@@ -78,7 +78,8 @@ def closed_form(offset, frequency, array, orientation):
     element = turn @ spherical(k)[array.polarization == "H"]
     gain = amplitude_pattern(array.pattern, k) * (spherical(-world)[0] @ element)
     wavelength = SPEED_OF_LIGHT / frequency
-    phase = -2 * np.pi * np.mod(distance / wavelength, 1) + 2 * np.pi * array.element_positions() @ k
+    elements = array.element_positions() / (wavelength if array.unit == "metres" else 1)
+    phase = -2 * np.pi * np.mod(distance / wavelength, 1) + 2 * np.pi * elements @ k
     return wavelength / (4 * np.pi * distance) * gain * np.exp(1j * phase)
 
 
@@ -97,6 +98,7 @@ def random_direction(rng):
         (ArraySettings(rows=8, columns=8, plane="xy", pattern="iso"), "random"),
         (ArraySettings(rows=3, columns=5, spacing=0.4, plane="xz", pattern="dipole", polarization="H"), "random"),
         (ArraySettings(rows=2, columns=1, pattern="hw_dipole"), "random"),
+        (ArraySettings(spacing=0.015, unit="metres"), "random"),
     ],
 )
 def test_free_space_equals_the_closed_form(array, orientation, rng):
