@@ -1,7 +1,7 @@
 # One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
 # `make experiments`; PYTHON for set-up.
 SCENE  ?= 1
-FIELD  ?= wideband
+FIELD  ?= hybrid
 PRESET ?= $(if $(CUDA),gpu,cpu)
 DATA   ?=
 OUT    ?=

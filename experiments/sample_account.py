@@ -21,6 +21,7 @@ from experiments.results import FOLDER
 from wbgs_jax import WaveConfig, make_mesh, pas_directions, wave
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import write_json
+from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
@@ -28,6 +29,9 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.training.antennas import AntennaReport, search_antennas
+from wbgs_jax.training.data import training_data
+from wbgs_jax.training.search import make_scores
 from wbgs_jax.types import Links
 
 CONFIG = WaveConfig(
@@ -35,11 +39,13 @@ CONFIG = WaveConfig(
 )
 AT_ONCE = 50
 """Spectra."""
+SEARCHED = 96
+"""Training spectra that the antennas are found in."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Score what the mesh alone says about a sample."""
+    """Score what the mesh alone says about a sample, with isotropic antennas and with those that its spectra tell of."""
 
     data: tyro.conf.Positional[str]
     """Folder of the published layout."""
@@ -55,9 +61,10 @@ def main() -> None:
     _, first = np.unique(dataset.tx_index, return_index=True)
     kind = np.asarray(prepared.paths.specular.interaction_type)
     reflections, passes = (kind == REFLECTED).sum(-1), (kind == TRANSMITTED).sum(-1)
-    kept = {"line of sight": reflections == 0, "one reflection": reflections <= 1, "two reflections": reflections <= 2}
-    kept |= {"two reflections, nothing passes": (reflections <= 2) & (passes == 0), "no line of sight": reflections > 0}
-    scores = {name: ssim(dataset, field, keep(prepared, mask)) for name, mask in kept.items()}
+    kept = {"line_of_sight": reflections == 0, "one_reflection": reflections <= 1, "two_reflections": reflections <= 2}
+    kept |= {"nothing_passes": (reflections <= 2) & (passes == 0), "no_line_of_sight": reflections > 0}
+    isotropic = field.init(jax.random.key(0))
+    scores = {name: ssim(dataset, field, keep(prepared, mask), isotropic) for name, mask in kept.items()}
     local = directions_to_tx(dataset)
     sine, sight = local[:, 2], power_in_sight(dataset, local)
     horizon = [
@@ -65,8 +72,11 @@ def main() -> None:
     ]
     seen = in_sight(dataset, first)
     assert seen is not None  # the field has been made of its mesh
+    found, params = antennas(dataset, field, prepared)
+    scores["antennas_found"] = ssim(dataset, field, keep(prepared, kept["two_reflections"]), params)
     report: dict[str, Any] = {
         "dataset": dataset.name,
+        "antennas": found.taken,
         "groups": by_group(dataset, sine, scores),
         "obstructed_transmitters": np.flatnonzero(~seen).tolist(),
         "power_in_sight_on_the_horizon": horizon,
@@ -89,9 +99,18 @@ def observe(field: Field, params: Any, plan: Any, prepared: wave.PreparedPaths, 
     return field.render_links(params, plan, prepared, links)
 
 
-def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> Float[np.ndarray, "n"]:
+def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tuple[AntennaReport, Any]:
+    """Returns the antennas that explain the training spectra best, and parameters that hold them."""
+    data, params = training_data(dataset), field.init(jax.random.key(0))
+    some = np.random.default_rng(0).permutation(dataset.train)[:SEARCHED]
+    score = make_scores(field, prepared, data, jnp.asarray(some, jnp.int32))
+    params, report = search_antennas(params, score, dataset.tx_index[some], SearchConfig(), known_elements=False)
+    return report, params
+
+
+def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, "n"]:
     """Returns the score of every spectrum."""
-    params, found = field.init(jax.random.key(0)), []
+    found = []
     plan = field.plan(params, dataset.receiver(), cache=prepared)
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
@@ -118,16 +137,16 @@ def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[n
 
 
 def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Returns the median SSIM of training and test transmitters, above the horizon and not."""
+    """Returns the median SSIM of training and test transmitters, above the horizon, and at it or below."""
     test = np.isin(np.arange(len(dataset)), dataset.test)
     groups = {}
     for role, members in (("training", ~test), ("test", test)):
-        for place, there in (("above the horizon", sine > 0.05), ("at it or below", sine <= 0.05)):
+        for place, there in (("above", sine > 0.05), ("below", sine <= 0.05)):
             chosen = members & there
             if not chosen.any():
                 continue
             count = {"transmitters": len(np.unique(dataset.tx_index[chosen]))}
-            groups[f"{role}, {place}"] = count | {name: round(float(np.median(s[chosen])), 3) for name, s in scores.items()}
+            groups[f"{role}_{place}"] = count | {name: round(float(np.median(s[chosen])), 3) for name, s in scores.items()}
     return groups
 
 

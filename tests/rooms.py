@@ -89,23 +89,23 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 
 
 @jax.jit
-def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency) -> Arrivals:
-    """What arrives over all paths: those without diffraction first."""
-    specular = arrivals(traced.specular, search, slabs, frequency, receiver, diffracted=False)
-    diffracted = arrivals(traced.diffracted, search, slabs, frequency, receiver, diffracted=True)
+def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
+    """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
+    specular = arrivals(traced.specular, search, slabs, frequency, receiver, False, *antennas)
+    diffracted = arrivals(traced.diffracted, search, slabs, frequency, receiver, True, *antennas)
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(specular, diffracted, strict=True)))
 
 
-def snapshot_of(search, tx, frequency, receiver=None, **slab) -> np.ndarray:
+def snapshot_of(search, tx, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:
     """The voltages of an array (the 4x4 one of isotropic elements unless another is given) where the search's receiver is."""
-    return snapshot_over(search, trace(search, tx), frequency, receiver, **slab)
+    return snapshot_over(search, trace(search, tx), frequency, receiver, antennas, **slab)
 
 
-def snapshot_over(search, traced, frequency, receiver=None, **slab) -> np.ndarray:
+def snapshot_over(search, traced, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:
     """The same, of paths that are known."""
     receiver = make_receiver(search.receiver_position) if receiver is None else receiver
     frequency = jnp.asarray(frequency, search.receiver_position.dtype)
-    found = arrivals_of(search, traced, slabs_of(search, frequency, **slab), receiver, frequency)
+    found = arrivals_of(search, traced, slabs_of(search, frequency, **slab), receiver, frequency, antennas)
     return np.asarray(snapshots_from_paths(found, receiver, frequency))
 
 

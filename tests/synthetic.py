@@ -9,6 +9,7 @@ from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.dataset import Dataset, Kind
 from wbgs_jax.data.scene_file import SceneFile
 from wbgs_jax.fields import get_field
+from wbgs_jax.fields.hybrid import HybridConfig
 from wbgs_jax.fields.nerf2 import Nerf2Config
 from wbgs_jax.fields.wave import WaveConfig
 from wbgs_jax.fields.wideband import WidebandConfig
@@ -93,16 +94,17 @@ FIELDS = {
     "wave": WaveConfig(mirror_areas=(0.0, 0.0), specular_tried=64, specular_kept=32, diffracted_tried=32, diffracted_kept=16),
 }
 FIELDS["wrfgs"] = without_frequency(FIELDS["wideband"])
+FIELDS["hybrid"] = HybridConfig(FIELDS["wave"], FIELDS["wideband"])
 
 
 def tiny_settings(field_name: str = "wideband", **changes) -> Settings:
     """Settings that train within seconds; keywords replace values of a section: `field={"width": 4}`."""
-    controls = get_field(field_name).controls
+    controls = [name.rpartition(".")[2] for name in get_field(field_name).controls]
     settings = Settings(
         field=FIELDS[field_name],
         optim=OptimConfig(steps=8, batch=2, final_fraction=1.0),
         loop=LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2),
         density=DensityConfig(every=0, reset_every=0) if "density" in controls else None,
-        search=SearchConfig(rounds=0) if "search" in controls else None,
+        search=SearchConfig(rounds=0, antenna_rounds=0) if "search" in controls else None,
     )
     return changed(settings, changes)

@@ -60,14 +60,20 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Search for known materials before the first step (training/materials.py)."""
+    """Search for known materials and antennas before the first step (training/search.py)."""
 
     rounds: int = 3
-    """Times all materials are gone through, at most; 0: no search."""
+    """Times all materials are gone through, at most; 0: no search for materials."""
     spectra: int = 384
     """Training spectra that are looked at."""
     sure: float = 2.0
     """Standard errors by which what has been learned must fit better than every known material to be kept."""
+    antenna_rounds: int = 2
+    """Times the antennas of both ends are gone through, at most; 0: no search for antennas."""
+    antenna_spectra: int = 96
+    """Training spectra that are looked at for them."""
+    antenna_sure: float = 4.0
+    """Standard errors by which another antenna must fit better than the one that is there."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +121,27 @@ PRESETS: Mapping[str, Settings] = {
 
 
 def sections(settings: Settings, field_name: str) -> dict[str, Any]:
-    """Returns the parts of settings by the names that command lines and files give them: the field's part has its name."""
+    """Returns the parts of settings by the names that command lines and files give them: the field's part has its name. Those
+    of a field that is made of fields have the names of these."""
     values = {f.name: getattr(settings, f.name) for f in dataclasses.fields(settings) if f.name != "field"}
-    return {field_name: settings.field} | {name: value for name, value in values.items() if value is not None}
+    own = _parts(settings.field) or {field_name: settings.field}
+    return own | {name: value for name, value in values.items() if value is not None}
 
 
-def from_sections(values: Mapping[str, Any], field_name: str) -> Settings:
-    """Returns the settings of named parts; the inverse of `sections`."""
-    return Settings(**{"field" if name == field_name else name: value for name, value in values.items()})
+def _parts(config: Any) -> dict[str, Any]:
+    """Returns the settings that a field's settings are made of; nothing where they are settings themselves."""
+    if not dataclasses.is_dataclass(config):
+        return {}
+    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    return values if all(map(dataclasses.is_dataclass, values.values())) else {}
+
+
+def from_sections(values: Mapping[str, Any], like: Settings, field_name: str) -> Settings:
+    """Returns the settings of named parts, the inverse of `sections`; `like` has the types."""
+    parts = _parts(like.field)
+    field = dataclasses.replace(like.field, **{name: values[name] for name in parts}) if parts else values[field_name]
+    others = {name: value for name, value in values.items() if name not in (parts or {field_name})}
+    return Settings(field=field, **others)
 
 
 def to_dict(settings: Settings, field_name: str) -> dict[str, Any]:
@@ -145,7 +164,7 @@ def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
     known = {name: type(section) for name, section in sections(default, field_name).items()}
     try:
         built = {name: build(known[name], value) for name, value in values.items()}
-        return from_sections({name: built[name] for name in known}, field_name)
+        return from_sections({name: built[name] for name in known}, default, field_name)
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
 

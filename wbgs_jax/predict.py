@@ -146,7 +146,7 @@ def ask_channel(
         UserError: the field knows nothing of it.
     """
     enough = {"paths", OBSERVED.get(what, "paths")}
-    if not enough & set(trained.field.gives):
+    if not enough & set(trained.field.known()):
         able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
         raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field {able}")
     if what == "power":
@@ -158,7 +158,7 @@ def ask_channel(
 
     def one(tx: Any, frequency: Any) -> np.ndarray:
         query = Query(tx[None], frequency[None])
-        if "paths" not in trained.field.gives:
+        if what in OBSERVED:
             return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name)[0])
         found = _arrivals(trained.field, trained.params, plan, query)
         return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency))
@@ -199,7 +199,7 @@ CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]]
 }
 """Name in the file, and how it follows from what arrives."""
 OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
-"""What a field may give (`Field.gives`) that knows no paths."""
+"""What a field says of itself, without a look at its paths."""
 
 
 def write_channel(path: Path, answer: dict[str, np.ndarray], trained: TrainedField, dataset: Dataset) -> None:

@@ -88,7 +88,7 @@ def parse(arguments: list[str]) -> tuple[Command, Settings]:
         description=f"{Command.__doc__} Settings of the field: {PROGRAM} --field {field} --help-settings.",
     )
     values = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Command)}
-    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, field)
+    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, kind.presets[preset], field)
 
 
 def _with_settings(parts: dict[str, Any]) -> type[Command]:

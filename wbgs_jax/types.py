@@ -14,7 +14,7 @@ from wbgs_jax._util.checks import check_array, concrete
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.radio.channel import received_power_db
-from wbgs_jax.radio.patterns import pattern_exponent
+from wbgs_jax.radio.patterns import pattern_exponents
 
 ElementUnit = Literal["wavelengths", "metres"]
 """Unit of element positions: "wavelengths" is an array that scales with the frequency, "metres" one of fixed size."""
@@ -63,8 +63,9 @@ class Receiver:
     """Unit quaternion (wxyz) that turns the receiver's local frame into the world frame."""
     element_positions: Float[Array, "*r elements 3"]
     """Local frame, in `unit`."""
-    pattern_exponent: Float[Array, "*r"]
-    """Exponent of the elements' gain: 1 for the element of 3GPP TR 38.901, 0 for isotropic ones (`radio/patterns.py`)."""
+    pattern_exponents: Float[Array, "*r 2"]
+    """Of the elements' gain: how much they are the element of 3GPP TR 38.901 and how much a short dipole; zeros are isotropic
+    (`radio/patterns.py`)."""
     unit: ElementUnit = static(default="wavelengths")
 
     def element_wavelengths(self, frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b_elements 3"]:
@@ -182,7 +183,7 @@ def make_receiver(
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion)
-    arrays = [jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements, pattern_exponent(pattern))]
+    arrays = [jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements, pattern_exponents(pattern))]
     return Receiver(arrays[0], arrays[1], arrays[2], arrays[3], unit)
 
 

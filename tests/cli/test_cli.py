@@ -109,7 +109,9 @@ def test_defaults_are_those_of_the_preset(preset):
 
 
 def test_a_setting_of_the_field_and_one_of_the_optimiser():
-    _, settings = train_command.parse(["--scene=1", "--preset=cpu", "--wideband.width", "7", "--optim.steps", "50"])
+    _, settings = train_command.parse(
+        ["--scene=1", "--field=wideband", "--preset=cpu", "--wideband.width", "7", "--optim.steps", "50"]
+    )
     default = get_field("wideband").presets["cpu"]
     assert (settings.field.width, settings.optim.steps) == (7, 50)
     assert settings.density == default.density and settings.loop == default.loop

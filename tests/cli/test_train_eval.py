@@ -32,7 +32,7 @@ def words(sections):
 
 
 SMOKE = ["--preset", "smoke", *words(SHORT)]
-TINY = [*SMOKE, *words({"wideband": NETWORKS})]
+TINY = [*SMOKE, "--field", "wideband", *words({"wideband": NETWORKS})]
 TOY = [*SMOKE, "--field", "ripple"]
 
 

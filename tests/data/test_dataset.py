@@ -33,7 +33,7 @@ def test_one_receiver_of_several(data):
     for i, position in enumerate(RECEIVERS):
         receiver = dataset.receiver(i)
         np.testing.assert_array_equal(receiver.position, np.float32(position))
-        assert receiver.element_positions.shape == (16, 3) and receiver.pattern_exponent.shape == ()
+        assert receiver.element_positions.shape == (16, 3) and receiver.pattern_exponents.shape == (2,)
         assert receiver.unit == "metres"
     for absent in (3, -1):
         with pytest.raises(UserError, match=f"box has no receiver {absent}; choose 0 to 2"):

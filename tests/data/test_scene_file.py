@@ -71,7 +71,7 @@ def test_round_trip_of_several_receivers(tmp_path, three):
     assert_same(load_scene(tmp_path / "s.npz"), three)
     dataset = load_dataset(tmp_path / "s.npz")
     assert (dataset.n_receivers, len(dataset), dataset.receivers.unit) == (3, 4 * 3 * 3, "metres")
-    assert dataset.receivers.pattern_exponent.tolist() == [1, 0, 0]
+    assert dataset.receivers.pattern_exponents.tolist() == [[1, 0], [0, 0], [0, 0]]
 
 
 def test_a_renamed_scene_keeps_its_new_name(tmp_path, scene):
@@ -266,7 +266,7 @@ def test_format_1_need_not_know_its_element_pattern(tmp_path, scene, array):
     arrays["meta"] = np.array(json.dumps(meta | ({} if array is None else {"rx_array": array})))
     np.savez(tmp_path / "s.npz", **arrays)
     assert load_scene(tmp_path / "s.npz").element_pattern == ""
-    assert load_dataset(tmp_path / "s.npz").receivers.pattern_exponent.tolist() == [0]
+    assert load_dataset(tmp_path / "s.npz").receivers.pattern_exponents.tolist() == [[0, 0]]
 
 
 def test_format_1_has_snapshots_only(tmp_path, scene):

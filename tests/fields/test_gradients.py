@@ -33,9 +33,9 @@ STEPS = (1e-7, 2e-8, 3e-9)
 RELATIVE, ROUNDING = 2e-5, 1e-5
 """Tolerances: of the derivative and of the terms that it is the sum of; and what differences of sums over all pixels lose."""
 UNUSED = {
-    "wideband": {".pattern_exponent", "['power']"},
-    "wrfgs": {".pattern_exponent", ".frequency_hz", "['power']"},
-    "nerf2": {".pattern_exponent"},
+    "wideband": {".pattern_exponents", "['power']"},
+    "wrfgs": {".pattern_exponents", ".frequency_hz", "['power']"},
+    "nerf2": {".pattern_exponents"},
     "wave": set(),
 }
 """Leaves that do not enter, by a part of their names: what a model that sees no single paths knows of elements is where they

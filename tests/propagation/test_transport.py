@@ -26,7 +26,7 @@ from wbgs_jax.propagation.slab import Slabs, complex_permittivity, slab_coeffici
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import planar_array, snapshot_to_pas
-from wbgs_jax.radio.patterns import element_gain
+from wbgs_jax.radio.patterns import Antenna, antenna_field, element_gain
 from wbgs_jax.types import make_receiver
 
 FREQUENCIES = [1e9, 10e9, 94e9]
@@ -230,3 +230,18 @@ def test_gradients_agree_with_finite_differences(x64):
         moved = [materials._replace(**{name: value.at[0].add(sign * step)}) for sign in (1, -1)]
         ends = [quadratic_form(one, *rest)[0] for one in moved]
         np.testing.assert_allclose(getattr(gradient, name)[0], (ends[0] - ends[1]) / (2 * step), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("frequency", FREQUENCIES[:1])
+def test_free_space_between_turned_antennas(frequency, rng):
+    """Friis, with the field of either antenna in the direction of the other."""
+    rx, tx = rng.uniform(-1, 1, 3), rng.uniform(2, 4, 3)
+    antennas = [
+        Antenna(jnp.asarray(q, jnp.float32), jnp.asarray(e)) for q, e in zip(rng.normal(size=(2, 4)), np.eye(2), strict=True)
+    ]
+    search = search_of([rectangle((100, 100, 100), (1, 0, 0), (0, 1, 0))], rx, mirror_areas=())
+    found = snapshot_of(search, tx, frequency, make_receiver(rx), antennas)
+    towards = (tx - rx) / np.linalg.norm(tx - rx)
+    sent, taken = (antenna_field(a, jnp.asarray(k, jnp.float32)) for a, k in zip(antennas, (-towards, towards), strict=True))
+    isotropic = free_space(tx, rx, frequency)
+    np.testing.assert_allclose(found, isotropic * float(jnp.dot(sent, taken)), atol=0.02 * np.abs(isotropic).max())

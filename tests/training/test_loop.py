@@ -239,7 +239,7 @@ def test_curves_watch_the_validation_part_or_nothing(dataset, tmp_path):
     assert set(run.numbers[run.batches(0, 50).ravel()]) <= set(dataset.train.tolist())
 
 
-@pytest.mark.parametrize("field", ["wideband", "nerf2", "wave"])
+@pytest.mark.parametrize("field", ["wideband", "nerf2", "wave", "hybrid"])
 def test_nothing_of_a_training_looks_at_the_test(dataset, tmp_path, field):
     """What is held out, place and spectrum, may be anything: field, cache, data and batches are the same to the last bit."""
     heard, places = dataset.snapshots.copy(), dataset.tx_positions.copy()

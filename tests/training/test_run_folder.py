@@ -11,7 +11,7 @@ from untrained import STEP, make_field, make_params, make_run
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.config import PRESETS, changed, sections
+from wbgs_jax.config import PRESETS, changed, from_sections, sections
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.training.run_folder import (
     RunConfig,
@@ -111,8 +111,8 @@ def test_every_setting_counts_in_a_difference(field):
         for setting in dataclasses.fields(part):
             value = getattr(part, setting.name)
             other = not value if isinstance(value, bool) else (value, "other")
-            attribute = "field" if section == field else section
-            settings = unchecked(config.settings, **{attribute: unchecked(part, **{setting.name: other})})
+            edited = sections(config.settings, field) | {section: unchecked(part, **{setting.name: other})}
+            settings = from_sections(edited, config.settings, field)
             found = difference(config, dataclasses.replace(config, settings=settings))
             assert found.startswith(f"settings.{section}.{setting.name}: "), (section, setting.name)
 

@@ -1,6 +1,6 @@
 """The models, one file each, behind one seam (`base.Field`). docs/new_field.md shows how to write another."""
 
-from wbgs_jax.fields import nerf2, wave, wideband, wrfgs
+from wbgs_jax.fields import hybrid, nerf2, wave, wideband, wrfgs
 from wbgs_jax.fields.base import (
     Aux,
     Field,
@@ -8,7 +8,6 @@ from wbgs_jax.fields.base import (
     Observation,
     default_field,
     field_names,
-    from_arrays,
     get_field,
     pas,
     register,
@@ -21,8 +20,8 @@ __all__ = [
     "Observation",
     "default_field",
     "field_names",
-    "from_arrays",
     "get_field",
+    "hybrid",
     "nerf2",
     "pas",
     "register",

@@ -8,7 +8,7 @@ and experiments ask a field nothing else.
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -74,7 +74,7 @@ class Field(ABC):
     gives: ClassVar[tuple[Quantity, ...]] = ("pas",)
     """What it knows of a link."""
     controls: ClassVar[tuple[str, ...]] = ()
-    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`."""
+    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`, "part.name" for one of a part alone."""
     config: Any
 
     @classmethod
@@ -86,6 +86,11 @@ class Field(ABC):
     def make(cls, config: Any, scene: Scene, seed: int) -> "Field":
         """Returns the field of a scene (host)."""
         return cls(config)  # type: ignore[call-arg]
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any], config: Any) -> "Field":
+        """Returns a field from its flattened arrays, `{".frame.centre": array, ...}`, and its settings."""
+        return from_leaves(cls, arrays, {"config": config})
 
     @abstractmethod
     def init(self, key: Key[Array, ""]) -> Any:
@@ -139,6 +144,15 @@ class Field(ABC):
         """Returns the plan without what is cheaply computed again from the parameters: what a file holds of it."""
         return plan
 
+    def calibrate(self, params: Any, cache: Any, batches: Sequence[Batch]) -> tuple[Any, dict[str, Any]]:
+        """Returns parameters with what only links outside the training part can say, and figures for the curves (host, after
+        the last step). By default nothing changes."""
+        return params, {}
+
+    def known(self) -> tuple[Quantity, ...]:
+        """Returns what it knows of a link: what its class `gives`, unless the scene lacks what that takes."""
+        return self.gives
+
     def sizes(self, params: Any) -> dict[str, int]:
         """Returns the numbers that tell how large a trained field is, for reports (host)."""
         return {"parameters": sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))}
@@ -186,11 +200,6 @@ def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any
     return field.render(params, field.plan(params, receiver, limits), query).pas
 
 
-def from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) -> Field:
-    """Returns a field from its flattened arrays, `{".frame.centre": array, ...}`, and its settings."""
-    return from_leaves(cls, arrays, {"config": config})
-
-
 def single_receiver(receivers: Receiver, name: str) -> Receiver:
     """Returns the only receiver; more than one is a `UserError`."""
     count = receivers.position.shape[0]
@@ -221,8 +230,8 @@ def get_field(name: str) -> type[Field]:
 
 
 def default_field() -> str:
-    """Returns the name of the field that is trained where none is asked for: the paper's."""
-    return "wideband"
+    """Returns the name of the field that is trained where none is asked for."""
+    return "hybrid"
 
 
 def with_field(

@@ -4,8 +4,8 @@
 
 The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (propagation/).
 What arrives over a path follows from the slabs it is reflected by and passes through, and those are learned: permittivity,
-conductivity and (where it is not known) thickness of every material, and a small correction of every facet. Phase-blind models
-cannot follow interference; this one does, and it yields the channel itself.
+conductivity and (where it is not known) thickness of every material, a small correction of every facet, and the antennas where
+nobody has said what they are. Phase-blind models cannot follow interference; this one does, and it yields the channel itself.
 """
 
 from typing import Any, ClassVar
@@ -36,6 +36,7 @@ from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
 from wbgs_jax.radio.array import EXACT, normalise, pas_directions, snapshot_to_pas, squared_magnitude, steering_vector
 from wbgs_jax.radio.channel import Arrivals, received_power_db
+from wbgs_jax.radio.patterns import Antenna, upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
 
 TRACED_AT_ONCE = 16
@@ -72,6 +73,10 @@ class WaveParams:
     diffraction)."""
     log_gain: Float[Array, ""]
     """Logarithm of the gain of the transmitter and whatever else scales all snapshots."""
+    transmitter: Antenna
+    """Of all transmitters, in the world frame."""
+    element: Antenna
+    """What every element of the array is besides its known pattern, in the receiver's frame."""
 
 
 @pytree
@@ -133,7 +138,9 @@ class WaveField(Field):
             log_thickness=jnp.full(m, np.log(config.thickness), jnp.float32),
         )
         amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
-        return WaveParams(materials, jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(()))
+        corrections = jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(())
+        transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
+        return WaveParams(materials, *corrections, transmitter, element)
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host, unless they are prepared)."""
@@ -198,17 +205,18 @@ class WaveField(Field):
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns groups for materials, thicknesses and corrections."""
+        """Returns groups for materials, thicknesses, corrections and antennas."""
         return {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
             "corrections": Group(config.corrections_lr),
+            "antennas": Group(config.antennas_lr),
         }
 
     @classmethod
     def labels(cls, params: WaveParams) -> Any:
         """Returns the group of every parameter."""
-        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3)
+        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4)
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
@@ -308,7 +316,8 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
     """Returns what one transmitter sends over all of its paths."""
     slabs, found = slabs_at(params, plan, frequency_hz), []
     for row, some in enumerate((paths.specular, paths.diffracted)):
-        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, diffracted=row == 1)
+        antennas = params.transmitter, params.element
+        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         found.append(one._replace(amplitude=one.amplitude * gain))
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))

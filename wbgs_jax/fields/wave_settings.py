@@ -53,11 +53,17 @@ class WaveConfig:
     """Learning rate of the logarithm of metres: at 100 GHz a thousandth of a wall turns the phase by a tenth of a radian."""
     corrections_lr: float = 5e-3
     """Learning rate of facet corrections, excess losses and the gain."""
+    antennas_lr: float = 1e-3
+    """Learning rate of the antennas' orientations and exponents."""
 
 
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """There are a few numbers a material to learn, no networks."""
-SEARCH = {"smoke": SearchConfig(rounds=1, spectra=96), "cpu": SearchConfig(), "gpu": SearchConfig()}
+SEARCH = {
+    "smoke": SearchConfig(rounds=1, spectra=96, antenna_rounds=1, antenna_spectra=48),
+    "cpu": SearchConfig(),
+    "gpu": SearchConfig(),
+}
 
 
 def _preset(name: str) -> Settings:

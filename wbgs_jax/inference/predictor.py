@@ -77,9 +77,9 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
 
 def check_power(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field cannot say what power a receiver gets."""
-    if "power" not in field.gives:
+    if "power" not in field.known():
         raise UserError(f"the {field.name} field has no power, only spectra; train another field")
-    if dataset.kind == "pas" and "paths" not in field.gives:
+    if dataset.kind == "pas" and "paths" not in field.known():
         raise UserError(
             f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
         )

@@ -1,7 +1,7 @@
 """The wave on every path: the field vector through reflections, transmissions and a diffraction, and the array's snapshot.
 
 The electric field is a complex vector across the ray, split at every slab into its components across (TE) and in (TM) the
-plane of incidence. Antennas are vertically polarised: along theta-hat of their own frame. The time factor is exp(+j omega t).
+plane of incidence. Antennas are those of radio/patterns.py. The time factor is exp(+j omega t).
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import to_local
-from wbgs_jax.radio.patterns import element_gain, zenith_vector
+from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
@@ -54,9 +54,16 @@ class _SlabInteractions(NamedTuple):
 
 
 def arrivals(
-    paths: Paths, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""], receiver: Receiver, diffracted: bool
+    paths: Paths,
+    search: Search,
+    slabs: Slabs,
+    frequency_hz: Float[Array, ""],
+    receiver: Receiver,
+    diffracted: bool,
+    transmitter: Antenna | None = None,
+    element: Antenna | None = None,
 ) -> Arrivals:
-    """Returns what a vertically polarised isotropic transmitter of unit power sends over K paths.
+    """Returns what a transmitter of unit power sends over K paths.
 
     Args:
         paths: of one transmitter (`paths.trace_paths`).
@@ -65,12 +72,17 @@ def arrivals(
         frequency_hz: of the carrier.
         receiver: whose array stands where the paths end.
         diffracted: whether every path has one diffraction, or none has any; static under `jax.jit`.
+        transmitter: its antenna in the world frame; by default upright and isotropic.
+        element: an antenna that every element of the array is besides its known pattern, in the receiver's frame; by default
+            upright and isotropic, which changes nothing.
     """
+    isotropic = upright(jnp.zeros_like(receiver.pattern_exponents))
+    transmitter, element = transmitter or isotropic, element or isotropic
     # What is no path may have legs of no length, and their direction no derivative.
     somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
     legs = _legs(paths)
-    field = zenith_vector(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
+    field = antenna_field(transmitter, legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
     active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
     if diffracted:
@@ -80,11 +92,11 @@ def arrivals(
     ends_leg = (paths.interaction_type == REFLECTED) | (paths.interaction_type == DIFFRACTED)
     last = jnp.sum(ends_leg, -1)
     local = to_local(-legs.direction[jnp.arange(len(last)), last], receiver.orientation)
-    seen = _dot(to_local(field, receiver.orientation), zenith_vector(local))
+    own = dataclasses.replace(element, exponents=element.exponents + receiver.pattern_exponents)
+    seen = _dot(to_local(field, receiver.orientation), antenna_field(own, local))
     wavelength = SPEED_OF_LIGHT / frequency_hz
     carrier = jnp.exp(-2j * jnp.pi * jnp.mod(legs.total / wavelength, 1.0))
-    gain = element_gain(local) ** receiver.pattern_exponent
-    amplitude = wavelength / (4 * jnp.pi) * spreading * gain * seen * carrier
+    amplitude = wavelength / (4 * jnp.pi) * spreading * seen * carrier
     return Arrivals(jnp.where(paths.alive, amplitude, 0), local, legs.total)
 
 

@@ -6,10 +6,12 @@ on the host). It says how whatever is stored beside the parameters, such as opti
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from wbgs_jax._util.pytree import replaced
 from wbgs_jax.fields import Field
 from wbgs_jax.training.data import TrainingData
 
@@ -60,3 +62,44 @@ class Control(Protocol):
     def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
         """Returns the changed parameters."""
         ...
+
+
+@dataclass(frozen=True)
+class OfPart:
+    """A control of one part of a field that is made of parts: of its field and parameters of that name."""
+
+    part: str
+    inner: Control
+
+    @property
+    def stream(self) -> int:
+        """Number of its stream of random numbers."""
+        return self.inner.stream
+
+    def statistics(self, params: Any) -> Any:
+        """Returns zeros, to be accumulated over steps; () where there is no such part."""
+        own = getattr(params, self.part)
+        return () if own is None else self.inner.statistics(own)
+
+    def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
+        """Returns the statistics after a step."""
+        own = getattr(gradients, self.part)
+        return () if own is None else self.inner.accumulate(statistics, own, probe)
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether something is to be done after this step of so many."""
+        return self.inner.due(step, steps)
+
+    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+        """Returns all parameters, those of the part changed."""
+        own = getattr(params, self.part)
+        if own is None:
+            return Edit(params, statistics, lambda tree: tree, {})
+        edit = self.inner.apply(getattr(field, self.part), own, statistics, context, step, rng)
+
+        def put(tree: Any, value: Any) -> Any:
+            return replaced(tree, **{self.part: value})
+
+        follow = edit.moments
+        moments = None if follow is None else lambda tree: put(tree, follow(getattr(tree, self.part)))
+        return edit._replace(params=put(params, edit.params), moments=moments)

@@ -23,19 +23,31 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
-from wbgs_jax.fields import Field, field_names, from_arrays, get_field
+from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.training import checkpoint, curves
-from wbgs_jax.training.controls import Context, Control, Edit
+from wbgs_jax.training.controls import Context, Control, Edit, OfPart
 from wbgs_jax.training.data import TrainingData, training_data
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
-from wbgs_jax.training.materials import MaterialSearch
 from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.progress import TrainingProgress
+from wbgs_jax.training.search import Search
 from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
 
-CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": MaterialSearch}
+CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": Search}
 """Host controls by the names that fields and settings give them."""
+CALIBRATED, BLOCK = 240, 16
+"""Validation links that a field is calibrated by, at most, and how many at a time."""
+
+
+def make_control(name: str, settings: Settings) -> Control | None:
+    """Returns the host control that a field asks for by this name; None where the settings switch it off."""
+    part, _, kind = name.rpartition(".")
+    config = getattr(settings, kind)
+    if not config:
+        return None
+    control = CONTROLS[kind](config)
+    return OfPart(part, control) if part else control
 
 
 @dataclass(frozen=True)
@@ -64,7 +76,7 @@ class Run:
         dataset = without_test(dataset)  # nothing in a training can look at the test
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
-        self.controls = tuple(CONTROLS[name](getattr(settings, name)) for name in kind.controls if getattr(settings, name))
+        self.controls = tuple(control for name in kind.controls if (control := make_control(name, settings)))
         self.optimizer = make_optimizer(kind, settings.field, settings.optim)
         self.checkpoints = folder / "checkpoints"
         self.seconds, self.compilations = 0.0, 1
@@ -170,6 +182,22 @@ class Run:
         statistics[number] = edit.statistics
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
 
+    def calibrate(self) -> None:
+        """Lets the field learn what only the validation part can say."""
+        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:CALIBRATED]
+        receiver = self.dataset.receiver_index[chosen]
+        blocks = [
+            own[i : i + BLOCK]
+            for number in np.unique(receiver)
+            for own in [chosen[receiver == number]]
+            for i in range(0, len(own), BLOCK)
+        ]
+        batches = [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
+        params, report = self.field.calibrate(self.state.params, self.cache, batches)
+        self.state = dataclasses.replace(self.state, params=params)
+        if report:
+            self.log({"step": self.step} | report)
+
     def evaluate(self) -> dict[str, float]:
         """Returns figures of the watched validation spectra."""
         return watch(self.field, self.state.params, self.dataset, self.watched)
@@ -191,7 +219,7 @@ class Run:
         if not steps:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
-        self.field = from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
+        self.field = type(self.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
         self.state = checkpoint.fill_like(saved, like)
@@ -263,6 +291,8 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
     before, loop = run.step, run.settings.loop
     figures = run.epoch()
     run.control()
+    if run.step == total:
+        run.calibrate()
     entry: dict[str, Any] = {"step": run.step} | {name: None if np.isnan(v) else v for name, v in figures.items()}
     entry |= run.field.sizes(run.state.params) | {"seconds": run.seconds}
     if len(run.watched) and (_crosses(before, run.step, loop.evaluate_every) or run.step == total):

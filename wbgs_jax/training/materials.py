@@ -1,4 +1,4 @@
-"""Search for materials on the host, before the first epoch: what gradients alone cannot find.
+"""Search for the materials of a scene.
 
 The phase behind a slab turns by many radians at high frequencies. Its permittivity then has a valley of the loss for every
 turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
@@ -8,20 +8,14 @@ spectra best is taken, unless what is there fits better by more than chance. Tra
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.fields import Field
-from wbgs_jax.fields.losses import log_decorrelation
-from wbgs_jax.training.controls import Context, Edit
-from wbgs_jax.training.data import TrainingData
 
 ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
@@ -40,8 +34,6 @@ ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
 """ITU-R P.2040-3, table 3 (metal has permittivity 1 there; log(eps_r - 1) is what is stored)."""
 UNSEEN = 1e-6
 """A material that changes the scores by less is in no path of the spectra, and stays what it is."""
-Scores = Callable[[Any, Any], Float[Array, "k n"]]
-"""(parameters, K candidates for their materials) -> log decorrelation of N spectra."""
 
 
 @dataclass(frozen=True)
@@ -56,50 +48,23 @@ class SearchReport:
     """Materials, and the entry that each of them got."""
 
 
-@dataclass(frozen=True)
-class MaterialSearch:
-    """The host control of fields whose parameters hold `materials` of ITU-R P.2040 and whose links are prepared."""
-
-    config: SearchConfig
-    stream: int = 6
-
-    def statistics(self, params: Any) -> tuple[()]:
-        """Returns nothing: it watches no step."""
-        return ()
-
-    def accumulate(self, statistics: tuple[()], gradients: Any, probe: Any) -> tuple[()]:
-        """Returns nothing."""
-        return ()
-
-    def due(self, step: int, steps: int) -> bool:
-        """Returns whether it is before the first step."""
-        return step == 0 and self.config.rounds > 0
-
-    def apply(
-        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
-    ) -> Edit:
-        """Returns the parameters with the materials that fit some training spectra best."""
-        spectra = rng.choice(context.train, min(self.config.spectra, len(context.train)), replace=False)
-        score = make_scores(field, context.cache, context.data, jnp.asarray(spectra, jnp.int32))
-        params, report = search_materials(params, score, self.config)
-        return Edit(params, (), None, {"search": dataclasses.asdict(report)})
-
-
-def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[Any, SearchReport]:
+def search_materials(
+    params: Any, score: Callable[[Sequence[Any]], Float[np.ndarray, "k n"]], config: SearchConfig
+) -> tuple[Any, SearchReport]:
     """Returns parameters with the materials whose scores are best."""
     before, taken, settled = np.zeros(0), dict[int, str](), 0
     count = len(params.materials.slope)
     for turn in range(config.rounds * count):
         material = turn % count
-        candidates = [params.materials, *_entries(params.materials, material)]
-        scores = np.asarray(score(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)))
+        candidates = [params, *(dataclasses.replace(params, materials=m) for m in _entries(params.materials, material))]
+        scores = score(candidates)
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before = before if turn else scores[0]
         settled += 1
         if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
             if taken.get(material) != (entry := list(ITU_MATERIALS)[best - 1]):
                 taken[material], settled = entry, 1
-            params, scores = dataclasses.replace(params, materials=candidates[best]), scores[best:]
+            params, scores = candidates[best], scores[best:]
         if settled == count:  # all others are what they were when each was looked at
             break
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
@@ -109,26 +74,6 @@ def _surely_better(new: Float[np.ndarray, "n"], old: Float[np.ndarray, "n"], err
     """Returns whether scores are lower by more than so many standard errors of the mean difference."""
     gain = old - new
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
-
-
-def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver."""
-    return lambda params, candidates: _score(field, params, candidates, cache, data, spectra)
-
-
-@jax.jit
-def _score(field: Field, params: Any, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"]):
-    batch = data.batch(spectra, jax.random.key(0))
-    plan = field.plan(params, batch.receiver, None, cache)
-
-    def one(materials):
-        seen = field.render_links(dataclasses.replace(params, materials=materials), plan, cache, batch.links)
-        if seen.snapshots is not None and batch.snapshots is not None:
-            return log_decorrelation(seen.snapshots, batch.snapshots)
-        assert batch.pas is not None, "materials are searched in spectra or snapshots"
-        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
-
-    return jax.lax.map(one, candidates)
 
 
 def _entries(materials: Any, material: int) -> list[Any]:

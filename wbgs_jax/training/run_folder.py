@@ -26,7 +26,7 @@ from wbgs_jax.data.splits import (
     select_receivers,
     unseen_frequencies,
 )
-from wbgs_jax.fields import Field, from_arrays, get_field
+from wbgs_jax.fields import Field, get_field
 from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
 from wbgs_jax.training import checkpoint
 
@@ -153,7 +153,7 @@ def load_trained(folder: Path | str) -> TrainedField:
     if not steps:
         raise UserError(f"{folder} holds no checkpoint yet; train on with the same command and --resume")
     saved = checkpoint.read(folder / "checkpoints", steps[-1])
-    field = from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
+    field = get_field(config.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     seconds = float(saved.metadata["seconds"])
     return TrainedField(config, field, params, steps[-1], seconds, read_neighbours(folder))

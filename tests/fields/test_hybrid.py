@@ -1,0 +1,132 @@
+"""The hybrid field: a mixture of its two fields, whose share is found on links that trained neither."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_dataset, tiny_settings
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import get_field
+from wbgs_jax.fields.hybrid import HybridField, Trust
+from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.training.loop import Run, train
+from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
+
+SETTINGS = tiny_settings(
+    "hybrid", optim={"steps": 4}, density={"every": 2, "start": 2, "gradient_threshold": 0.0, "max_gaussians": 90}
+)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return hold_out_validation(tiny_dataset(12))
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory):
+    """Before its first step."""
+    return Run(dataset, "hybrid", SETTINGS, 0, tmp_path_factory.mktemp("hybrid"))
+
+
+def trusting(params, spectra, power):
+    return dataclasses.replace(params, trust=Trust(jnp.asarray(spectra), jnp.asarray(power)))
+
+
+def parts(run, params, index):
+    """What the two fields say by themselves."""
+    field = run.field
+    return [
+        observe_links(one, own, run.dataset, index)
+        for one, own in ((field.wave, params.wave), (field.wideband, params.wideband))
+    ]
+
+
+@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.3, 0.8), (1.0, 1.0)])
+def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
+    params, index = trusting(run.state.params, *shares), run.dataset.validation
+    seen = observe_links(run.field, params, run.dataset, index)
+    wave, wideband = parts(run, params, index)
+    np.testing.assert_allclose(seen.pas, shares[0] * wave.pas + (1 - shares[0]) * wideband.pas, atol=1e-5)
+    np.testing.assert_allclose(seen.power_db, shares[1] * wave.power_db + (1 - shares[1]) * wideband.power_db, atol=1e-3)
+    np.testing.assert_array_equal(seen.snapshots, wave.snapshots)
+    plan = run.field.plan(params, run.dataset.receiver())
+    again = run.field.render(params, plan, run.dataset.query(index))
+    np.testing.assert_allclose(again.pas, seen.pas, atol=2e-3)  # traced by another program, in single precision, at 94 GHz
+
+
+@pytest.mark.parametrize("share", [0.0, 0.35, 1.0])
+def test_the_share_is_what_explains_other_links_best(run, share):
+    params, index = run.state.params, run.dataset.validation
+    batch = run.data.batch(jnp.asarray(index), run.key)
+    wave, wideband = parts(run, params, index)
+    truth = share * wave.pas + (1 - share) * wideband.pas
+    power = (1 - share) * wave.power_db + share * wideband.power_db  # that of the power is another one
+    batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
+    found, report = run.field.calibrate(params, run.cache, [batch])
+    assert float(found.trust.spectra) == pytest.approx(share, abs=0.05)
+    assert float(found.trust.power) == pytest.approx(1 - share, abs=0.05)
+    assert report["coherent_share"]["spectra"] == pytest.approx(share, abs=0.05)
+
+
+def test_its_loss_is_the_sum_and_no_field_knows_of_the_other(run):
+    field, params = run.field, run.state.params
+    batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)
+
+    @jax.jit
+    def losses(params):
+        coherent, _ = field.wave.loss(params.wave, run.cache, batch)
+        blurred, _ = field.wideband.loss(params.wideband, None, batch, run.limits, field.probe(params))
+        return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0], coherent + blurred
+
+    both, total = losses(params)
+    assert float(both) == pytest.approx(float(total), rel=1e-6)
+
+
+@pytest.mark.parametrize("reason", ["no mesh", "several receivers"])
+def test_without_a_coherent_field_it_is_the_splatting_one(reason, tmp_path):
+    dataset = tiny_dataset(12, n_rx=2 if reason == "several receivers" else 1)
+    if reason == "no mesh":
+        nothing = np.zeros((0, 3))
+        dataset = dataclasses.replace(dataset, faces=nothing.astype(np.int32), materials=None, face_part=None)
+    result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
+    assert result.field.wave is None and set(result.field.known()) == {"pas", "power"}
+    seen = observe_links(result.field, result.params, dataset, dataset.test)
+    alone = observe_links(result.field.wideband, result.params.wideband, dataset, dataset.test)
+    np.testing.assert_allclose(seen.pas, alone.pas, atol=1e-6)
+    plan = result.field.plan(result.params, dataset.receiver())
+    with pytest.raises(UserError, match="no paths"):
+        result.field.arrivals(result.params, plan, dataset.query(dataset.test))
+
+
+def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
+    """Its host controls act on their parts, and a run that stopped half way ends where one goes that did not."""
+    config = RunConfig("box", "hybrid", "smoke", 0, None, SETTINGS)
+    prepare_folder(tmp_path / "run", config, resume=False)
+    result = train(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")
+    assert result.sizes["gaussians"] > SETTINGS.field.wideband.gaussians and result.sizes["facets"] > 0
+    again = load_trained(tmp_path / "run")
+    for a, b in zip(jax.tree.leaves((result.field, result.params)), jax.tree.leaves((again.field, again.params)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert 0 <= float(again.params.trust.spectra) <= 1
+    resumed = Run(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")
+    assert resumed.restore() and resumed.step == SETTINGS.optim.steps
+
+
+def test_the_presets_have_both_fields_settings():
+    wave, wideband = get_field("wave").presets, get_field("wideband").presets
+    for name, settings in HybridField.presets.items():
+        assert (settings.field.wave, settings.field.wideband) == (wave[name].field, wideband[name].field)
+        assert settings.search == wave[name].search and settings.density == wideband[name].density
+    phase_blind = dataclasses.replace(settings.field.wave, coherent=False)
+    with pytest.raises(UserError, match="nothing to mix"):
+        HybridField.check(dataclasses.replace(settings.field, wave=phase_blind))
+
+
+def test_a_hybrid_of_one_field_has_no_scene_for_waves():
+    scene = DatasetScene(tiny_dataset(6, n_rx=3))
+    assert HybridField.make(SETTINGS.field, scene, 0).wave is None

@@ -1,0 +1,62 @@
+"""Antennas against closed forms: the patterns' own, and what turning an antenna does."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wbgs_jax.radio.patterns import Antenna, antenna_field, dipole_gain, element_gain, pattern_exponents, upright, zenith_vector
+
+
+def directions(rng, n=50):
+    k = rng.normal(size=(n, 3))
+    return (k / np.linalg.norm(k, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def wxyz(rotation):
+    return jnp.asarray(np.roll(rotation.as_quat(), 1), jnp.float32)
+
+
+def test_the_directional_element_has_8_dbi_and_falls_by_3_db_at_half_of_65_degrees():
+    angle = np.radians(65 / 2)
+    k = jnp.array([[1, 0, 0], [np.cos(angle), np.sin(angle), 0], [np.cos(angle), 0, np.sin(angle)], [-1, 0, 0]])
+    np.testing.assert_allclose(20 * np.log10(element_gain(k)), [8, 5, 5, -22], atol=1e-4)
+
+
+def test_a_short_dipole_radiates_what_it_is_given(rng):
+    """Its gain, averaged over the sphere, is one; its largest is 1.76 dBi, across its axis."""
+    zenith = (np.arange(20_000) + 0.5) / 20_000 * np.pi
+    k = np.stack([np.sin(zenith), np.zeros_like(zenith), np.cos(zenith)], -1)
+    assert np.average(np.asarray(dipole_gain(jnp.asarray(k))) ** 2, weights=np.sin(zenith)) == pytest.approx(1, rel=1e-4)
+    assert 20 * np.log10(dipole_gain(jnp.array([0.6, 0.8, 0.0]))) == pytest.approx(1.7609, abs=1e-3)
+
+
+def test_an_upright_isotropic_antenna_is_vertical_polarisation_alone(rng):
+    k = jnp.asarray(directions(rng))
+    np.testing.assert_allclose(antenna_field(upright(jnp.zeros(2)), k), zenith_vector(k), atol=1e-6)
+
+
+@pytest.mark.parametrize("pattern", ["iso", "tr38901", "dipole"])
+def test_a_turned_antenna_seen_from_a_turned_direction_is_itself_turned(pattern, rng):
+    turn, k = Rotation.random(rng=rng), directions(rng)
+    exponents = jnp.array(pattern_exponents(pattern))
+    scale = rng.uniform(0.3, 3)  # of the quaternion, which means nothing
+    turned = antenna_field(Antenna(scale * wxyz(turn), exponents), jnp.asarray(turn.apply(k), jnp.float32))
+    np.testing.assert_allclose(turned, turn.apply(antenna_field(upright(exponents), jnp.asarray(k))), atol=2e-4)
+
+
+def test_the_field_is_across_the_ray_and_as_large_as_the_gain(rng):
+    turn, k = Rotation.random(rng=rng), jnp.asarray(directions(rng))
+    field = np.asarray(antenna_field(Antenna(wxyz(turn), jnp.array([1.0, 0.0])), k))
+    np.testing.assert_allclose(np.sum(field * k, -1), 0, atol=1e-5)
+    gain = element_gain(jnp.asarray(turn.inv().apply(k), jnp.float32))
+    np.testing.assert_allclose(np.linalg.norm(field, axis=-1), gain, rtol=1e-3)
+
+
+def test_a_half_wave_dipole_is_nearly_a_power_of_the_short_one():
+    zenith = np.radians(np.linspace(1, 90, 200))
+    exact = np.sqrt(1.643) * np.cos(np.pi / 2 * np.cos(zenith)) / np.sin(zenith)
+    k = jnp.asarray(np.stack([np.sin(zenith), np.zeros_like(zenith), np.cos(zenith)], -1))
+    field = antenna_field(upright(jnp.array(pattern_exponents("hw_dipole"))), k)
+    error_db = 20 * np.log10(np.linalg.norm(field, axis=-1) / exact)
+    assert np.abs(error_db[20 * np.log10(exact) > -10]).max() < 0.45

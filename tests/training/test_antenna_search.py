@@ -1,0 +1,107 @@
+"""The search names the antennas of both ends from snapshots alone, and leaves what is right alone."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import box, mesh_of, room
+from synthetic import tiny_scene, tiny_settings
+
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.fields import wave
+from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
+from wbgs_jax.training.antennas import antenna_candidates, search_antennas, surely_better
+from wbgs_jax.training.loop import Run
+from wbgs_jax.training.search import make_scores
+
+N_TX = 30
+PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
+SETTINGS = tiny_settings(
+    "wave",
+    field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    search={"spectra": 60, "antenna_spectra": 60, "antenna_rounds": 2, "rounds": 0},
+)
+
+
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory):
+    """A run before its first step: the paths of all transmitters, and snapshots that mean nothing."""
+    mesh = mesh_of(*PARTS)
+    scene = dataclasses.replace(
+        tiny_scene(N_TX),
+        snapshots=np.ones((N_TX, 1, 3, 16), np.complex64),
+        tx_positions=np.random.default_rng(3).uniform([0.3, 0.3, 0.3], [5.7, 3.7, 2.7], (N_TX, 3)),
+        rx_position=np.array([[1.0, 1.0, 1.2]]),
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+        face_part=np.asarray(mesh.part),
+        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": 0.05} for i in range(len(PARTS))]},
+    )
+    return Run(scene_dataset(scene), "wave", SETTINGS, 0, tmp_path_factory.mktemp("untrained"))
+
+
+@jax.jit
+def snapshots(params, plan, cache, links):
+    paths = jax.tree.map(lambda leaf: leaf[links.tx_index], cache.paths)
+    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+
+
+def searched(run, known_elements=False, **antennas):
+    """What is found in snapshots that the field itself made with these antennas."""
+    plan = run.field.plan(run.state.params, run.dataset.receiver(), cache=run.cache)
+    y = snapshots(dataclasses.replace(run.state.params, **antennas), plan, run.cache, run.data.links)
+    data, spectra = dataclasses.replace(run.data, snapshots=y), run.dataset.train[:60]
+    score = make_scores(run.field, run.cache, data, jnp.asarray(spectra))
+    tx = run.dataset.tx_index[spectra]
+    return search_antennas(run.state.params, score, tx, SETTINGS.search, known_elements)
+
+
+def test_it_names_the_antennas_of_both_ends(untrained, rng):
+    candidates = antenna_candidates()
+    directional = [name for name in candidates if name.startswith("tr38901")]
+    transmitter, element = rng.choice(directional), "dipole along +z"
+    print(transmitter)
+    params, report = searched(untrained, transmitter=candidates[transmitter], element=candidates[element])
+    assert report.taken == {"transmitter": transmitter, "element": element}
+    assert report.after < report.before - 1
+    np.testing.assert_array_equal(params.transmitter.orientation, candidates[transmitter].orientation)
+
+
+def test_what_is_right_stays(untrained):
+    params, report = searched(untrained)
+    assert report.taken == {}
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(params.element), jax.tree.leaves(upright(jnp.zeros(2))), strict=True)
+    )
+
+
+def test_known_elements_are_left_alone(untrained):
+    _, report = searched(untrained, known_elements=True, element=antenna_candidates()["dipole along +x"])
+    assert "element" not in report.taken
+
+
+def test_the_candidates_are_what_they_are_called():
+    forward = jnp.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    down = np.asarray(antenna_field(antenna_candidates()["tr38901 along +x towards -z"], forward))
+    assert np.linalg.norm(down, axis=-1) == pytest.approx([10 ** (8 / 20), 10 ** (-22 / 20)], rel=1e-4)
+    assert abs(down[0, 0]) == pytest.approx(np.linalg.norm(down[0]), rel=1e-4)  # polarised along x
+    fields = [np.abs(antenna_field(a, jnp.asarray(np.eye(3) + 0.1, jnp.float32))) for a in antenna_candidates().values()]
+    assert not any(np.allclose(a, b, atol=1e-3) for i, a in enumerate(fields) for b in fields[:i])
+
+
+def test_what_is_sure_counts_transmitters_and_not_spectra(rng):
+    tx = np.repeat(np.arange(4), 100)
+    gain = np.repeat([1.0, -0.5, 1.0, -0.5], 100) + 0.01 * rng.normal(size=400)
+    assert not surely_better(gain, tx, 1.0)
+    assert surely_better(np.ones(400), tx, 4.0) and not surely_better(np.ones(100), tx[:100], 0.0)
+
+
+def test_an_antenna_of_any_length_of_quaternion_is_the_same(rng):
+    antenna = antenna_candidates()["tr38901 along +y towards -x"]
+    longer = Antenna(3 * antenna.orientation, antenna.exponents)
+    k = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
+    k = k / jnp.linalg.norm(k, axis=-1, keepdims=True)
+    np.testing.assert_allclose(antenna_field(longer, k), antenna_field(antenna, k), atol=1e-5)

@@ -1,0 +1,247 @@
+"""The hybrid field: the coherent field and the paper's splatting field side by side, and how far each is to be trusted.
+
+    PAS = w PAS of the waves + (1 - w) PAS of the Gaussians
+
+The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
+needs neither and blurs. Both are trained on the same batches, and the share w is what explains validation transmitters best.
+Without a mesh, or with several receivers, of which the coherent field knows nothing, it is the splatting field by itself.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
+from wbgs_jax.config import Settings
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, Quantity, register
+from wbgs_jax.fields.losses import ssim
+from wbgs_jax.fields.wave import PreparedPaths, WaveConfig, WaveField
+from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
+from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
+from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
+
+SHARES = np.linspace(0, 1, 21)
+"""Shares of the coherent field that are tried."""
+
+
+@dataclass(frozen=True)
+class HybridConfig:
+    """Settings of the two fields."""
+
+    wave: WaveConfig = field(default_factory=WaveConfig)
+    wideband: WidebandConfig = field(default_factory=WidebandConfig)
+
+
+@pytree
+class Trust:
+    """The coherent field's share, 0 to 1."""
+
+    spectra: Float[Array, ""]
+    power: Float[Array, ""]
+    """Of the received power in decibels."""
+
+
+@pytree
+class HybridParams:
+    """What is trained."""
+
+    wave: Any
+    """`WaveParams`, or None without a coherent field."""
+    wideband: WidebandParams
+    trust: Trust
+
+
+@pytree
+class HybridPlan:
+    """What is independent of the query."""
+
+    wave: Any
+    """`WavePlan`, or None without a coherent field."""
+    wideband: WidebandPlan
+
+
+def _preset(name: str) -> Settings:
+    wave, wideband = WaveField.presets[name], WidebandField.presets[name]
+    return dataclasses.replace(wideband, field=HybridConfig(wave.field, wideband.field), search=wave.search)
+
+
+@register
+@pytree
+class HybridField(Field):
+    """Both fields of a scene."""
+
+    wave: Any
+    """`WaveField`, or None where it could know nothing."""
+    wideband: WidebandField
+    config: HybridConfig = static()
+
+    name: ClassVar[str] = "hybrid"
+    presets: ClassVar = {name: _preset(name) for name in WaveField.presets}
+    gives: ClassVar = WaveField.gives
+    controls: ClassVar = ("wideband.density", "wave.search")
+
+    @classmethod
+    def check(cls, config: HybridConfig) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        WaveField.check(config.wave)
+        WidebandField.check(config.wideband)
+        if not config.wave.coherent:
+            raise UserError("--wave.coherent False leaves nothing to mix; train --field wideband")
+
+    @classmethod
+    def make(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":
+        """Returns the field of a scene."""
+        cls.check(config)
+        return cls(_coherent(config.wave, scene, seed), WidebandField.make(config.wideband, scene, seed), config)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any], config: HybridConfig) -> "HybridField":
+        """Returns a field from its flattened arrays and its settings."""
+        has_wave = any(key.startswith(".wave.") for key in arrays)
+        wave = from_leaves(WaveField, arrays, {"config": config.wave}, ".wave") if has_wave else None
+        return cls(wave, from_leaves(WidebandField, arrays, {"config": config.wideband}, ".wideband"), config)
+
+    def known(self) -> tuple[Quantity, ...]:
+        """Returns what it knows of a link: without a coherent field no snapshots and no paths."""
+        return self.wideband.gives if self.wave is None else self.gives
+
+    def init(self, key: Key[Array, ""]) -> HybridParams:
+        """Returns initial parameters, both fields trusted alike."""
+        wave = None if self.wave is None else self.wave.init(key)
+        share = 0.0 if wave is None else 0.5
+        return HybridParams(wave, self.wideband.init(key), Trust(jnp.asarray(share), jnp.asarray(share)))
+
+    def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
+        """Returns the paths of all transmitters of some links (host)."""
+        return None if self.wave is None else self.wave.prepare(links, receivers)
+
+    def plan(
+        self, params: HybridParams, receiver: Receiver, limits: Any = None, cache: PreparedPaths | None = None
+    ) -> HybridPlan:
+        """Returns a receiver's mirror images (host, unless they are prepared) and the projected Gaussians."""
+        wave = None if self.wave is None else self.wave.plan(params.wave, receiver, None, cache)
+        return HybridPlan(wave, self.wideband.plan(params.wideband, receiver, limits))
+
+    def render(self, params: HybridParams, plan: HybridPlan, query: Query) -> Observation:
+        """Returns spectra and received power of B queries, and the coherent field's snapshots."""
+        coherent = None if self.wave is None else self.wave.render(params.wave, plan.wave, query)
+        return self._mixed(params, plan, query, coherent)
+
+    def render_links(self, params: HybridParams, plan: HybridPlan, cache: PreparedPaths | None, links: Links) -> Observation:
+        """Returns the same of links whose transmitters' paths are prepared."""
+        coherent = None if self.wave is None else self.wave.render_links(params.wave, plan.wave, cache, links)
+        return self._mixed(params, plan, links.query, coherent)
+
+    def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
+        if coherent is None:
+            return self.wideband.render(params.wideband, plan.wideband, query)
+        known, trust = coherent._replace(snapshots=None), params.trust
+        alone = (trust.spectra >= 1) & (trust.power >= 1)
+        other = jax.lax.cond(alone, lambda: known, lambda: self.wideband.render(params.wideband, plan.wideband, query))
+        shares = Observation(trust.spectra, None, trust.power)
+        mixed = jax.tree.map(lambda share, a, b: share * a + (1 - share) * b, shares, known, other)
+        return mixed._replace(snapshots=coherent.snapshots)
+
+    def probe(self, params: HybridParams) -> Any:
+        """Returns that of the splatting field."""
+        return self.wideband.probe(params.wideband)
+
+    def loss(
+        self, params: HybridParams, cache: PreparedPaths | None, batch: Batch, limits: Any = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the sum of both losses: neither field knows of the other."""
+        loss, aux = self.wideband.loss(params.wideband, None, batch, limits, probe)
+        if self.wave is None:
+            return loss, aux
+        coherent, other = self.wave.loss(params.wave, cache, batch)
+        figures = {f"{name}_wave": value for name, value in other.metrics.items()} | aux.metrics
+        return loss + coherent, aux._replace(metrics=figures)
+
+    def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
+        """Returns the parameters with the share of the coherent field that explains best what neither field was trained on."""
+        if self.wave is None or not batches:
+            return params, {}
+        plan = self.plan(params, batches[0].receiver, None, cache)
+        scores = [_scores(self, params, plan, cache, batch) for batch in batches]
+        trust = Trust(*(_best(of_one_kind) for of_one_kind in zip(*scores, strict=True)))
+        report = {name: round(float(share), 3) for name, share in vars(trust).items()}
+        return dataclasses.replace(params, trust=trust), {"coherent_share": report}
+
+    def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
+        """Returns every path of B queries: amplitudes, directions, lengths."""
+        if self.wave is None:
+            raise UserError("this run knows no paths: its data had no mesh, or several receivers")
+        return self.wave.arrivals(params.wave, plan.wave, query)
+
+    def limits(self, params: HybridParams, receivers: Receiver) -> Any:
+        """Returns those of the splatting field."""
+        return self.wideband.limits(params.wideband, receivers)
+
+    def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:
+        """Returns larger limits of the splatting field."""
+        return self.wideband.grow(limits, required)
+
+    def portable(self, plan: HybridPlan) -> HybridPlan:
+        """Returns the plan without what is cheaply computed again."""
+        return dataclasses.replace(plan, wideband=self.wideband.portable(plan.wideband))
+
+    def sizes(self, params: HybridParams) -> dict[str, int]:
+        """Returns the sizes of both fields."""
+        coherent = {} if self.wave is None else self.wave.sizes(params.wave)
+        return self.wideband.sizes(params.wideband) | coherent
+
+    @classmethod
+    def groups(cls, config: HybridConfig) -> dict[str, Group]:
+        """Returns the groups of both fields under their names; trust is not trained, but found afterwards."""
+        parts = {"wave": WaveField.groups(config.wave), "wideband": WidebandField.groups(config.wideband)}
+        named = {f"{part}.{name}": group for part, groups in parts.items() for name, group in groups.items()}
+        return named | {"trust": Group(0.0)}
+
+    @classmethod
+    def labels(cls, params: HybridParams) -> Any:
+        """Returns the group of every parameter."""
+        coherent = [] if params.wave is None else jax.tree.leaves(WaveField.labels(params.wave))
+        blurred = jax.tree.leaves(WidebandField.labels(params.wideband))
+        names = [f"wave.{name}" for name in coherent] + [f"wideband.{name}" for name in blurred]
+        return with_leaves(params, *names, *["trust"] * len(jax.tree.leaves(params.trust)))
+
+
+def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
+    """Returns the coherent field of a scene; None where there is no mesh that it could use, or more than one receiver."""
+    if scene.receivers.position.shape[0] > 1:
+        return None
+    try:
+        return WaveField.make(config, scene, seed)
+    except UserError:
+        return None
+
+
+@jax.jit
+def _scores(
+    hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch
+) -> tuple[Float[Array, "shares b"] | None, Float[Array, "shares b"] | None]:
+    """Returns what every share of the coherent field is worth on every link: SSIM, and the negative error of the power (dB)."""
+    coherent: Any = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
+    blurred: Any = hybrid.wideband.render(params.wideband, plan.wideband, batch.links.query)
+    spectra = power = None
+    if batch.pas is not None:
+        spectra = jax.lax.map(lambda w: ssim(w * coherent.pas + (1 - w) * blurred.pas, batch.pas), jnp.asarray(SHARES))
+    if batch.received_db is not None:
+        shares = jnp.asarray(SHARES)[:, None]
+        error = jnp.abs(shares * coherent.power_db + (1 - shares) * blurred.power_db - batch.received_db)
+        power = jnp.where(batch.received_db > NOT_HEARD_DB, -error, 0)
+    return spectra, power
+
+
+def _best(scores: Sequence[Float[Array, "shares b"] | None]) -> Float[Array, ""]:
+    """Returns the share whose mean score is largest; 1 where nothing is known."""
+    known = [np.asarray(score) for score in scores if score is not None]
+    best = SHARES[np.argmax(np.concatenate(known, 1).mean(1))] if known else 1.0
+    return jnp.asarray(best, jnp.float32)
