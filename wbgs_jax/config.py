@@ -72,7 +72,7 @@ class SearchConfig:
     """Times the antennas of both ends are gone through, at most; 0: no search for antennas."""
     antenna_spectra: int = 96
     """Training spectra that are looked at for them."""
-    antenna_sure: float = 4.0
+    antenna_sure: float = 3.0
     """Standard errors by which another antenna must fit better than the one that is there."""
 
 
