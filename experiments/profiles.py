@@ -61,11 +61,12 @@ PROFILES = {
         changes={"optim": {"batch": 2}, "loop": {"epoch_steps": 2}},
         fields={"wideband": TINY, "wrfgs": TINY},
     ),
-    # Of the series, each its own. `rates` and `curve` are of today's presets.
+    # Of the series, each its own. `rates`, `curve` and `rooms` are of today's presets.
     "tuning": Profile("cpu", 1000, 600, **QUICK_BY_ADAM, scored_tx=SCORED_SLOW),
     "main": Profile("cpu", 2400, 600, validation=True),
     "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_SLOW),
     "curve": Profile("cpu", 1000, 600, **QUICK),
+    "rooms": Profile("cpu", 1000, 600, **QUICK),
     "schedules": Profile("cpu", 2000, 600, fields={"wideband": BY_ADAM}, validation=True),
     "frequency": Profile("cpu", 1000, 600, fields={"wideband": BY_ADAM}, validation=True),
     # What an hour on one core allows of the preset `paper`, Gaussians and steps.

@@ -18,6 +18,8 @@ class Variant:
     """Steps, instead of the profile's."""
     rates: float = 1
     """Factor of all learning rates of the field."""
+    room: bool = False
+    """Whether a whole room is the test (`jobs.ROOMS`), and nothing of it trains."""
     displacement: float = 0
     """Metres by which every part of the mesh stands in a wrong place (standard deviation along each axis)."""
 
@@ -94,9 +96,14 @@ SCHEDULES = {
 """How fast, and how long."""
 OPTIMIZERS = {
     "adam_4e-3": _of_field(network_optimizer="adam", network_lr=4e-3),
+    "adam_1.6e-2": _of_field(network_optimizer="adam", network_lr=1.6e-2),
+    "muon_5e-3": _of_field(network_optimizer="muon", network_lr=5e-3),
     "muon_1e-2": _of_field(network_optimizer="muon", network_lr=1e-2),
+    "muon_2e-2": _of_field(network_optimizer="muon", network_lr=2e-2),
 }
 """Optimisers of the networks."""
+ROOMS = {"room": Variant(room=True), "room_pooled": Variant({"field": _BLIND}, room=True)}
+"""A room held out."""
 POOLED = {
     "pooled": Variant({"field": _BLIND}),
     "pooled_long": Variant({"field": _BLIND}, budget=5),
@@ -119,6 +126,8 @@ COHERENT = {
     "order_3": _of_field(**_NO_EDGES),
     "no_search": Variant(_NO_SEARCH),
     "no_search_low_frequencies_first": Variant({"optim": {"curriculum": 0.5}, **_NO_SEARCH}),
+    "materials_lr_5e-3": _of_field(materials_lr=5e-3),
+    "materials_lr_2e-2": _of_field(materials_lr=2e-2),
     "search_alone": _of_field(**_UNTRAINED),
     "no_corrections": _of_field(corrections_lr=0.0),
     "free_reflectivity": Variant({"field": _NO_MATERIALS, **_NO_SEARCH}),
@@ -129,4 +138,6 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | POOLED | VOLUME | COHERENT
+VARIANTS: dict[str, Variant] = (
+    TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | ROOMS | POOLED | VOLUME | COHERENT
+)
