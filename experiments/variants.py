@@ -138,6 +138,14 @@ COHERENT = {
     "mesh_moved_3cm": Variant(displacement=0.03),
     "mesh_moved_1m": Variant(displacement=1.0),
 }
-VARIANTS: dict[str, Variant] = (
-    TABLES | GAUSSIANS_AND_NETWORKS | SCHEDULES | FREQUENCY | OPTIMIZERS | ROOMS | POOLED | VOLUME | COHERENT
-)
+VARIANTS: dict[str, Variant] = {
+    **TABLES,
+    **GAUSSIANS_AND_NETWORKS,
+    **SCHEDULES,
+    **FREQUENCY,
+    **OPTIMIZERS,
+    **ROOMS,
+    **POOLED,
+    **VOLUME,
+    **COHERENT,
+}
