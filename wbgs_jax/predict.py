@@ -31,8 +31,10 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import Field, Observation, field_names, get_field
 from wbgs_jax.fields.base import Quantity
+from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.maps import predict_many
+from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import BLOCK, check_power, predictor, trained_band
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
@@ -73,6 +75,8 @@ class Spectra:
     """float32."""
     tx_positions: Float[np.ndarray, "tx 3"]
     frequencies_hz: Float[np.ndarray, "freq"]
+    expected: Float[np.ndarray, "tx freq 3"] | None = None
+    """Expected SSIM of every answer, and the ends of its interval; None where a run does not know how sure it is."""
 
 
 def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
@@ -134,7 +138,22 @@ def ask(
     shape = len(tx_positions), len(frequencies_hz)
     tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
     pas = predict_many(predictor(trained, dataset.receiver()), tx, frequency, block=min(BLOCK, len(tx)))
-    return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz)
+    confidence = for_receiver(trained.confidence, dataset.receiver())
+    expected = None if confidence is None else np.stack(expect_many(confidence, pas, tx, frequency), -1).reshape(*shape, 3)
+    return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz, expected)
+
+
+def sureness(spectra: Spectra) -> list[str]:
+    """Returns how good the first `SHOWN` answers are expected to be: one line each."""
+    if spectra.expected is None:
+        return []
+    lines = []
+    for (tx, frequency), (ssim, low, high) in zip(
+        np.ndindex(spectra.expected.shape[:2]), spectra.expected.reshape(-1, 3), strict=True
+    ):
+        where = f"TX {_point(spectra.tx_positions[tx])} at {spectra.frequencies_hz[frequency] / 1e9:g} GHz"
+        lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
+    return lines[:SHOWN]
 
 
 def ask_channel(
@@ -214,9 +233,11 @@ def _source(trained: TrainedField, dataset: Dataset) -> dict[str, Any]:
 
 
 def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: Dataset) -> None:
-    """Writes `pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, and where they come from as JSON text in `meta`."""
+    """Writes `pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, `expected` (tx, freq, 3) if it is known, and where
+    they come from as JSON text in `meta`."""
+    arrays = {name: value for name, value in vars(spectra).items() if value is not None}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **vars(spectra), meta=np.array(json.dumps(_source(trained, dataset))))
+        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(_source(trained, dataset))))
 
 
 def draw(spectra: Spectra) -> Figure:
@@ -261,6 +282,8 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
         return
     spectra = ask(trained, dataset, tx_positions, frequencies_hz)
+    for line in sureness(spectra):
+        say(line)
     if command.out:
         write_spectra(command.out, spectra, trained, dataset)
         say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")

@@ -20,9 +20,11 @@ from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, get_field
+from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
+from wbgs_jax.training.confidence import learn_confidence
 from wbgs_jax.training.loop import TrainResult, check_data, train
-from wbgs_jax.training.neighbours import learn_neighbours
+from wbgs_jax.training.neighbours import Learned, learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 PROGRAM = "wbgs-jax train"
@@ -149,12 +151,18 @@ def main(arguments: list[str] | None = None) -> None:
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
     result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
-    if config.neighbours:
-        neighbours, line = learn_neighbours(result.field, result.params, dataset)
-        write_neighbours(folder, neighbours)
-        if line:
-            say(line)
+    learn_beside(result, dataset, config, folder)
     say(summary(result, folder))
+
+
+def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path) -> None:
+    """Leaves what the validation part says about a trained field: whom to ask beside it, and how sure it is."""
+    trained = result.field, result.params, dataset
+    learned = learn_neighbours(*trained) if config.neighbours else Learned()
+    write_neighbours(folder, learned.neighbours)
+    if learned.line:
+        say(learned.line)
+    write_confidence(folder, learn_confidence(*trained, learned.of_training))
 
 
 def summary(result: TrainResult, folder: Path) -> str:

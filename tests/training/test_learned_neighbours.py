@@ -37,7 +37,7 @@ def alike(dataset, rng, spread):
 
 def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
     dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
-    neighbours, line = learn_neighbours(field, params, dataset)
+    neighbours, line, _ = learn_neighbours(field, params, dataset)
     assert neighbours is not None and "gain +" in line
     assert len(neighbours.frequency_hz) == len(dataset.train) + len(dataset.validation)
     own = jax.jit(lambda query: field.render(params, field.plan(params, dataset.receiver()), query).pas)
@@ -53,7 +53,7 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     images = np.asarray(jax.jit(lambda query: field.render(params, plan, query).pas)(dataset.query(np.arange(len(dataset)))))
     told = np.clip(255 * images + rng.normal(0, 3, images.shape), 0, 255).astype(np.uint8)  # what the field says already
     noisy = dataclasses.replace(dataset, snapshots=None, images=told)
-    neighbours, line = learn_neighbours(field, params, hold_out_validation(noisy))
+    neighbours, line, _ = learn_neighbours(field, params, hold_out_validation(noisy))
     assert neighbours is None and "the field answers alone" in line
 
 
@@ -80,8 +80,8 @@ def test_the_test_part_changes_nothing(field, params, rng):
     dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
     poisoned = dataset.snapshots.copy()
     poisoned[dataset.test] = np.nan
-    found, _ = learn_neighbours(field, params, dataset)
-    again, _ = learn_neighbours(field, params, dataclasses.replace(dataset, snapshots=poisoned))
+    found, *_ = learn_neighbours(field, params, dataset)
+    again, *_ = learn_neighbours(field, params, dataclasses.replace(dataset, snapshots=poisoned))
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
 
@@ -90,6 +90,6 @@ def test_data_that_cannot_have_any_have_none(field, params, monkeypatch):
     fewer = dataclasses.replace(dataset, validation=dataset.validation[: FEWEST - 1])
     others = hold_out_validation(tiny_dataset(24, n_rx=2)), hold_out_validation(tiny_dataset(24, kind="power"))
     for data in (fewer, *others):
-        assert learn_neighbours(field, params, data) == (None, "")
+        assert learn_neighbours(field, params, data) == (None, "", None)
     monkeypatch.setattr(module, "MOST", len(dataset.train))
-    assert learn_neighbours(field, params, dataset) == (None, "") and len(dataset.train) < MOST
+    assert learn_neighbours(field, params, dataset) == (None, "", None) and len(dataset.train) < MOST

@@ -132,5 +132,10 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
     if power := report.get("power"):
         others = ", ".join(f"{name.replace('_', ' ')} {own['power_mae_db']:.2f} dB" for name, own in power["baselines"].items())
         lines.append(f"received power: {power['power_mae_db']:.2f} dB off ({others}; means)")
+    if sure := report.get("confidence"):
+        lines.append(
+            f"expected SSIM {sure['expected']:.3f} (mean; scored {sure['scored']:.3f}); {100 * sure['level']:.0f} % intervals "
+            f"hold {100 * sure['coverage']:.0f} % of the scores; the surer half scores {sure['risk_coverage']['0.5']:.3f}"
+        )
     single = report["ms_per_pas_single"]
     return [*lines, f"{report['ms_per_pas']:.2f} ms a PAS in blocks of {block}, {single:.2f} ms for a single query"]

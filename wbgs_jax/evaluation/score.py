@@ -13,8 +13,10 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.power import power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.confidence import expect_many
 from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import BLOCK, Trained, observe, observe_links, render_pas
 from wbgs_jax.radio import channel
@@ -41,6 +43,9 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
+    if confidence := for_receiver(trained.confidence, dataset.receiver()):
+        expected = expect_many(confidence, np.asarray(seen.pas), dataset.tx_positions[index], dataset.frequencies_hz[index])
+        report["confidence"] = calibration(expected, metrics.ssim(np.asarray(seen.pas), known[0]))
     report |= time_queries(trained, dataset)
     report["baselines"] = {
         name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()

@@ -76,12 +76,12 @@ def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query:
     return jnp.where(heard, jnp.clip(corrected, 0, 1), pas)
 
 
-def for_receiver(neighbours: Neighbours | None, receiver: Receiver) -> Neighbours | None:
-    """Returns the neighbours if they are of this receiver, else None (host)."""
-    if neighbours is None:
+def for_receiver(learned: Any, receiver: Receiver) -> Any:
+    """Returns what was learned of a receiver (`Neighbours`, `Confidence`) if it is this one, else None (host)."""
+    if learned is None:
         return None
-    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(neighbours.rx_position))
-    return neighbours if distance < SAME_PLACE_M else None
+    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(learned.rx_position))
+    return learned if distance < SAME_PLACE_M else None
 
 
 def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.confidence import Confidence
 from wbgs_jax.inference.neighbours import Neighbours, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
@@ -39,6 +40,11 @@ class Trained(Protocol):
     @property
     def neighbours(self) -> Neighbours | None:
         """Known spectra that are asked beside it."""
+        ...
+
+    @property
+    def confidence(self) -> Confidence | None:
+        """How sure its answers are."""
         ...
 
     def dataset(self) -> Dataset:

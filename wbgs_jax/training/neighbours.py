@@ -8,7 +8,7 @@ parts are asked.
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,15 +43,26 @@ class Choice:
     weight: float
 
 
-def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> tuple[Neighbours | None, str]:
-    """Returns the neighbours that improve a trained field (None: it is better by itself), and a line that says what was found.
+class Learned(NamedTuple):
+    """What was found."""
+
+    neighbours: Neighbours | None = None
+    """None: the field is better by itself."""
+    line: str = ""
+    """What was found, in words."""
+    of_training: Neighbours | None = None
+    """The same of the training part alone, for whoever looks at the validation part."""
+
+
+def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
+    """Returns the neighbours that improve a trained field.
 
     Data of several receivers, of received powers, with fewer than `FEWEST` validation or more than `MOST` known spectra have
     none.
     """
     links = training_links(dataset)
     if dataset.kind == "power" or dataset.n_receivers > 1 or len(dataset.validation) < FEWEST or len(links) > MOST:
-        return None, ""
+        return Learned()
     truth, predicted = np.asarray(dataset.pas(links)), predict_spectra(field, params, dataset, links)
     known, asked = (np.flatnonzero(np.isin(links, part)) for part in (dataset.train, dataset.validation))
     asked = np.random.default_rng(0).permutation(asked)[:SCORED]
@@ -65,9 +76,10 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> tuple[Neigh
     tx = dataset.tx_index[links[asked]]
     chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, links[known])}, tx)
     if chosen is None:
-        return None, f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone"
+        return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
     line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
-    return make_neighbours(chosen, dataset, links, truth, predicted), line
+    of_training = make_neighbours(chosen, dataset, links[known], truth[known], predicted[known])
+    return Learned(make_neighbours(chosen, dataset, links, truth, predicted), line, of_training)
 
 
 def choices(dataset: Dataset, known: Int[np.ndarray, "n"]) -> list[Choice]:

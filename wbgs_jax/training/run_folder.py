@@ -1,6 +1,6 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
-config.json   metrics.jsonl   checkpoints/STEP/   neighbours.npz   eval.json   pictures/*.png
+config.json   metrics.jsonl   checkpoints/STEP/   neighbours.npz   confidence.npz   eval.json   pictures/*.png
 """
 
 import dataclasses
@@ -27,6 +27,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, get_field
+from wbgs_jax.inference.confidence import Confidence, read_confidence
 from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
 from wbgs_jax.training import checkpoint
 
@@ -85,6 +86,8 @@ class TrainedField:
     """Training time."""
     neighbours: Neighbours | None = None
     """Known spectra that are asked beside it."""
+    confidence: Confidence | None = None
+    """How sure its answers are."""
 
     def dataset(self) -> Dataset:
         """Returns the data that it was trained on."""
@@ -156,4 +159,4 @@ def load_trained(folder: Path | str) -> TrainedField:
     field = get_field(config.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     seconds = float(saved.metadata["seconds"])
-    return TrainedField(config, field, params, steps[-1], seconds, read_neighbours(folder))
+    return TrainedField(config, field, params, steps[-1], seconds, read_neighbours(folder), read_confidence(folder))

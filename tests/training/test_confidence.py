@@ -1,0 +1,147 @@
+"""Expected scores and their intervals: learned where they should be, and honest about new transmitters."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_dataset
+from untrained import make_field, make_params
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.evaluation.calibration import calibration
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.inference.confidence import (
+    FILE,
+    MARGIN,
+    Confidence,
+    Expected,
+    expect_many,
+    expected_ssim,
+    features,
+    read_confidence,
+    write_confidence,
+)
+from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.training.confidence import SETS, fit, interval, learn_confidence, left_out, regress
+from wbgs_jax.types import Query
+
+
+def drawn(rng, n_tx, per_tx=5, slope=0.5, noise=0.3):
+    """Features, and errors that follow the first of them and differ by transmitter."""
+    tx = np.repeat(np.arange(n_tx), per_tx)
+    known = rng.normal(size=(len(tx), SETS[-1]))
+    error = -2 + slope * known[:, 0] + noise * rng.normal(size=len(tx))
+    return known, error, tx
+
+
+def test_intervals_hold_nine_of_ten_new_scores(rng):
+    known, error, tx = drawn(rng, 60)
+    mean, scale, weights, quantiles, surplus = fit(known, error, tx)
+    again, truth, _ = drawn(rng, 400)
+    predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
+    inside = (predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])
+    assert 0.85 < inside.mean() < 0.95
+    assert np.mean(np.exp(predicted) * surplus) == pytest.approx(np.exp(truth).mean(), rel=0.1)
+
+
+def test_what_says_nothing_is_left_out(rng):
+    known, error, tx = drawn(rng, 40, slope=0.0)
+    weights = fit(known, error, tx)[2]
+    assert np.count_nonzero(weights[:-1]) <= SETS[1]  # by chance one, at most
+    weights = fit(*drawn(rng, 40, slope=1.0))[2]
+    assert weights[0] == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_transmitter_is_not_judged_by_itself(rng):
+    """Ten spectra of one transmitter that are alike are one piece of evidence."""
+    known, error, tx = drawn(rng, 8, per_tx=10)
+    rest = left_out(known[:, :1], error, tx)
+    own = tx == 3
+    weights = regress(known[~own, :1], error[~own])
+    np.testing.assert_allclose(rest[own], error[own] - known[own, 0] * weights[0] - weights[1], atol=1e-9)
+    assert np.isfinite(left_out(known, error, np.zeros(len(tx), int))).all()
+
+
+def test_few_scores_give_the_widest_interval():
+    rest = np.array([0.3, -1.0, 2.0])
+    np.testing.assert_array_equal(interval(rest), [-1.0, 2.0])
+    many = np.arange(199.0)
+    np.testing.assert_array_equal(interval(many), [9, 189])
+
+
+def test_calibration_reports_what_it_says(rng):
+    scores = rng.uniform(0.3, 0.9, 100)
+    exact = Expected(*(jnp.asarray(scores + d) for d in (0, -0.1, 0.1)))
+    report = calibration(exact, scores)
+    assert report["coverage"] == 1 and report["correlation"] == pytest.approx(1)
+    assert report["width"] == pytest.approx(0.2, abs=0.01) and report["expected"] == pytest.approx(report["scored"])
+    assert report["risk_coverage"]["1"] == pytest.approx(scores.mean())
+    assert report["risk_coverage"]["0.5"] == pytest.approx(np.sort(scores)[50:].mean())
+    wrong = Expected(*(jnp.asarray(1 - scores + d) for d in (0, -0.01, 0.01)))
+    assert calibration(wrong, scores)["coverage"] < 0.2 and calibration(wrong, scores)["risk_coverage"]["0.1"] < 0.5
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return hold_out_validation(tiny_dataset(30))
+
+
+def test_it_is_learned_from_the_validation_part_alone(dataset):
+    field, params = make_field(), make_params()
+    learned = learn_confidence(field, params, dataset, None)
+    heard = dataset.snapshots.copy()
+    heard[dataset.test] = 1
+    poisoned = dataclasses.replace(dataset, snapshots=heard)
+    again = learn_confidence(field, params, poisoned, None)
+    for a, b in zip(jax.tree.leaves(learned), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    index = dataset.test
+    pas = predict_spectra(field, params, dataset, index)
+    expected = expect_many(learned, pas, dataset.tx_positions[index], dataset.frequencies_hz[index])
+    scores = ssim(pas, np.asarray(dataset.pas(index)))
+    assert abs(expected.ssim.mean() - scores.mean()) < 0.15
+    assert calibration(expected, scores)["coverage"] > 0.6
+
+
+def test_several_receivers_or_a_handful_of_spectra_say_nothing(dataset):
+    field, params = make_field(), make_params()
+    assert learn_confidence(field, params, hold_out_validation(tiny_dataset(12, n_rx=2)), None) is None
+    few = dataclasses.replace(dataset, validation=dataset.validation[:3])
+    assert learn_confidence(field, params, few, None) is None
+
+
+def confidence():
+    k = SETS[-1]
+    return Confidence(
+        *(
+            jnp.asarray(a, jnp.float32)
+            for a in (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2)
+        )
+    )
+
+
+def test_blocks_say_what_single_answers_do(rng):
+    pas = rng.uniform(0, 1, (19, 90, 360)).astype(np.float32)
+    tx, f = rng.uniform(-3, 3, (19, 3)), rng.uniform(1e9, 1e11, 19)
+    query = Query(jnp.asarray(tx, jnp.float32), jnp.asarray(f, jnp.float32))
+    for a, b in zip(expect_many(confidence(), pas, tx, f), expected_ssim(confidence(), jnp.asarray(pas), query), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4)
+    found = expected_ssim(confidence(), jnp.asarray(pas), query)
+    assert (found.low < found.high).all() and (found.high <= 1 + MARGIN).all()
+    distance = features(jnp.asarray(pas), query, jnp.asarray(tx, jnp.float32))[:, 0]
+    assert (distance < np.log(0.02)).all()  # at known transmitters
+
+
+def test_it_comes_back_from_a_run_folder(tmp_path):
+    write_confidence(tmp_path, confidence())
+    again = read_confidence(tmp_path)
+    for a, b in zip(jax.tree.leaves(confidence()), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    (tmp_path / FILE).write_bytes(b"no archive")
+    with pytest.raises(UserError, match="remove it"):
+        read_confidence(tmp_path)
+    write_confidence(tmp_path, None)
+    assert read_confidence(tmp_path) is None and not (tmp_path / FILE).exists()
