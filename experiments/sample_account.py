@@ -31,7 +31,7 @@ from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.training.antennas import AntennaReport, search_antennas
 from wbgs_jax.training.data import training_data
-from wbgs_jax.training.search import make_scores
+from wbgs_jax.training.scores import make_scores
 from wbgs_jax.types import Links
 
 CONFIG = WaveConfig(

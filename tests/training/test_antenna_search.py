@@ -14,7 +14,7 @@ from wbgs_jax.fields import wave
 from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
 from wbgs_jax.training.antennas import antenna_candidates, search_antennas, surely_better
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.search import make_scores
+from wbgs_jax.training.scores import make_scores
 
 N_TX = 30
 PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]

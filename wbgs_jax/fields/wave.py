@@ -8,6 +8,7 @@ conductivity and (where it is not known) thickness of every material, a small co
 nobody has said what they are. Phase-blind models cannot follow interference; this one does, and it yields the channel itself.
 """
 
+import dataclasses
 from typing import Any, ClassVar
 
 import jax
@@ -22,7 +23,9 @@ from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.fields.wave_settings import PRESETS, WaveConfig
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
 from wbgs_jax.propagation.facets import Facets, facets_from_mesh
+from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.motion import length_changes
 from wbgs_jax.propagation.paths import (
     DIFFRACTED,
     MAX_FACETS,
@@ -34,7 +37,15 @@ from wbgs_jax.propagation.paths import (
 )
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
-from wbgs_jax.radio.array import EXACT, normalise, pas_directions, snapshot_to_pas, squared_magnitude, steering_vector
+from wbgs_jax.radio.array import (
+    EXACT,
+    SPEED_OF_LIGHT,
+    normalise,
+    pas_directions,
+    snapshot_to_pas,
+    squared_magnitude,
+    steering_vector,
+)
 from wbgs_jax.radio.channel import Arrivals, received_power_db
 from wbgs_jax.radio.patterns import Antenna, upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
@@ -86,6 +97,8 @@ class WavePlan:
     search: Search
     receiver: Receiver
     known_thickness: Float[Array, "m"]
+    motion: Float[Array, "movers 3"] | None
+    """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
     config: WaveConfig = static()
 
 
@@ -146,7 +159,7 @@ class WaveField(Field):
         """Returns all mirror images of a receiver (host, unless they are prepared)."""
         check_receiver(receiver)
         search = self._search(receiver) if cache is None else cache.search
-        return WavePlan(search, receiver, self.known_thickness, self.config)
+        return WavePlan(search, receiver, self.known_thickness, None, self.config)
 
     def _search(self, receiver: Receiver) -> Search:
         config = self.config
@@ -186,13 +199,23 @@ class WaveField(Field):
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
         facet corrections."""
-        config = self.config
-        seen = self.render_links(params, self.plan(params, batch.receiver, cache=cache), cache, batch.links)
+        return self.planned_loss(params, self.plan(params, batch.receiver, cache=cache), cache, batch)
+
+    def planned_loss(
+        self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, batch: Batch
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the loss of a batch by a plan that is known."""
+        config, seen = self.config, self.render_links(params, plan, cache, batch.links)
         loss, aux = compare(seen, batch, config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
         return loss + config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0)), aux
+
+    def moved(self, motion: Float[np.ndarray, "movers 3"]) -> "WaveField":
+        """Returns the field of a scene whose surfaces stand elsewhere (host)."""
+        facets = move_facets(self.facets, np.asarray(motion, np.float64))
+        return dataclasses.replace(self, facets=_to_device(facets), edges=_to_device(edges_of_facets(facets)))
 
     def arrivals(self, params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
         """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
@@ -319,6 +342,9 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
         antennas = params.transmitter, params.element
         one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
+        if plan.motion is not None:
+            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
+            gain = gain * jnp.exp(-2j * jnp.pi * turns)
         found.append(one._replace(amplitude=one.amplitude * gain))
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 

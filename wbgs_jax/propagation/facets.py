@@ -5,6 +5,8 @@ what they are merged in, and what edges are searched in (`edges.py`): an object 
 material that meet, such as the walls of a room. Objects that are closed stay apart even where they touch. Runs on the host.
 """
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import coo_array
@@ -40,6 +42,8 @@ class Facets:
     """What a facet may have edges with: the object that it belongs to, or the open sheets of its material that meet."""
     material: Int[AnyArray, "f"]
     """Index of the mesh's material."""
+    mover: Int[AnyArray, "f"]
+    """What a facet moves with, if it stands elsewhere than the mesh says: the corners of a body that hang together."""
 
 
 @pytree
@@ -57,9 +61,10 @@ def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
     triangles, material = index[np.asarray(mesh.faces)], np.asarray(mesh.material)
     body = _bodies(triangles, np.asarray(mesh.part), material)
+    mover = _movers(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
-    triangles, normal, body, material = triangles[keep], normal[keep], body[keep], material[keep]
+    triangles, normal, body, material, mover = (a[keep] for a in (triangles, normal, body, material, mover))
     polygons: list[Polygon] = []
     first = []  # triangle of every polygon's plane
     for group in _coplanar(triangles, normal, body):
@@ -72,7 +77,16 @@ def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
     order = np.argsort(-sizes, kind="stable")[:most]
     owner = np.array(first, int)[order]
     offset = np.sum(normals[order] * corners[order].mean(1), -1)
-    return Facets(corners[order], normals[order], offset, body[owner].astype(np.int32), material[owner].astype(np.int32))
+    _, hangs_with = np.unique(mover[owner], return_inverse=True)
+    numbers = (values.astype(np.int32) for values in (body[owner], material[owner], hangs_with.reshape(-1)))
+    return Facets(corners[order], normals[order], offset, *numbers)
+
+
+def moved(facets: Facets, motion: Float[np.ndarray, "m 3"]) -> Facets:
+    """Returns the facets with their movers shifted (metres)."""
+    corners = np.asarray(facets.corners, np.float64) + motion[np.asarray(facets.mover)][:, None]
+    offset = np.sum(np.asarray(facets.normal, np.float64) * corners.mean(1), -1)
+    return dataclasses.replace(facets, corners=corners, offset=offset)
 
 
 def outline_of(facets: Facets) -> Outline:
@@ -135,6 +149,14 @@ def _bodies(
     # A graph whose nodes are the parts, and behind them the corners of borders, one for each material that meets there.
     label = _components(len(pieces) + len(owner), owner, len(pieces) + shared.reshape(-1))
     return label[piece]
+
+
+def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]) -> Int[np.ndarray, "t"]:
+    """Returns the mover of every triangle: those of one body that are joined by common corners share it."""
+    _, node = np.unique(np.column_stack([np.repeat(body, 3), triangles.reshape(-1)]), axis=0, return_inverse=True)
+    node = node.reshape(-1, 3)
+    label = _components(int(node.max(initial=-1)) + 1, node[:, [0, 1]].reshape(-1), node[:, [1, 2]].reshape(-1))
+    return label[node[:, 0]]
 
 
 def _normals(

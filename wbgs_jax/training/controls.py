@@ -26,6 +26,10 @@ class Edit(NamedTuple):
     """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
     report: dict[str, Any]
     """For metrics.jsonl; nothing is written if it is empty."""
+    field: Field | None = None
+    """The field where it is another one now, ..."""
+    cache: Any = None
+    """... and what it knows of the links."""
 
 
 class Context(NamedTuple):
@@ -102,4 +106,5 @@ class OfPart:
 
         follow = edit.moments
         moments = None if follow is None else lambda tree: put(tree, follow(getattr(tree, self.part)))
-        return edit._replace(params=put(params, edit.params), moments=moments)
+        whole = None if edit.field is None else put(field, edit.field)
+        return edit._replace(params=put(params, edit.params), moments=moments, field=whole)

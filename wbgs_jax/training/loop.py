@@ -181,6 +181,8 @@ class Run:
         moments = self.optimizer.init(edit.params) if edit.moments is None else _map_like(old, edit.moments)
         statistics[number] = edit.statistics
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
+        if edit.field is not None:
+            self.field, self.cache = edit.field, edit.cache
 
     def calibrate(self) -> None:
         """Lets the field learn what only the validation part can say."""

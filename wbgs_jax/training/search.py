@@ -1,28 +1,23 @@
-"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, then materials.
+"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, places of surfaces.
 
-Both are a choice among known ones by how well they explain some training spectra, and training goes on from there.
+The first two are a choice among known ones by how well they explain some training spectra; surfaces are moved where the mesh is
+doubtful. Training goes on from there.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.losses import log_decorrelation
 from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.controls import Context, Edit
-from wbgs_jax.training.data import TrainingData
+from wbgs_jax.training.geometry import Place, is_doubtful, learn_geometry
 from wbgs_jax.training.materials import search_materials
-
-Scores = Callable[[Sequence[Any]], Float[np.ndarray, "k n"]]
-"""K candidates for all parameters -> how badly each explains N spectra: log decorrelation, or log error of spectra alone."""
+from wbgs_jax.training.scores import make_scores
 
 
 @dataclass(frozen=True)
@@ -47,10 +42,11 @@ class Search:
     def apply(
         self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the parameters with the antennas and materials that explain some training spectra best."""
+        """Returns the antennas and materials that explain some training spectra best, and the field with its surfaces moved if
+        the mesh is doubtful."""
         config, data = self.config, context.data
         spectra = rng.choice(context.train, min(config.spectra, len(context.train)), replace=False)
-        report = {}
+        report, place = {}, Place(field, params, context.cache)
         if config.antenna_rounds:
             some = spectra[: config.antenna_spectra]
             score = make_scores(field, context.cache, data, jnp.asarray(some, jnp.int32))
@@ -61,28 +57,8 @@ class Search:
             score = make_scores(field, context.cache, data, jnp.asarray(spectra, jnp.int32))
             params, named = search_materials(params, score, config)
             report["search"] = dataclasses.asdict(named)
-        return Edit(params, (), None, report)
-
-
-def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver."""
-
-    def score(candidates: Sequence[Any]) -> Float[np.ndarray, "k n"]:
-        return np.asarray(_score(field, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates), cache, data, spectra))
-
-    return score
-
-
-@jax.jit
-def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"]):
-    batch = data.batch(spectra, jax.random.key(0))
-    plan = field.plan(jax.tree.map(lambda leaf: leaf[0], candidates), batch.receiver, None, cache)
-
-    def one(params):
-        seen = field.render_links(params, plan, cache, batch.links)
-        if seen.snapshots is not None and batch.snapshots is not None:
-            return log_decorrelation(seen.snapshots, batch.snapshots)
-        assert batch.pas is not None, "candidates are scored by spectra or snapshots"
-        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
-
-    return jax.lax.map(one, candidates)
+            place = dataclasses.replace(place, params=params)
+            if config.geometry_steps and is_doubtful(score([params])[0], np.asarray(data.links.query.frequency_hz)[spectra]):
+                place, found_at = learn_geometry(place, data, context.train, config, rng)
+                report["geometry"] = dataclasses.asdict(found_at)
+        return Edit(place.params, (), None, report, place.field, place.cache) if report else Edit(params, (), None, report)

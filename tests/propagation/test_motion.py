@@ -1,0 +1,63 @@
+"""First-order changes of path lengths against paths that are traced where the surfaces have gone."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import box, facets_of, room, search_of, trace
+
+from wbgs_jax.propagation.edges import edges_of_facets
+from wbgs_jax.propagation.facets import moved
+from wbgs_jax.propagation.image_method import make_search
+from wbgs_jax.propagation.motion import length_changes
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
+
+RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
+PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
+
+
+def lengths(paths):
+    """Of every path, by what it interacts with."""
+    points = np.asarray(paths.points, float)
+    total = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
+    names = [
+        tuple(np.stack([kind, facet], -1).ravel())
+        for kind, facet in zip(np.asarray(paths.interaction_type), np.asarray(paths.interaction_facet), strict=True)
+    ]
+    return {name: (k, total[k]) for k, name in enumerate(names) if paths.alive[k]}
+
+
+def test_closed_bodies_and_separate_walls_move_by_themselves():
+    facets = facets_of(*PARTS)
+    movers = np.asarray(facets.mover)
+    assert len(np.unique(movers)) == len(PARTS)
+    sizes = sorted(np.bincount(movers).tolist())
+    assert sizes == [1] * 6 + [6]
+
+
+@pytest.mark.parametrize("kind", ["specular", "diffracted"])
+def test_lengths_follow_the_surfaces(kind, rng):
+    facets = facets_of(*PARTS)
+    search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
+    motion = rng.normal(0, 1e-3, (len(PARTS), 3))
+    there = moved(facets, motion)
+    moved_search = make_search(there, edges_of_facets(there), np.asarray(RX), (0.0, 0.0), 0.5, 3.0)
+    before, after = (getattr(trace(s, TX), kind) for s in (search, moved_search))
+    expected = np.asarray(length_changes(before, search, jnp.asarray(motion, jnp.float32)))
+    first, second = lengths(before), lengths(after)
+    wanted = REFLECTED if kind == "specular" else DIFFRACTED
+    both = [name for name in first if name in second and wanted in name[::2]]
+    assert len(both) > 5
+    found = np.array([second[name][1] - first[name][1] for name in both])
+    said = np.array([expected[first[name][0]] for name in both])
+    np.testing.assert_allclose(said, found, atol=2e-5)
+    assert np.abs(found).max() > 2e-4
+
+
+def test_nothing_changes_where_nothing_moves():
+    search = search_of(PARTS, RX, mirror_areas=(0.0,))
+    paths = trace(search, TX).specular
+    np.testing.assert_array_equal(length_changes(paths, search, jnp.zeros((len(PARTS), 3))), 0)
+    facets = facets_of(*PARTS)
+    same = moved(facets, np.zeros((len(PARTS), 3)))
+    for name in ("corners", "normal", "offset"):
+        np.testing.assert_allclose(getattr(same, name), getattr(facets, name), atol=1e-12)

@@ -1,0 +1,108 @@
+"""Surfaces that stand elsewhere than the mesh says are put where the spectra say they are; right ones stay."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import box, mesh_of, room
+from synthetic import tiny_scene, tiny_settings
+
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.fields import wave
+from wbgs_jax.training.geometry import Place, is_doubtful, learn_geometry
+from wbgs_jax.training.loop import Run
+from wbgs_jax.training.materials import ITU_MATERIALS
+
+N_TX, FREQUENCIES = 60, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
+PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
+SETTINGS = tiny_settings(
+    "wave",
+    field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    search={"spectra": 120, "rounds": 1, "antenna_rounds": 0, "geometry_steps": 60, "geometry_tx": 60},
+)
+
+
+def run_in(parts, folder, snapshots):
+    mesh = mesh_of(*parts)
+    scene = dataclasses.replace(
+        tiny_scene(N_TX),
+        snapshots=snapshots,
+        frequencies_hz=FREQUENCIES,
+        tx_positions=np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3)),
+        rx_position=np.array([[1.0, 1.0, 1.2]]),
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+        face_part=np.asarray(mesh.part),
+        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": 0.05} for i in range(len(parts))]},
+    )
+    return Run(scene_dataset(scene), "wave", SETTINGS, 0, folder)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """Snapshots of a room of concrete, in all places."""
+    run = run_in(PARTS, tmp_path_factory.mktemp("true"), np.ones((N_TX, 1, len(FREQUENCIES), 16), np.complex64))
+    permittivity, c, d = ITU_MATERIALS["concrete"]
+    materials = dataclasses.replace(
+        run.state.params.materials,
+        log_susceptibility=jnp.full(len(PARTS), np.log(permittivity - 1)),
+        log_conductivity=jnp.full(len(PARTS), np.log(c)),
+        slope=jnp.full(len(PARTS), d),
+    )
+    params = dataclasses.replace(run.state.params, materials=materials)
+    field = run.field
+    scene = run_in(PARTS, run.folder, np.ones((N_TX, 1, len(FREQUENCIES), 16), np.complex64)).dataset
+    everywhere = np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3))
+    plan = field.plan(params, scene.receiver())
+    query = wave.Query(
+        jnp.asarray(np.repeat(everywhere, len(FREQUENCIES), 0), jnp.float32),
+        jnp.asarray(np.tile(FREQUENCIES, N_TX), jnp.float32),
+    )
+    heard = jax.jit(wave.snapshots)(params, plan, query)
+    return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16), params
+
+
+def learned(truth, parts, folder):
+    snapshots, params = truth
+    run = run_in(parts, folder, snapshots)
+    place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
+    return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
+
+
+def test_walls_come_back(truth, tmp_path):
+    rng = np.random.default_rng(5)
+    shifts = rng.normal(0, 0.01, (len(PARTS), 3))
+    wrong = [part.copy().apply_translation(shift) for part, shift in zip(PARTS, shifts, strict=True)]
+    (place, report), run = learned(truth, wrong, tmp_path)
+    assert report.kept and report.after < report.before - 0.5
+    normal, mover = np.asarray(run.field.facets.normal), np.asarray(run.field.facets.mover)
+    own = {int(m): shifts[p] for m, p in zip(mover, part_of(run, wrong), strict=True)}
+    along = np.array([abs(normal[i] @ own[int(m)]) for i, m in enumerate(mover)])
+    steps = np.asarray(place.field.facets.offset) - np.asarray(run.field.facets.offset)
+    left = np.array([abs(steps[i] + normal[i] @ own[int(m)]) for i, m in enumerate(mover)])
+    walls = np.bincount(mover)[mover] == 1
+    print(np.round(1e3 * along[walls], 2), np.round(1e3 * left[walls], 2))
+    assert np.median(left[walls]) < 5e-4 < np.median(along[walls])
+
+
+def part_of(run, parts):
+    """The part that every facet lies on."""
+    centres = np.asarray(run.field.facets.corners, float).mean(1)
+    distances = np.array([[np.abs(part.nearest.on_surface([c])[1][0]) for part in parts] for c in centres])
+    return distances.argmin(1)
+
+
+def test_right_surfaces_stay(truth, tmp_path):
+    (place, report), run = learned(truth, PARTS, tmp_path)
+    assert report.largest_mm < 1 or not report.kept
+    if not report.kept:
+        assert place.field is run.field
+
+
+def test_only_phases_that_get_worse_with_the_frequency_make_a_mesh_doubtful(rng):
+    frequency = np.repeat([1e9, 5e9, 28e9, 94e9], 20)
+    worse = np.repeat([-3.0, -2.0, -0.5, -0.3], 20)
+    assert is_doubtful(worse, frequency) and not is_doubtful(worse[::-1], frequency)
+    assert not is_doubtful(np.full(80, -1.0), frequency) and not is_doubtful(worse[:40], frequency[:40])
