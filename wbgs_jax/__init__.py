@@ -4,13 +4,14 @@ Pure functions on pytrees, for use under `jax.jit`, `jax.vmap` and `jax.grad`. S
 loaded when they are first asked for: importing this package changes nothing in the process, and the pure part stands without
 the host's modules. `__init__.pyi` lists them with their types; docs/api.md describes them.
 
-* fields: `wideband` (the paper's), `wave` (coherent), `wrfgs` and `nerf2` (baselines); `pas` is the differentiable function
-  from parameters, receiver and query to spectra, `Field` the seam that a new model fits
+* fields: `hybrid` (the default, both of the next), `wideband` (the paper's), `wave` (coherent), `wrfgs` and `nerf2`
+  (baselines); `pas` is the differentiable function from parameters, receiver and query to spectra, `Field` the seam that a
+  new model fits
 * splatting onto a receiver's hemisphere: `project`, `geometry_plan`, `render_splats`, `render_dense`
 * the antenna array: `planar_array`, `steering_vector`, `cbf`, `snapshot_to_pas`, `pas_directions`
 * data on the host: `load_dataset`, `load_scene`, `make_surface`, `make_mesh`, `surface_from_points`
 * a trained field: `load_trained`, `predictor`, `power_predictor`, `predict_many`, `predict_blocks`, `predict_map`,
-  `map_queries`, `export_field`, `load_exported` (docs/inference.md)
+  `map_queries`, `expected_ssim`, `export_field`, `load_exported` (docs/inference.md)
 """
 
 import lazy_loader

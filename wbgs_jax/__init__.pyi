@@ -9,6 +9,7 @@ from .data.surface import surface_from_points as surface_from_points
 from .fields import Field as Field
 from .fields import Observation as Observation
 from .fields import get_field as get_field
+from .fields import hybrid as hybrid
 from .fields import nerf2 as nerf2
 from .fields import pas as pas
 from .fields import register as register
@@ -21,6 +22,7 @@ from .fields.losses import image_loss as image_loss
 from .fields.losses import ssim as ssim
 from .fields.wave import WaveConfig as WaveConfig
 from .fields.wideband import WidebandConfig as WidebandConfig
+from .inference.confidence import expected_ssim as expected_ssim
 from .inference.export import export_field as export_field
 from .inference.export import load_exported as load_exported
 from .inference.maps import map_queries as map_queries

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wbgs_jax.evaluation.beams import FAINTEST_DB, RINGS, SECTORS, angle_error_deg, beam_loss_db, codebook
-from wbgs_jax.radio.array import pas_directions
+from wbgs_jax.evaluation.beams import FAINTEST_DB, RINGS, SECTORS, angle_error_deg, beam_loss_db, codebook, plane_normal
+from wbgs_jax.radio.array import pas_directions, planar_array
 
 
 def spot(row, column, width=200.0):
@@ -57,3 +57,14 @@ def test_a_silent_beam_and_a_silent_truth_have_finite_losses():
     heard.reshape(-1)[codebook()[-1]] = 1
     assert beam_loss_db(nothing, heard)[0] == pytest.approx(-FAINTEST_DB)  # all beams look alike: the first is used
     assert beam_loss_db(heard, nothing)[0] == 0
+
+
+def test_a_planar_array_does_not_tell_its_front_from_its_back(rng):
+    """Twins are half a pixel off each other's places, so that which of them is the largest pixel is chance."""
+    front, back = (np.zeros((1, 90, 360)) for _ in range(2))
+    row, column = 60, int(rng.integers(190, 260))
+    front[0, row, column] = back[0, row, (538 - column) % 359] = 1
+    normal = plane_normal(planar_array())
+    np.testing.assert_allclose(np.abs(normal), [1, 0, 0], atol=1e-9)
+    assert angle_error_deg(front, back, normal)[0] < 1.1 and angle_error_deg(front, back)[0] > 20
+    assert plane_normal(rng.normal(size=(16, 3))) is None and plane_normal(np.arange(4.0)[:, None] * np.ones(3)) is None

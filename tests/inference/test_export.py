@@ -14,13 +14,16 @@ import numpy as np
 import pytest
 from synthetic import FREQUENCIES_HZ, RX, tiny_dataset
 from toys import RippleConfig, RippleField
-from untrained import STEP, make_run, make_trained
+from untrained import STEP, make_field, make_params, make_run, make_trained
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.training.confidence import learn_confidence
 
 
 @pytree
@@ -110,7 +113,8 @@ def blocks(text):
 
 def test_the_guide_runs(tmp_path, monkeypatch):
     """Block after block, and the one that loads a field elsewhere in a process that can import nothing of the library."""
-    make_run(tmp_path / "runs" / "scene1-wideband-cpu-seed0")
+    run = make_run(tmp_path / "runs" / "scene1-hybrid-cpu-seed0")
+    write_confidence(run, learn_confidence(make_field(), make_params(), hold_out_validation(tiny_dataset(30)), None))
     monkeypatch.chdir(tmp_path)
     here, elsewhere = GUIDE.split("## Loading elsewhere")
     names: dict = {}
@@ -119,6 +123,7 @@ def test_the_guide_runs(tmp_path, monkeypatch):
     assert names["pas"].shape == (90, 360)
     assert names["grid"].shape == (2, 3, 4, 90, 360)
     np.testing.assert_allclose(names["strongest"], names["grid"].max((3, 4)), atol=1e-6)
+    assert (names["sure"].low < names["sure"].high).all()
     assert names["slope"].shape == (3,) and float(jnp.abs(names["slope"]).max()) > 0
     (block,) = blocks(elsewhere)
     block_imports = f"import sys\nsys.modules.update(dict.fromkeys({FOREIGN!r}))\n"

@@ -15,12 +15,13 @@ from wbgs_jax.training.geometry import Place, is_doubtful, learn_geometry
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import ITU_MATERIALS
 
-N_TX, FREQUENCIES = 60, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
+N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
+PLACES = np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3))
 PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
 SETTINGS = tiny_settings(
     "wave",
-    field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"spectra": 120, "rounds": 1, "antenna_rounds": 0, "geometry_steps": 60, "geometry_tx": 60},
+    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "geometry_steps": 80, "geometry_tx": 40},
 )
 
 
@@ -30,7 +31,7 @@ def run_in(parts, folder, snapshots):
         tiny_scene(N_TX),
         snapshots=snapshots,
         frequencies_hz=FREQUENCIES,
-        tx_positions=np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3)),
+        tx_positions=PLACES,
         rx_position=np.array([[1.0, 1.0, 1.2]]),
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
@@ -44,6 +45,7 @@ def run_in(parts, folder, snapshots):
 def truth(tmp_path_factory):
     """Snapshots of a room of concrete, in all places."""
     run = run_in(PARTS, tmp_path_factory.mktemp("true"), np.ones((N_TX, 1, len(FREQUENCIES), 16), np.complex64))
+    field = run.field
     permittivity, c, d = ITU_MATERIALS["concrete"]
     materials = dataclasses.replace(
         run.state.params.materials,
@@ -73,7 +75,7 @@ def learned(truth, parts, folder):
 
 def test_walls_come_back(truth, tmp_path):
     rng = np.random.default_rng(5)
-    shifts = rng.normal(0, 0.01, (len(PARTS), 3))
+    shifts = rng.normal(0, 0.006, (len(PARTS), 3))
     wrong = [part.copy().apply_translation(shift) for part, shift in zip(PARTS, shifts, strict=True)]
     (place, report), run = learned(truth, wrong, tmp_path)
     assert report.kept and report.after < report.before - 0.5
@@ -94,6 +96,7 @@ def part_of(run, parts):
     return distances.argmin(1)
 
 
+@pytest.mark.slow
 def test_right_surfaces_stay(truth, tmp_path):
     (place, report), run = learned(truth, PARTS, tmp_path)
     assert report.largest_mm < 1 or not report.kept

@@ -37,6 +37,7 @@ def score(
     truth: Float[np.ndarray, "n 90 360"],
     frequencies_hz: Float[np.ndarray, "n"],
     sight: Bool[np.ndarray, "n"] | None = None,
+    array_normal: Float[np.ndarray, "3"] | None = None,
 ) -> dict[str, Any]:
     """Returns a report of predicted spectra, ready for JSON.
 
@@ -45,6 +46,7 @@ def score(
         truth: what was observed.
         frequencies_hz: of every spectrum.
         sight: whether the receiver sees the transmitter, where that is known.
+        array_normal: of a planar array, which cannot tell its front from its back.
 
     Returns:
         n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
@@ -63,7 +65,7 @@ def score(
         "ssim": ssim(predicted, truth),
         "psnr_db": psnr_db(predicted, truth),
         "mae": mae(predicted, truth),
-        "angle_error_deg": angle_error_deg(predicted, truth),
+        "angle_error_deg": angle_error_deg(predicted, truth, array_normal),
         "beam_loss_db": beam_loss_db(predicted, truth),
         "beam_loss_top3_db": beam_loss_db(predicted, truth, 3),
     }

@@ -13,6 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.power import power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
@@ -38,7 +39,8 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     power = None if said is None else power_figures(said, dataset, index)
     if dataset.kind == "power":
         return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
-    known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index)
+    normal = plane_normal(np.asarray(dataset.receiver().element_positions))
+    known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index), normal
     report |= metrics.score(np.asarray(seen.pas), *known)
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
