@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from experiments.profiles import BY_ADAM, STEPS_BY_ADAM
+from experiments.profiles import BY_ADAM, NERF2_BY_ADAM, STEPS_BY_ADAM
 from experiments.settings import HOUSEKEEPING, plain
 
 MOVED = {
@@ -26,8 +26,10 @@ BEFORE_MUON: dict[str, dict[str, Any]] = {
     },
 }
 BEFORE_MUON["wrfgs"] = {name.replace("wideband.", "wrfgs."): value for name, value in BEFORE_MUON["wideband"].items()}
-"""What the presets of a field had until then: results that do not say otherwise (`EDITION`) were made so."""
-EDITION = 2
+"""What the presets of a field had in the first edition: results that do not say otherwise (`EDITION`) were made so."""
+BEFORE_NERF2_BY_MUON = {"nerf2": {f"nerf2.{name}": value for name, value in NERF2_BY_ADAM.items()}}
+"""... and in the second."""
+EDITION = 3
 """Of the presets; results are written with it."""
 NOT_OF = {"density": ("wave", "nerf2"), "search": ("wideband", "wrfgs", "nerf2")}
 """Sections that all fields had, and the fields that took no notice."""
@@ -36,8 +38,10 @@ NOT_OF = {"density": ("wave", "nerf2"), "search": ("wideband", "wrfgs", "nerf2")
 def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
     """Returns the settings of a result by today's names and against today's presets, without those that changed nothing."""
     settings = result.get("settings", {})
-    if result.get("presets", 1) < EDITION and result.get("preset") != "paper":
-        settings = BEFORE_MUON.get(field, {}) | settings
+    edition = result.get("presets", 1)
+    if result.get("preset") != "paper":
+        settings = (BEFORE_MUON.get(field, {}) if edition < 2 else {}) | settings
+        settings = (BEFORE_NERF2_BY_MUON.get(field, {}) if edition < 3 else {}) | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value

@@ -46,7 +46,11 @@ BY_ADAM: dict[str, Any] = {
 """What the splatting fields had until Muon came: the series of that time, which chose other settings, keep it."""
 STEPS_BY_ADAM = 6000
 """Of the `cpu` preset until then."""
-QUICK_BY_ADAM = QUICK | {"fields": {"wideband": GAUSSIANS | BY_ADAM, "wrfgs": GAUSSIANS | BY_ADAM}}
+NERF2_BY_ADAM = {"network_optimizer": "adam", "network_lr": 4e-3}
+"""What the NeRF2-style field had until then."""
+QUICK_BY_ADAM = QUICK | {
+    "fields": {"wideband": GAUSSIANS | BY_ADAM, "wrfgs": GAUSSIANS | BY_ADAM, "nerf2": NERF2_BY_ADAM},
+}
 BEFORE = BY_ADAM | {"network_lr": 1e-3, "fusion": 0}
 """What the `cpu` preset had when its inputs and sizes were chosen."""
 PROFILES = {

@@ -74,9 +74,9 @@ class SearchConfig:
     """Training spectra that are looked at for them."""
     antenna_sure: float = 3.0
     """Standard errors by which another antenna must fit better than the one that is there."""
-    geometry_steps: int = 120
+    geometry_steps: int = 360
     """Steps at every frequency in which surfaces of a doubtful mesh are moved; 0: the mesh stays as it is."""
-    geometry_tx: int = 250
+    geometry_tx: int = 160
     """Transmitters that are looked at for that."""
     geometry_width: float = 0.02
     """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""

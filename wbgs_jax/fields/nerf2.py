@@ -59,9 +59,9 @@ class Nerf2Config:
     """Also encode the TX relative to the place, the direction and the receiver array, as the wideband field does."""
     pixel_loss: Literal["l1", "l2"] = "l1"
     """Mean absolute or squared error of the sampled pixels, which make no image and have no SSIM."""
-    network_optimizer: Optimizer = "adam"
-    """What moves the networks' matrices (`base.Group`)."""
-    network_lr: float = 4e-3
+    network_optimizer: Optimizer = "muon"
+    """What moves the networks' matrices (`base.Group`; authors: Adam)."""
+    network_lr: float = 1e-2
     """Learning rate of the networks (authors: 5e-4)."""
     network_weight_decay: float = 0.0
     """Decoupled weight decay of the networks."""
@@ -70,7 +70,7 @@ class Nerf2Config:
 CONFIGS = {
     "smoke": Nerf2Config(samples=8, directions=64, width=32, depth=3, radiance_widths=(32,)),
     "cpu": Nerf2Config(),
-    "gpu": Nerf2Config(samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128), network_lr=8e-4),
+    "gpu": Nerf2Config(samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128)),
 }
 Weights = dict[str, Any]
 """What is trained: the two networks."""

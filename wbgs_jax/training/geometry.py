@@ -20,16 +20,20 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.antennas import surely_better
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.scores import make_scores
 from wbgs_jax.types import Links
 
-STEP = 5e-3
+STEP = 0.012
 """Learning rate, in wavelengths of the highest frequency, at most ..."""
 LONGEST_STEP = 2e-3
 """... so many metres."""
+UNSEEN = 0.03, 0.01
+"""Gradient of the loss, per radian of a path's phase, of a surface that is hardly seen: below it, steps shrink with it. Before
+surfaces have been moved for the first time, and afterwards: at the lowest frequencies the field's physics is at its worst."""
 TRACED_AGAIN = 5.0
 """Ratio of frequencies after which surfaces are moved and paths traced again."""
 PRIOR_WEIGHT = 0.01
@@ -100,8 +104,9 @@ def learn_geometry(
             traced_at = float(highest)
         pool = own[frequency[own] <= highest * (1 + 1e-6)]
         batches = jnp.asarray(rng.choice(pool, (config.geometry_steps, min(BATCH, len(pool)))), jnp.int32)
-        rate = min(STEP * 299_792_458.0 / float(highest), LONGEST_STEP)
-        params, motion = _steps(now.field, now.params, motion, now.cache, data, batches, rate, config.geometry_width)
+        wavelength = SPEED_OF_LIGHT / float(highest)
+        rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN[bool(total.any())] * 2 * np.pi / wavelength
+        params, motion = _steps(now.field, now.params, motion, now.cache, data, batches, rate, unseen, config.geometry_width)
         now = dataclasses.replace(now, params=params)
     total, now, _ = _commit(total, now, motion, place.field, None, data)
     moved = _named(dataclasses.replace(now, params=_fresh(place.params, now.params)), data, train, config, rng)
@@ -167,12 +172,13 @@ def _steps(
     data: TrainingData,
     batches: Int[Array, "k b"],
     rate: Any,
+    unseen: Any,
     width: float,
 ) -> tuple[Any, Float[Array, "m 3"]]:
     """Learns shifts, with materials and corrections beside them, on some batches."""
     others = optax.adam(RATE)
     # Steps of shifts shrink to a tenth over the batches.
-    shifts = optax.adam(optax.cosine_decay_schedule(1.0, batches.shape[0], 0.1))
+    shifts = optax.adam(optax.cosine_decay_schedule(1.0, batches.shape[0], 0.1), eps=unseen)
 
     def objective(learned: Any, index: Int[Array, "b"]) -> Float[Array, ""]:
         params, motion = learned
