@@ -19,7 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import VALIDATION
-from wbgs_jax.fields import default_field, get_field
+from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.confidence import learn_confidence
@@ -76,7 +76,8 @@ def parse(arguments: list[str]) -> tuple[Command, Settings]:
     preset = option_value(arguments, "--preset", default_preset())
     kind = get_field(field)
     if preset not in kind.presets:
-        raise UserError(f"{field} has no preset {preset!r}; choose one of: {', '.join(kind.presets)}")
+        others = [f"--field {name}" for name in field_names() if preset in get_field(name).presets]
+        raise UserError(f"{field} has no preset {preset!r}; choose one of: {', '.join([*kind.presets, *others])}")
     parts = sections(kind.presets[preset], field)
     everything = "--help-settings" in arguments
     if everything:

@@ -1,6 +1,7 @@
 """Surfaces that stand elsewhere than the mesh says are put where the spectra say they are; right ones stay."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ from synthetic import tiny_scene, tiny_settings
 
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
-from wbgs_jax.training.geometry import Place, is_doubtful, learn_geometry
+from wbgs_jax.training import search
+from wbgs_jax.training.geometry import GeometryReport, Place, is_doubtful, learn_geometry
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import ITU_MATERIALS
 
@@ -102,6 +104,18 @@ def test_right_surfaces_stay(truth, tmp_path):
     assert report.largest_mm < 1 or not report.kept
     if not report.kept:
         assert place.field is run.field
+
+
+def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
+    run = run_in(PARTS, tmp_path, truth[0])
+    moved = run.field.moved(np.full((len(PARTS), 3), 1e-3))
+    report = GeometryReport(-1.0, -2.0, True, 1.0, 1.0)
+    monkeypatch.setattr(search, "is_doubtful", lambda *_: True)
+    monkeypatch.setattr(search, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
+    run.controls = (search.Search(SETTINGS.search),)
+    run.control()
+    assert run.field is moved
+    assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
 
 
 def test_only_phases_that_get_worse_with_the_frequency_make_a_mesh_doubtful(rng):

@@ -93,7 +93,7 @@ class HybridField(Field):
         WaveField.check(config.wave)
         WidebandField.check(config.wideband)
         if not config.wave.coherent:
-            raise UserError("--wave.coherent False leaves nothing to mix; train --field wideband")
+            raise UserError("--wave.no-coherent leaves nothing to mix; train --field wideband")
 
     @classmethod
     def make(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":
