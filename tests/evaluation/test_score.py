@@ -41,6 +41,7 @@ class Toy(NamedTuple):
     field: RippleField
     params: Any
     neighbours: None = None
+    confidence: None = None
 
     def origin(self):
         return {"field": self.field.name, "preset": "none", "seed": 0, "step": 3}

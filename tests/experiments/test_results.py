@@ -41,7 +41,8 @@ def test_settings_that_have_moved_are_found_under_todays_names():
     old = {"optim.network_lr": 0.016, "optim.steps": 100, "loop.checkpoint_every": 200, "density.every": 75}
     wrfgs = {"wrfgs.network_lr": 0.016, "optim.steps": 100, "density.every": 75}
     assert todays({"settings": old, "presets": EDITION}, "wrfgs") == wrfgs
-    assert todays({"settings": old}, "nerf2") == {"nerf2.network_lr": 0.016, "optim.steps": 100}
+    adam = {"nerf2.network_optimizer": "adam", "nerf2.network_lr": 0.016, "optim.steps": 100}
+    assert todays({"settings": old}, "nerf2") == adam == todays({"settings": old, "presets": 2}, "nerf2")
     old = {
         "wave.survival": 0.5,
         "optim.residual_lr": 0.1,

@@ -137,7 +137,8 @@ def test_jobs_come_in_the_order_of_importance():
     cheap = [job for job in listed if job not in costly]
     assert listed == cheap + costly
     for some in (cheap, costly):
-        assert [job.seed for job in some] == sorted(job.seed for job in some)
+        order = [(job.budget, job.seed) for job in some]
+        assert order == sorted(order)
 
 
 @pytest.mark.usefixtures("calls")

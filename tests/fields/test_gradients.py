@@ -119,7 +119,7 @@ def random_arguments(rng, name):
         }
         params = replaced(params, gaussians=replaced(gaussians, **changes))
     orientation = np.array([1.0, 0, 0, 0]) + rng.normal(0, 0.2, 4)
-    receiver = Receiver(*map(jnp.asarray, (np.array(RX), orientation, planar_array(3, 2, 0.4), np.array(0.7))))
+    receiver = Receiver(*map(jnp.asarray, (np.array(RX), orientation, planar_array(3, 2, 0.4), np.array([0.7, 0.4]))))
     places = rng.uniform([1.5, 0.5, 0.5], [5.5, 3.5, 2.5], (2, 3)), rng.uniform(2e9, 4e9, 2)
     return jax.tree.map(np.asarray, (params, receiver, Query(*map(jnp.asarray, places))))
 
@@ -184,9 +184,7 @@ def test_materials_of_known_thickness_have_no_gradient_of_it(rng, x64):
 def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
     """Candidates without strength fill the list of paths up; their legs may have no length."""
     field = field_of("wave")
-    plan = field.plan(
-        None, Receiver(*map(jnp.asarray, (np.array(RX), np.array([1.0, 0, 0, 0]), np.zeros((1, 3)), np.ones(()))))
-    )
+    plan = field.plan(None, Receiver(*map(jnp.asarray, (np.array(RX), np.array([1.0, 0, 0, 0]), np.zeros((1, 3)), np.ones(2)))))
     slabs = Slabs(jnp.full(7, 4 - 0.1j), jnp.full(7, 0.1))
     points = np.array([[[4.0, 3, 2], *[RX] * 4], [RX] * 5])
     nothing = jnp.zeros((2, 5), jnp.int32)

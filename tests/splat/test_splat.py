@@ -40,7 +40,7 @@ LIMITS = TileLimits(entries=32_768, jobs=2048)
 
 
 def receiver_at(position, orientation, dtype=np.float64) -> Receiver:
-    return Receiver(*(jnp.asarray(a, dtype) for a in (position, orientation, np.zeros((1, 3)), 0.0)))
+    return Receiver(*(jnp.asarray(a, dtype) for a in (position, orientation, np.zeros((1, 3)), np.zeros(2))))
 
 
 def rotation_of(receiver):

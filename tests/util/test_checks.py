@@ -78,12 +78,12 @@ def test_shapes_are_checked_under_jit_too(planned):
 
 def test_a_wrong_receiver_is_refused(field, planned):
     params, _ = planned
-    elements, isotropic = jnp.zeros((1, 3)), jnp.zeros(())
+    elements, isotropic = jnp.zeros((1, 3)), jnp.zeros(2)
     with pytest.raises(ValueError, match=r"receiver.position has shape \(2,\)"):
         field.plan(params, wb.Receiver(jnp.zeros(2), jnp.ones(4), elements, isotropic))
     with pytest.raises(ValueError, match="zero length"):
         field.plan(params, wb.Receiver(jnp.zeros(3), jnp.zeros(4), elements, isotropic))
-    three = wb.Receiver(jnp.zeros((3, 3)), jnp.ones((3, 4)), jnp.zeros((3, 1, 3)), jnp.zeros(3))
+    three = wb.Receiver(jnp.zeros((3, 3)), jnp.ones((3, 4)), jnp.zeros((3, 1, 3)), jnp.zeros((3, 2)))
     with pytest.raises(ValueError, match=r"receiver.position has shape \(3, 3\); expected \(3,\)"):
         field.plan(params, three)
 

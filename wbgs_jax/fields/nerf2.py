@@ -165,7 +165,7 @@ class Nerf2Field(Field):
 def _init(field: Nerf2Field, key: Key[Array, ""]) -> Weights:
     """Returns initial weights; the inputs matter by their shapes only."""
     box = field.box
-    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), jnp.zeros(()))
+    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), jnp.zeros(2))
     rays = make_rays(box, receiver, jnp.array([[0.0, 0.0, 1.0]]))
     plan = Nerf2Plan(rays, receiver, box, field.config)
     query = Query(box[1:], jnp.full((1,), 1e9))

@@ -37,23 +37,13 @@ from wbgs_jax.propagation.paths import (
 )
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
-from wbgs_jax.radio.array import (
-    EXACT,
-    SPEED_OF_LIGHT,
-    normalise,
-    pas_directions,
-    snapshot_to_pas,
-    squared_magnitude,
-    steering_vector,
-)
-from wbgs_jax.radio.channel import Arrivals, received_power_db
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, snapshot_to_pas, squared_magnitude
+from wbgs_jax.radio.channel import Arrivals, added_powers, received_power_db
 from wbgs_jax.radio.patterns import Antenna, upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
 
 TRACED_AT_ONCE = 16
 """Transmitters."""
-FAINTEST = 1e-30
-"""Amplitude that stands for nothing; its square would vanish in single precision."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Beyond it (S/m) every material is a mirror, and single precision ends."""
 
@@ -310,20 +300,9 @@ def phase_blind_pas(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
 ) -> Float[Array, "b 90 360"]:
     """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
-
-    def one(paths, f):
-        elements = plan.receiver.element_wavelengths(f)
-        found = arrivals_at(params, plan, paths, f)
-        steering = steering_vector(elements, found.direction)
-        strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(found.amplitude)))
-        power = squared_magnitude(found.amplitude / jnp.maximum(strongest, FAINTEST))
-        weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
-        covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)  # sum of power times a a^H
-        grid = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
-        return jnp.einsum("hwe,ef,hwf->hw", grid.conj(), covariance, grid, precision=EXACT)
-
-    beams = jax.vmap(one)(paths, frequency_hz)
-    return normalise(jnp.sqrt(jnp.maximum(beams.real, 1e-12)))
+    return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
+        paths, frequency_hz
+    )
 
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:

@@ -53,7 +53,7 @@ class WaveConfig:
     """Learning rate of the logarithm of metres: at 100 GHz a thousandth of a wall turns the phase by a tenth of a radian."""
     corrections_lr: float = 5e-3
     """Learning rate of facet corrections, excess losses and the gain."""
-    antennas_lr: float = 1e-3
+    antennas_lr: float = 3e-4
     """Learning rate of the antennas' orientations and exponents."""
 
 

@@ -6,10 +6,11 @@ every path. Leading axes are free.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, squared_magnitude
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, normalise, pas_directions, squared_magnitude, steering_vector
 
 
 class Arrivals(NamedTuple):
@@ -23,6 +24,8 @@ class Arrivals(NamedTuple):
     """Length of the whole path, metres."""
 
 
+FAINTEST = 1e-30
+"""Amplitude that stands for nothing; its square would vanish in single precision."""
 SMALLEST = 1e-30
 """Power that stands for nothing, so that decibels stay finite."""
 NOT_HEARD_DB = -250.0
@@ -76,3 +79,16 @@ def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements
     norms = [jnp.sqrt(jnp.sum(squared_magnitude(v), -1, keepdims=True)) for v in (a, b)]
     unit_a, unit_b = (v / jnp.where(norm > 0, norm, 1) for v, norm in zip((a, b), norms, strict=True))
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
+
+
+def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
+    """Returns the spectrum, maximum 1, that an array sees of one transmitter's paths if their powers are added instead of their
+    amplitudes. Element positions are in wavelengths."""
+    steering = steering_vector(elements, arrivals.direction)
+    strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))
+    power = squared_magnitude(arrivals.amplitude / jnp.maximum(strongest, FAINTEST))
+    weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
+    covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)  # sum of power times a a^H
+    grid = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
+    beams = jnp.einsum("hwe,ef,hwf->hw", grid.conj(), covariance, grid, precision=EXACT)
+    return normalise(jnp.sqrt(jnp.maximum(beams.real, 1e-12)))
