@@ -17,6 +17,7 @@ from wbgs_jax.data.sight import in_sight
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.power import power_figures
 from wbgs_jax.evaluation.score import evaluate, held_out, score_snapshots, watch
 from wbgs_jax.fields import Observation
@@ -88,14 +89,14 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
     seen = observe_links(knowing.field, knowing.params, dataset, dataset.test)
     np.testing.assert_array_equal(predicted, seen.pas)
     truth, frequencies = np.asarray(dataset.pas(dataset.test)), dataset.frequencies_hz[dataset.test]
-    sight = in_sight(dataset, dataset.test)
-    for key, value in metrics.score(predicted, truth, frequencies, sight).items():
+    known = truth, frequencies, in_sight(dataset, dataset.test), plane_normal(np.asarray(dataset.receiver().element_positions))
+    for key, value in metrics.score(predicted, *known).items():
         assert report[key] == value
     for key, value in score_snapshots(seen.snapshots, dataset.snapshots[dataset.test]).items():
         assert report[key] == value
     assert report["power"] == power_figures(seen.power_db, dataset, dataset.test)
     assert report["baselines"].keys() == baselines(dataset).keys()
-    nearest = metrics.score(baselines(dataset)["nearest_tx"](dataset.test), truth, frequencies, sight)
+    nearest = metrics.score(baselines(dataset)["nearest_tx"](dataset.test), *known)
     assert report["baselines"]["nearest_tx"] == nearest
     assert report["ms_per_pas"] > 0 and report["ms_per_pas_single"] > 0
     json.dumps(report, allow_nan=False)

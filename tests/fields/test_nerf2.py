@@ -27,7 +27,7 @@ RECEIVER = make_receiver([0.3, -0.2, 1.0], [0.9, 0.1, -0.3, 0.2])
 CONFIG = dataclasses.replace(FIELDS["nerf2"], samples=3, directions=40, depth=3)
 SETTINGS = tiny_settings(
     "nerf2",
-    field=vars(CONFIG) | {"network_lr": 1e-2},
+    field=vars(CONFIG) | {"network_lr": 1e-2, "network_optimizer": "adam"},
     optim={"steps": 60},
     loop={"epoch_steps": 20, "evaluate_every": 60},
 )
