@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from experiments.jobs import Job
-from experiments.series import choices, curve, frequency, paper_form, rates, rooms, schedules, tuning, wave_choices
+from experiments.series import choices, curve, frequency, paper_form, rates, robustness, rooms, schedules, tuning, wave_choices
 from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
@@ -25,6 +25,7 @@ SERIES: dict[str, ModuleType] = {
     "rates": rates,
     "curve": curve,
     "rooms": rooms,
+    "robustness": robustness,
     "schedules": schedules,
     "frequency": frequency,
     "paper_form": paper_form,

@@ -118,6 +118,7 @@ _NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
 _NO_SEARCH: Changes = {"search": {"rounds": 0}}
+_AS_IT_IS: Changes = {"search": {"geometry_steps": 0}}
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
@@ -134,10 +135,18 @@ COHERENT = {
     "untrained": Variant({"field": _UNTRAINED, **_NO_SEARCH}),
     "no_snapshot_loss": _of_field(correlation_weight=0.0, power_weight=0.0),
     "more_candidates": _of_field(diffracted_tried=4096, diffracted_kept=512, mirror_areas=(0.0, 0.02, 0.3)),
-    "mesh_moved_3mm": Variant(displacement=0.003),
-    "mesh_moved_3cm": Variant(displacement=0.03),
-    "mesh_moved_1m": Variant(displacement=1.0),
+    "mesh_moved_3mm": Variant(_AS_IT_IS, displacement=0.003),
+    "mesh_moved_3cm": Variant(_AS_IT_IS, displacement=0.03),
+    "mesh_moved_1m": Variant(_AS_IT_IS, displacement=1.0),
 }
+MESHES = {
+    "mesh_moved_1cm": Variant(_AS_IT_IS, displacement=0.01),
+    **{
+        f"mesh_put_right_{name}": Variant(displacement=metres)
+        for name, metres in {"3mm": 0.003, "1cm": 0.01, "3cm": 0.03}.items()
+    },
+}
+"""Meshes whose bodies and walls all stand in a wrong place, with and without moving them back."""
 VARIANTS: dict[str, Variant] = {
     **TABLES,
     **GAUSSIANS_AND_NETWORKS,
@@ -148,4 +157,5 @@ VARIANTS: dict[str, Variant] = {
     **POOLED,
     **VOLUME,
     **COHERENT,
+    **MESHES,
 }

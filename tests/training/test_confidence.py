@@ -65,9 +65,16 @@ def test_a_transmitter_is_not_judged_by_itself(rng):
     assert np.isfinite(left_out(known, error, np.zeros(len(tx), int))).all()
 
 
-def test_few_scores_give_the_widest_interval():
-    rest = np.array([0.3, -1.0, 2.0])
-    np.testing.assert_array_equal(interval(rest), [-1.0, 2.0])
+def test_few_scores_give_a_wide_interval(rng):
+    """And no narrower one than what was seen, or than Student's t says: nine of ten further ones lie in it."""
+    low, high = interval(np.array([0.3, -1.0, 2.0]))
+    assert low < -1 and high > 2
+    held = []
+    for _ in range(400):
+        *rest, new = rng.normal(size=9)
+        low, high = interval(np.array(rest))
+        held.append(low <= new <= high)
+    assert 0.85 < np.mean(held) < 0.96
     many = np.arange(199.0)
     np.testing.assert_array_equal(interval(many), [9, 189])
 

@@ -45,7 +45,8 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
-    if confidence := for_receiver(trained.confidence, dataset.receiver()):
+    confidence = for_receiver(trained.confidence, dataset.receiver())
+    if confidence and part == "test":  # it has been learned from the validation part
         expected = expect_many(confidence, np.asarray(seen.pas), dataset.tx_positions[index], dataset.frequencies_hz[index])
         report["confidence"] = calibration(expected, metrics.ssim(np.asarray(seen.pas), known[0]))
     report |= time_queries(trained, dataset)

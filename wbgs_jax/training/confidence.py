@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.stats import t as student_t
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.metrics import ssim
@@ -20,6 +21,8 @@ from wbgs_jax.inference.predictor import predict_spectra
 
 FEWEST, MOST = 8, 300
 """Validation spectra below which nothing is said; those that are looked at, at most."""
+FEW = 20
+"""Rests below which their own quantiles do not reach `LEVEL`."""
 SETS = (0, 1, 3, 5)
 """Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency."""
 RIDGE = 1.0
@@ -85,9 +88,16 @@ def left_out(
 
 
 def interval(rest: Float[np.ndarray, "n"]) -> Float[np.ndarray, "2"]:
-    """Returns the ends between which `LEVEL` of further rests lie, with the correction for the number of those seen."""
+    """Returns the ends between which `LEVEL` of further rests lie, with the correction for the number of those seen.
+
+    A few cannot have such quantiles: there it is the interval of Student's t, no narrower than what was seen.
+    """
     n, tail = len(rest), round((1 - LEVEL) / 2, 9)  # binary fractions would lose a place
     ordered = np.sort(rest)
     low = max(int(np.floor(tail * (n + 1))) - 1, 0)
     high = min(int(np.ceil((1 - tail) * (n + 1))) - 1, n - 1)
-    return ordered[[low, high]]
+    ends = ordered[[low, high]]
+    if n >= FEW:
+        return ends
+    spread = rest.std(ddof=1) * np.sqrt(1 + 1 / n) * student_t.ppf(1 - tail, n - 1)
+    return np.array([min(ends[0], rest.mean() - spread), max(ends[1], rest.mean() + spread)])
