@@ -43,7 +43,7 @@ class Command:
     field: str = dataclasses.field(default_factory=default_field)
     """The model."""
     preset: str = "cpu"
-    """smoke (less than a minute), cpu (the default without a GPU), gpu, or paper (of the wideband field: the paper's form)."""
+    """smoke (about a minute), cpu (the default without a GPU), gpu, or paper (of the wideband field: the paper's form)."""
     seed: int = 0
     """Seed of everything that is drawn at random."""
     resume: bool = False

@@ -60,9 +60,17 @@ class WaveConfig:
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """There are a few numbers a material to learn, no networks."""
 SEARCH = {
-    "smoke": SearchConfig(rounds=1, spectra=96, antenna_rounds=1, antenna_spectra=48),
+    "smoke": SearchConfig(rounds=0, antenna_rounds=0, geometry_steps=0),
     "cpu": SearchConfig(),
     "gpu": SearchConfig(),
+}
+
+
+CONFIGS = {
+    # Few candidates, of large facets alone.
+    "smoke": WaveConfig(mirror_areas=(0.05, 1.0), specular_tried=96, specular_kept=24, diffracted_tried=32, diffracted_kept=8),
+    "cpu": WaveConfig(),
+    "gpu": WaveConfig(),
 }
 
 
@@ -70,7 +78,7 @@ def _preset(name: str) -> Settings:
     common, steps = COMMON[name], STEPS[name]
     optim = dataclasses.replace(common.optim, steps=steps, min_steps=steps // 2, batch=8)
     loop = dataclasses.replace(common.loop, evaluate_every=min(common.loop.evaluate_every, steps // 2))
-    return Settings(WaveConfig(), optim, loop, search=SEARCH[name])
+    return Settings(CONFIGS[name], optim, loop, search=SEARCH[name])
 
 
 PRESETS = {name: _preset(name) for name in COMMON}
