@@ -6,18 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box, mesh_of, room
-from synthetic import tiny_scene, tiny_settings
+from synthetic import FREQUENCIES_HZ, tiny_settings
+from wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.data import scene_dataset
-from wbgs_jax.fields import wave
 from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
-from wbgs_jax.training.antennas import antenna_candidates, search_antennas, surely_better
-from wbgs_jax.training.loop import Run
-from wbgs_jax.training.scores import make_scores
+from wbgs_jax.training.antennas import antenna_candidates, search_antennas
+from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX = 30
-PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
@@ -27,25 +23,7 @@ SETTINGS = tiny_settings(
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
-    """A run before its first step: the paths of all transmitters, and snapshots that mean nothing."""
-    mesh = mesh_of(*PARTS)
-    scene = dataclasses.replace(
-        tiny_scene(N_TX),
-        snapshots=np.ones((N_TX, 1, 3, 16), np.complex64),
-        tx_positions=np.random.default_rng(3).uniform([0.3, 0.3, 0.3], [5.7, 3.7, 2.7], (N_TX, 3)),
-        rx_position=np.array([[1.0, 1.0, 1.2]]),
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-        face_part=np.asarray(mesh.part),
-        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": 0.05} for i in range(len(PARTS))]},
-    )
-    return Run(scene_dataset(scene), "wave", SETTINGS, 0, tmp_path_factory.mktemp("untrained"))
-
-
-@jax.jit
-def snapshots(params, plan, cache, links):
-    paths = jax.tree.map(lambda leaf: leaf[links.tx_index], cache.paths)
-    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+    return run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("untrained"), places(N_TX), FREQUENCIES_HZ)
 
 
 def searched(run, known_elements=False, **antennas):
@@ -93,10 +71,18 @@ def test_the_candidates_are_what_they_are_called():
 
 
 def test_what_is_sure_counts_transmitters_and_not_spectra(rng):
-    tx = np.repeat(np.arange(4), 100)
-    gain = np.repeat([1.0, -0.5, 1.0, -0.5], 100) + 0.01 * rng.normal(size=400)
-    assert not surely_better(gain, tx, 1.0)
-    assert surely_better(np.ones(400), tx, 4.0) and not surely_better(np.ones(100), tx[:100], 0.0)
+    tx = np.repeat(np.arange(20), 20)
+    in_turn = np.repeat(np.tile([1.0, -0.5], 10), 20) + 0.01 * rng.normal(size=400)
+    assert not surely_better(in_turn, tx, 3.0)
+    assert surely_better(np.ones(400), tx, 3.0) and not surely_better(np.ones(180), tx[:180], 3.0)
+
+
+def test_a_large_gain_among_gains_is_no_reason_for_doubt(rng):
+    gains = np.append(rng.uniform(0.01, 0.3, 19), 4.0)
+    assert surely_better(gains, np.arange(20), 3.0)
+    assert not surely_better(-gains, np.arange(20), 0.0)
+    chosen_by_chance = sum(surely_better(rng.standard_t(2, 12), np.arange(12), 2.0) for _ in range(200))
+    assert chosen_by_chance < 20  # 4.6 are expected, standard deviation 2.1
 
 
 def test_an_antenna_of_any_length_of_quaternion_is_the_same(rng):

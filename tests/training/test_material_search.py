@@ -7,19 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box, mesh_of, room
-from synthetic import tiny_scene, tiny_settings
+from synthetic import tiny_settings
+from wave_runs import PARTS, THICKNESS, places, run_in, snapshots
 
 from wbgs_jax.config import changed
-from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search as search_module
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import ITU_MATERIALS
 
-RX, FREQUENCIES = (1.0, 1.0, 1.2), np.array([1e9, 94e9])
-PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
-N_TX, THICKNESS = 40, 0.05
+FREQUENCIES = np.array([1e9, 94e9])
+N_TX = 40
 SETTINGS = tiny_settings(
     "wave",
     field={
@@ -37,26 +35,7 @@ SETTINGS = tiny_settings(
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
-    """A run before its first step: the paths of all transmitters, and snapshots that mean nothing."""
-    mesh = mesh_of(*PARTS)
-    scene = dataclasses.replace(
-        tiny_scene(N_TX),
-        snapshots=np.ones((N_TX, 1, 2, 16), np.complex64),
-        tx_positions=np.random.default_rng(3).uniform([0.3, 0.3, 0.3], [5.7, 3.7, 2.7], (N_TX, 3)),
-        frequencies_hz=FREQUENCIES,
-        rx_position=np.array([RX]),
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-        face_part=np.asarray(mesh.part),
-        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": THICKNESS} for i in range(len(PARTS))]},
-    )
-    return Run(scene_dataset(scene), "wave", SETTINGS, 0, tmp_path_factory.mktemp("untrained"))
-
-
-@jax.jit
-def snapshots(params, plan, cache, links):
-    paths = jax.tree.map(lambda leaf: leaf[links.tx_index], cache.paths)
-    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+    return run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("untrained"), places(N_TX), FREQUENCIES)
 
 
 @pytest.fixture

@@ -7,19 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box, mesh_of, room
-from synthetic import tiny_scene, tiny_settings
+from synthetic import tiny_settings
+from wave_runs import PARTS, places, run_in
 
-from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
 from wbgs_jax.training.geometry import GeometryReport, Place, is_doubtful, learn_geometry
-from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import ITU_MATERIALS
+from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
-PLACES = np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3))
-PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
+PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
@@ -27,27 +25,10 @@ SETTINGS = tiny_settings(
 )
 
 
-def run_in(parts, folder, snapshots):
-    mesh = mesh_of(*parts)
-    scene = dataclasses.replace(
-        tiny_scene(N_TX),
-        snapshots=snapshots,
-        frequencies_hz=FREQUENCIES,
-        tx_positions=PLACES,
-        rx_position=np.array([[1.0, 1.0, 1.2]]),
-        vertices=np.asarray(mesh.vertices),
-        faces=np.asarray(mesh.faces),
-        face_part=np.asarray(mesh.part),
-        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": 0.05} for i in range(len(parts))]},
-    )
-    return Run(scene_dataset(scene), "wave", SETTINGS, 0, folder)
-
-
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     """Snapshots of a room of concrete, in all places."""
-    run = run_in(PARTS, tmp_path_factory.mktemp("true"), np.ones((N_TX, 1, len(FREQUENCIES), 16), np.complex64))
-    field = run.field
+    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("true"), PLACES, FREQUENCIES)
     permittivity, c, d = ITU_MATERIALS["concrete"]
     materials = dataclasses.replace(
         run.state.params.materials,
@@ -56,21 +37,14 @@ def truth(tmp_path_factory):
         slope=jnp.full(len(PARTS), d),
     )
     params = dataclasses.replace(run.state.params, materials=materials)
-    field = run.field
-    scene = run_in(PARTS, run.folder, np.ones((N_TX, 1, len(FREQUENCIES), 16), np.complex64)).dataset
-    everywhere = np.random.default_rng(3).uniform([0.4, 0.4, 0.4], [5.6, 3.6, 2.6], (N_TX, 3))
-    plan = field.plan(params, scene.receiver())
-    query = wave.Query(
-        jnp.asarray(np.repeat(everywhere, len(FREQUENCIES), 0), jnp.float32),
-        jnp.asarray(np.tile(FREQUENCIES, N_TX), jnp.float32),
-    )
-    heard = jax.jit(wave.snapshots)(params, plan, query)
+    query = make_query(np.repeat(PLACES, len(FREQUENCIES), 0), np.tile(FREQUENCIES, N_TX))
+    heard = jax.jit(wave.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
     return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16), params
 
 
 def learned(truth, parts, folder):
     snapshots, params = truth
-    run = run_in(parts, folder, snapshots)
+    run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots)
     place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
 
@@ -107,7 +81,7 @@ def test_right_surfaces_stay(truth, tmp_path):
 
 
 def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
-    run = run_in(PARTS, tmp_path, truth[0])
+    run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0])
     moved = run.field.moved(np.full((len(PARTS), 3), 1e-3))
     report = GeometryReport(-1.0, -2.0, True, 1.0, 1.0)
     monkeypatch.setattr(search, "is_doubtful", lambda *_: True)

@@ -57,11 +57,20 @@ def score(
     Raises:
         UserError: there is no spectrum, or a prediction contains NaN or infinity.
     """
+    return summarise(figures(predicted, truth, array_normal), frequencies_hz, sight)
+
+
+def figures(
+    predicted: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    array_normal: Float[np.ndarray, "3"] | None = None,
+) -> dict[str, Float[np.ndarray, "n"]]:
+    """Returns what `score` reports of every spectrum by itself; raises what it raises."""
     if len(predicted) == 0:
         raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
     if broken := sum(not np.isfinite(p).all() for p in predicted):
         raise UserError(f"{broken} of {len(predicted)} predicted spectra contain NaN or infinity; the model diverged")
-    values = {
+    return {
         "ssim": ssim(predicted, truth),
         "psnr_db": psnr_db(predicted, truth),
         "mae": mae(predicted, truth),
@@ -70,6 +79,14 @@ def score(
         "beam_loss_top3_db": beam_loss_db(predicted, truth, 3),
     }
 
+
+def summarise(
+    values: dict[str, Float[np.ndarray, "n"]],
+    frequencies_hz: Float[np.ndarray, "n"],
+    sight: Bool[np.ndarray, "n"] | None = None,
+) -> dict[str, Any]:
+    """Returns the report of `score` from the figures of all spectra."""
+
     def part(chosen: Bool[np.ndarray, "n"]) -> dict[str, Any]:
         return _summary({name: value[chosen] for name, value in values.items()})
 
@@ -77,7 +94,7 @@ def score(
     if sight is not None:
         report |= {name: part(where) for name, where in (("in_sight", sight), ("out_of_sight", ~sight)) if where.any()}
     by_frequency = ((f, part(frequencies_hz == f)) for f in np.unique(frequencies_hz))
-    return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | figures for f, figures in by_frequency]}
+    return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | summary for f, summary in by_frequency]}
 
 
 def _summary(values: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -39,19 +39,20 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     power = None if said is None else power_figures(said, dataset, index)
     if dataset.kind == "power":
         return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
+    truth, known = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
-    known = np.asarray(dataset.pas(index)), dataset.frequencies_hz[index], in_sight(dataset, index), normal
-    report |= metrics.score(np.asarray(seen.pas), *known)
+    figures = metrics.figures(np.asarray(seen.pas), truth, normal)
+    report |= metrics.summarise(figures, *known)
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
     confidence = for_receiver(trained.confidence, dataset.receiver())
     if confidence and part == "test":  # it has been learned from the validation part
         expected = expect_many(confidence, np.asarray(seen.pas), dataset.tx_positions[index], dataset.frequencies_hz[index])
-        report["confidence"] = calibration(expected, metrics.ssim(np.asarray(seen.pas), known[0]))
+        report["confidence"] = calibration(expected, figures["ssim"])
     report |= time_queries(trained, dataset)
     report["baselines"] = {
-        name: metrics.score(np.asarray(predict(index)), *known) for name, predict in baselines(dataset).items()
+        name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in baselines(dataset).items()
     }
     return report, np.asarray(seen.pas)
 

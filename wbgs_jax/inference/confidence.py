@@ -6,18 +6,15 @@ Which features help is found on the validation part, and the interval's ends are
 conformal prediction, Lei et al. 2018): it holds what it promises where transmitters are drawn as those were, not elsewhere.
 """
 
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.types import Query
 
@@ -97,25 +94,9 @@ _expected = jax.jit(expected_ssim)
 
 def write_confidence(folder: Path, confidence: Confidence | None) -> None:
     """Leaves it in a run folder, or nothing."""
-    if confidence is None:
-        (folder / FILE).unlink(missing_ok=True)
-        return
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(confidence).items()}
-    with atomic_write(folder / FILE) as stream:
-        np.savez_compressed(stream, **arrays)
+    write_tree(folder / FILE, confidence)
 
 
 def read_confidence(folder: Path) -> Confidence | None:
-    """Returns that of a run folder; None if it has none.
-
-    Raises:
-        UserError: the file is damaged.
-    """
-    path = folder / FILE
-    if not path.exists():
-        return None
-    try:
-        with np.load(path) as archive:
-            return Confidence(**{name: jnp.asarray(value, jnp.float32) for name, value in archive.items()})
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged ({error}); remove it to do without, or train again") from error
+    """Returns that of a run folder; None if it has none. A damaged file is a `UserError`."""
+    return read_tree(folder / FILE, Confidence, "do without")

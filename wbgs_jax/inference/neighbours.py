@@ -9,8 +9,7 @@ where the field has learned them by heart and their residuals are zero. Which, h
 validation part (training/neighbours.py), nothing at all included.
 """
 
-import zipfile
-import zlib
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.types import Query, Receiver
@@ -86,27 +84,10 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
 
 def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:
     """Leaves them in a run folder, or nothing; images in half precision."""
-    if neighbours is None:
-        (folder / FILE).unlink(missing_ok=True)
-        return
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(neighbours).items()}
-    arrays["images"] = arrays["images"].astype(np.float16)
-    with atomic_write(folder / FILE) as stream:
-        np.savez_compressed(stream, **arrays)
+    half = neighbours and dataclasses.replace(neighbours, images=neighbours.images.astype(jnp.float16))
+    write_tree(folder / FILE, half)
 
 
 def read_neighbours(folder: Path) -> Neighbours | None:
-    """Returns those of a run folder; None if it has none.
-
-    Raises:
-        UserError: the file is damaged.
-    """
-    path = folder / FILE
-    if not path.exists():
-        return None
-    try:
-        with np.load(path) as archive:
-            arrays = {name: jnp.asarray(value, jnp.float32) for name, value in archive.items()}
-        return Neighbours(**arrays)
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged ({error}); remove it to ask the field alone, or train again") from error
+    """Returns those of a run folder; None if it has none. A damaged file is a `UserError`."""
+    return read_tree(folder / FILE, Neighbours, "ask the field alone")

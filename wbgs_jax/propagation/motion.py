@@ -12,16 +12,13 @@ from jaxtyping import Array, Float
 
 from wbgs_jax.propagation.image_method import Search
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, Paths
-
-SHORTEST = 1e-9
-"""Metres: legs that are shorter fill the places of reflections that a path does not have."""
+from wbgs_jax.propagation.transport import legs_of
 
 
 def length_changes(paths: Paths, search: Search, motion: Float[Array, "m 3"]) -> Float[Array, "k"]:
     """Returns by how much the K paths of one transmitter grow (metres) if every mover of the facets moves by so much."""
-    legs = paths.points[:, 1:] - paths.points[:, :-1]
-    direction = legs / jnp.maximum(jnp.linalg.norm(legs, axis=-1, keepdims=True), SHORTEST)
-    path, leg = jnp.arange(len(legs))[:, None], jnp.minimum(paths.interaction_leg, legs.shape[1] - 2)
+    direction = legs_of(paths).direction
+    path, leg = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_leg, direction.shape[1] - 2)
     turn = direction[path, leg] - direction[path, leg + 1]
     reflects, diffracts = paths.interaction_type == REFLECTED, paths.interaction_type == DIFFRACTED
     number = paths.interaction_facet

@@ -29,7 +29,7 @@ SOMEWHERE = np.arange(5)[:, None] * np.array([0.3, 0.5, 0.7])
 """Points (metres) of what is no path, on a line that no edge or normal is along."""
 
 
-class _Legs(NamedTuple):
+class Legs(NamedTuple):
     """The straight pieces of K paths."""
 
     length: Float[Array, "k 4"]
@@ -81,7 +81,7 @@ def arrivals(
     # What is no path may have legs of no length, and their direction no derivative.
     somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
-    legs = _legs(paths)
+    legs = legs_of(paths)
     field = antenna_field(transmitter, legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
     active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
@@ -122,15 +122,15 @@ def _unit(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     return v / jnp.sqrt(jnp.maximum(_dot(v, v), 1e-12))[..., None]
 
 
-def _legs(paths: Paths) -> _Legs:
+def legs_of(paths: Paths) -> Legs:
     """Returns the legs of paths."""
     legs = paths.points[:, 1:] - paths.points[:, :-1]
     lengths = jnp.sqrt(jnp.maximum(_dot(legs, legs), SHORTEST**2))
-    return _Legs(lengths, legs / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
+    return Legs(lengths, legs / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
 
 
 def _slab_interactions(
-    paths: Paths, legs: _Legs, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""]
+    paths: Paths, legs: Legs, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""]
 ) -> _SlabInteractions:
     """Returns what the slabs of all paths do; nonsense where an interaction is none with a slab."""
     facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
@@ -173,7 +173,7 @@ def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[
 def _over_edges(
     field: Complex[Array, "k 3"],
     paths: Paths,
-    legs: _Legs,
+    legs: Legs,
     interactions: _SlabInteractions,
     active: Bool[Array, "k 5"],
     edges: Edges,

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.radio.patterns import PATTERN_EXPONENTS, Antenna
+from wbgs_jax.training.scores import surely_better
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 UP = ("+x", "+y", "+z")
@@ -79,9 +80,3 @@ def search_antennas(
         if settled == len(ends):  # the other end is what it was when this one was looked at
             break
     return params, AntennaReport(float(before.mean()), float(after.mean()), taken)
-
-
-def surely_better(gain: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"], errors: float) -> bool:
-    """Returns whether gains are positive by more than so many standard errors, transmitters being what was drawn."""
-    by_tx = np.array([gain[tx_index == tx].mean() for tx in np.unique(tx_index)])
-    return len(by_tx) > 1 and bool(by_tx.mean() > errors * by_tx.std(ddof=1) / np.sqrt(len(by_tx)))

@@ -19,12 +19,10 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.fields import Field
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.training.antennas import surely_better
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.materials import search_materials
-from wbgs_jax.training.scores import make_scores
+from wbgs_jax.training.scores import make_scores, surely_better
 from wbgs_jax.types import Links
 
 STEP = 0.012
@@ -43,7 +41,7 @@ DOUBT = 0.5
 KNOWN_BELOW_HZ = 2.5e9
 """Up to where materials are named before surfaces have been moved."""
 SURE = 3.0
-"""Standard errors over transmitters."""
+"""As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
 RATE = 5e-3
 """Of the materials and corrections that are learned beside."""
 
@@ -68,7 +66,8 @@ class GeometryReport:
 class Place:
     """A field whose surfaces stand somewhere, with the paths of some transmitters there."""
 
-    field: Field
+    field: Any
+    """A field whose surfaces can be `moved`."""
     params: Any
     cache: Any
 
@@ -92,7 +91,7 @@ def learn_geometry(
     some_tx = rng.permutation(np.unique(tx[train]))[: config.geometry_tx]
     own = train[np.isin(tx[train], some_tx)]
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
-    total = np.zeros((int(np.asarray(place.field.facets.mover).max()) + 1, 3))  # type: ignore[attr-defined]
+    total = np.zeros((int(np.asarray(place.field.facets.mover).max()) + 1, 3))
     now = _traced(place, place.field, links, data)
     now = _named(now, data, own[frequency[own] <= max(KNOWN_BELOW_HZ, frequency[own].min())], config, rng)
     traced_at = float(frequency[own].min())
@@ -135,17 +134,17 @@ def _commit(
     total: Float[np.ndarray, "m 3"],
     now: Place,
     motion: Float[Array, "m 3"],
-    original: Field,
+    original: Any,
     links: Links | None,
     data: TrainingData,
 ) -> tuple[Float[np.ndarray, "m 3"], Place, Float[Array, "m 3"]]:
     """Moves the surfaces by what has been learned, and traces paths again (of all transmitters without `links`)."""
     total = total + np.asarray(motion, np.float64)
-    field = original.moved(total)  # type: ignore[attr-defined]
+    field = original.moved(total)
     return total, _traced(now, field, data.links if links is None else links, data), jnp.zeros_like(motion)
 
 
-def _traced(now: Place, field: Field, links: Links, data: TrainingData) -> Place:
+def _traced(now: Place, field: Any, links: Links, data: TrainingData) -> Place:
     return Place(field, now.params, field.prepare(links, data.receivers))
 
 

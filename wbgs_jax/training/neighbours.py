@@ -20,6 +20,7 @@ from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
 from wbgs_jax.inference.neighbours import Neighbours, correct, nearness
 from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.training.scores import standard_error
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 1000
@@ -107,13 +108,6 @@ def choose(tried: dict[Choice, Float[np.ndarray, "n"]], tx_index: Int[np.ndarray
     enough = [choice for choice, gains in tried.items() if standard_error(gains, tx_index)[0] >= gain - error]
     smoothest = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", choice.length))
     return smoothest, standard_error(tried[smoothest], tx_index)[0]
-
-
-def standard_error(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> tuple[float, float]:
-    """Returns the mean gain and its standard error, transmitters being what was drawn."""
-    by_tx = np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])
-    error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
-    return float(by_tx.mean()), float(error)
 
 
 def make_neighbours(

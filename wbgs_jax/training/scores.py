@@ -1,4 +1,5 @@
-"""How badly candidates for a field's parameters explain some training spectra: what the searches before a training compare."""
+"""How badly candidates for a field's parameters explain some training spectra, and whether one is surely better: what the
+searches before a training, and the choices after it, compare."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.stats import norm, permutation_test
 
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation
@@ -38,3 +40,26 @@ def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectr
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
 
     return jax.lax.map(one, candidates)
+
+
+def standard_error(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> tuple[float, float]:
+    """Returns the mean gain and its standard error, transmitters being what was drawn."""
+    by_tx = _by_transmitter(gains, tx_index)
+    error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
+    return float(by_tx.mean()), float(error)
+
+
+def surely_better(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"], errors: float) -> bool:
+    """Returns whether the mean gain over transmitters is positive, as surely as so many standard errors of a normal mean say.
+
+    Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
+    t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
+    three errors.
+    """
+    by_tx = _by_transmitter(gains, tx_index)
+    chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue
+    return bool(chance <= norm.sf(errors))
+
+
+def _by_transmitter(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "k"]:
+    return np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])

@@ -46,7 +46,7 @@ class Search:
         the mesh is doubtful."""
         config, data = self.config, context.data
         spectra = rng.choice(context.train, min(config.spectra, len(context.train)), replace=False)
-        report, place = {}, Place(field, params, context.cache)
+        report = {}
         if config.antenna_rounds:
             some = spectra[: config.antenna_spectra]
             score = make_scores(field, context.cache, data, jnp.asarray(some, jnp.int32))
@@ -57,8 +57,9 @@ class Search:
             score = make_scores(field, context.cache, data, jnp.asarray(spectra, jnp.int32))
             params, named = search_materials(params, score, config)
             report["search"] = dataclasses.asdict(named)
-            place = dataclasses.replace(place, params=params)
-            if config.geometry_steps and is_doubtful(score([params])[0], np.asarray(data.links.query.frequency_hz)[spectra]):
-                place, found_at = learn_geometry(place, data, context.train, config, rng)
-                report["geometry"] = dataclasses.asdict(found_at)
-        return Edit(place.params, (), None, report, place.field, place.cache) if report else Edit(params, (), None, report)
+            frequency_hz = np.asarray(data.links.query.frequency_hz)[spectra]
+            if config.geometry_steps and is_doubtful(score([params])[0], frequency_hz):
+                place, moved = learn_geometry(Place(field, params, context.cache), data, context.train, config, rng)
+                report["geometry"] = dataclasses.asdict(moved)
+                return Edit(place.params, (), None, report, place.field, place.cache)
+        return Edit(params, (), None, report)

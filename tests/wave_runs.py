@@ -1,0 +1,47 @@
+"""What tests of the searches share: a run of the coherent field in a made-up room, before its first step."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from rooms import box, mesh_of, room
+from synthetic import tiny_scene
+
+from wbgs_jax.data import scene_dataset
+from wbgs_jax.fields import wave
+from wbgs_jax.training.loop import Run
+
+RX = (1.0, 1.0, 1.2)
+PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
+THICKNESS = 0.05
+
+
+def places(n_tx, margin=0.3):
+    """Transmitters in the room, so far from its walls."""
+    low = np.full(3, margin)
+    return np.random.default_rng(3).uniform(low, np.array([6.0, 4.0, 3.0]) - margin, (n_tx, 3))
+
+
+def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None) -> Run:
+    """The paths of all transmitters, and snapshots that mean nothing unless given (tx, 1, freq, 16)."""
+    mesh, n_tx = mesh_of(*parts), len(tx_positions)
+    nothing = np.ones((n_tx, 1, len(frequencies_hz), 16), np.complex64)
+    scene = dataclasses.replace(
+        tiny_scene(n_tx),
+        snapshots=nothing if snapshots is None else snapshots,
+        tx_positions=tx_positions,
+        frequencies_hz=frequencies_hz,
+        rx_position=np.array([RX]),
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+        face_part=np.asarray(mesh.part),
+        meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": THICKNESS} for i in range(len(parts))]},
+    )
+    return Run(scene_dataset(scene), "wave", settings, 0, folder)
+
+
+@jax.jit
+def snapshots(params, plan, cache, links):
+    """What the coherent field says of links whose paths are prepared."""
+    paths = jax.tree.map(lambda leaf: leaf[links.tx_index], cache.paths)
+    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)

@@ -1,0 +1,40 @@
+"""A pytree of arrays as one file of a run folder: a compressed .npz, written whole or not at all."""
+
+import dataclasses
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
+
+T = TypeVar("T")
+
+
+def write_tree(path: Path, tree: Any) -> None:
+    """Writes the arrays of a pytree by the names of its fields; None removes the file."""
+    if tree is None:
+        path.unlink(missing_ok=True)
+        return
+    arrays: dict[str, Any] = {f.name: np.asarray(getattr(tree, f.name)) for f in dataclasses.fields(tree)}
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def read_tree(path: Path, cls: type[T], without: str) -> T | None:
+    """Returns the pytree of a file, float32 whatever was written; None if there is no file.
+
+    Raises:
+        UserError: the file is damaged; `without` says what removing it means.
+    """
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as archive:
+            return cls(**{name: jnp.asarray(value, jnp.float32) for name, value in archive.items()})
+    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{path} is damaged ({error}); remove it to {without}, or train again") from error
