@@ -19,6 +19,8 @@ from jaxtyping import Array, Key
 from wbgs_jax._util.errors import UserError
 
 FIELD, EMPTY = "field", "empty"
+STATE = "state"
+"""Folder of the arrays in a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def read(folder: Path, step: int) -> Saved:
 
     path = folder / str(step)
     with _explained(path), _quiet():
+        _read_every_value(path / STATE)
         metadata = ocp.metadata(path.absolute()).custom_metadata
         if not metadata:  # Orbax gives None for a file that it cannot read
             raise ValueError("no metadata")
@@ -122,6 +125,16 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)
+
+
+def _read_every_value(folder: Path) -> None:
+    """Raises an error for a value that cannot be read, one after another: Orbax reads all at once and stops at the first that
+    fails, and the others go on to complain on stderr, in threads of their own."""
+    import tensorstore  # of Orbax
+
+    values = tensorstore.KvStore.open({"driver": "ocdbt", "base": folder.absolute().as_uri() + "/"}).result()
+    for key in values.list().result():
+        values.read(key).result()
 
 
 @contextlib.contextmanager
