@@ -7,11 +7,12 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
@@ -21,6 +22,9 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.radio.channel import correlation
+
+if TYPE_CHECKING:
+    from data_gen.solve import Simulator
 
 TX_SEED = 0
 
@@ -64,23 +68,30 @@ def convergence(options: Options) -> list[str]:
     snapshots, costs = [], []
     for effort in options.effort:
         simulator = Simulator(spec, settings(effort, options.diffraction, options.depth))
-        size = simulator.settings.tx_per_call
-        simulator.paths(tx[:size], frequencies)  # compiles
+        simulator.paths(tx[: simulator.settings.tx_per_call], frequencies)  # compiles
         start = time.perf_counter()
-        solved = [simulator.paths(tx[i : i + size], frequencies) for i in range(0, len(tx), size)]
+        snapshots.append(traced(simulator, tx, frequencies))
         costs.append((time.perf_counter() - start) / len(tx))
-        snapshots.append(np.concatenate([np.array([[p.snapshot() for p in row] for row in one]) for one in solved], 1))
     return _lines(options, snapshots, costs)
+
+
+def traced(
+    simulator: "Simulator", tx: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]
+) -> Complex[np.ndarray, "freq tx elements"]:
+    """Returns the snapshots of transmitters, as many at once as the settings say."""
+    size = simulator.settings.tx_per_call
+    solved = [simulator.paths(tx[i : i + size], frequencies_hz) for i in range(0, len(tx), size)]
+    return np.concatenate([np.array([[p.snapshot() for p in row] for row in one]) for one in solved], 1)
 
 
 def _lines(options: Options, snapshots: Sequence[Complex[np.ndarray, "freq tx elements"]], costs: Sequence[float]) -> list[str]:
     elements = jnp.asarray(ArraySettings().element_positions())
     lines = []
     for i, ghz in enumerate(options.frequencies):
-        best = _scaled(snapshots[-1][i])
+        best = scaled(snapshots[-1][i])
         truth = np.asarray(snapshot_to_pas(best, elements))
         for effort, cost, by_frequency in zip(options.effort, costs, snapshots, strict=True):
-            snapshot = _scaled(by_frequency[i])
+            snapshot = scaled(by_frequency[i])
             same = np.asarray(correlation(snapshot, best))
             score = ssim(np.asarray(snapshot_to_pas(snapshot, elements)), truth)
             cells = (f"{options.scene} | {ghz:g} | {effort:g}", *(f"{v:.3f}" for v in (np.median(same), same.min())),
@@ -89,7 +100,7 @@ def _lines(options: Options, snapshots: Sequence[Complex[np.ndarray, "freq tx el
     return lines
 
 
-def _scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
+def scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
     """Returns snapshots with a maximum of 1: what is compared has no scale, and squares of weak ones stay normal numbers."""
     peak = np.abs(snapshots).max(-1, keepdims=True)
     return jnp.asarray(snapshots / np.where(peak > 0, peak, 1), jnp.complex64)

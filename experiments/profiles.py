@@ -76,6 +76,14 @@ PROFILES = {
     "frequency": Profile("cpu", 1000, 600, fields={"wideband": BY_ADAM}, validation=True),
     # What an hour on one core allows of the preset `paper`, Gaussians and steps.
     "paper_form": Profile("paper", 30_000, 4000, {"density": {"max_gaussians": 4000}}, {"wideband": {"gaussians": 3000}}),
+    "to_ours": Profile(
+        "paper",
+        8000,
+        4000,
+        changes=QUICK["changes"] | {"density": {"max_gaussians": 3000}},
+        fields={"wideband": GAUSSIANS},
+        validation=True,
+    ),
     "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
     "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
 }

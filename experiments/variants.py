@@ -1,6 +1,6 @@
 """Named changes of a job's settings: those of the tables, and those that the series try one at a time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from experiments.profiles import Changes
@@ -147,6 +147,37 @@ MESHES = {
     },
 }
 """Meshes whose bodies and walls all stand in a wrong place, with and without moving them back."""
+_STEPS_TO_OURS: dict[str, Changes] = {
+    "batch_of_8": {"optim": {"batch": 8}, "field": {"network_lr": 4e-3}},
+    "small_networks": {"field": {"width": 64, "depth": 4, "skip": 2, "fusion": 1, "radiance_widths": (32,)}},
+    "relative_inputs": {"field": {"relative": True, "gaussian_octaves": 6, "tx_octaves": 4}},
+    "log_frequency": {"field": {"frequency_scale": "log", "frequency_octaves": 0}},
+    "own_features": {"field": {"features": 16}},
+    "moving_gaussians": {
+        "field": {"means_lr": 1e-3},
+        "density": {
+            "every": 100, "start": 100, "stop_fraction": 0.5, "gradient_threshold": 8e-4, "split_scale": 0.3, "reset_every": 0,
+        },
+    },
+    "muon": {
+        "field": {"network_optimizer": "muon", "network_lr": 1e-2, "network_weight_decay": 0.0},
+        "optim": {"final_fraction": 0.01},
+    },
+    "our_loss": {"field": {"ssim_stride": 2, "power_weight": 0.01}},
+}  # fmt: skip
+"""From the paper's form to ours: what is changed, one after the other."""
+
+
+def _together(all_changes: Sequence[Changes]) -> Changes:
+    sections = dict.fromkeys(section for changes in all_changes for section in changes)
+    return {name: {k: v for changes in all_changes for k, v in changes.get(name, {}).items()} for name in sections}
+
+
+TO_OURS = {
+    f"to_{name}": Variant(_together(list(_STEPS_TO_OURS.values())[: i + 1]), steps=1000)
+    for i, name in enumerate(_STEPS_TO_OURS)
+}
+"""Each with all changes before it, and as many spectra as the paper's form saw one at a time."""
 VARIANTS: dict[str, Variant] = {
     **TABLES,
     **GAUSSIANS_AND_NETWORKS,
@@ -158,4 +189,5 @@ VARIANTS: dict[str, Variant] = {
     **VOLUME,
     **COHERENT,
     **MESHES,
+    **TO_OURS,
 }

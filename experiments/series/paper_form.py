@@ -1,11 +1,21 @@
-"""The paper's own form (preset `paper`), as whole as an hour on one core allows."""
+"""The paper's own form (preset `paper`): as whole as an hour on one core allows, and change by change on the way to ours."""
 
 from experiments.jobs import Job
 from experiments.results import Results
 from experiments.series.series import Series, jobs_of_all, render_all
+from experiments.variants import TO_OURS
 
 TITLE = "The paper's form"
-SERIES = (Series("As many Gaussians and steps as an hour allows", "wideband", ("",), "paper_form"),)
+SERIES = (
+    Series("As many Gaussians and steps as an hour allows", "wideband", ("",), "paper_form"),
+    Series(
+        "From the paper's form to ours, every row with all changes above it: equally many spectra, scores of validation",
+        "wideband",
+        ("", *TO_OURS),
+        "to_ours",
+        scenes=("4",),
+    ),
+)
 
 
 def jobs() -> list[Job]:

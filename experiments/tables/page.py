@@ -42,6 +42,7 @@ published and the data here are others: compare orders and ratios, not single va
 * **NeRF2-style**: a volume marched along rays, with the frequency as an input; rebuilt here too.
 * **Predictors that learn nothing**, and the **phase-blind ceiling**: the mean spectrum over random phases of all true paths,
   about the best that can be said without phases; measured on 50 transmitters of each scene ([dataset card](dataset.md)).
+* **Truth against itself**: 40 transmitters of each scene, traced again with three times the rays. No score says more than that.
 
 Effort (profile `{name}`): {effort}.
 Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over

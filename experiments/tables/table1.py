@@ -7,6 +7,7 @@ from experiments.markdown import markdown
 from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
 from experiments.results import Results
 from experiments.tables.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells
+from wbgs_jax.data.repeatability import repeatability
 
 TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"
 MODELS = (
@@ -41,7 +42,7 @@ def render(results: Results, images: Path) -> str:
 
 
 def scene_table(results: Results, scene: str) -> str:
-    """One scene: a row a model, the ceiling below."""
+    """One scene: a row a model, the ceiling below, and how well the truth repeats itself."""
     rows = []
     for field, variant in MODELS:
         jobs, paper = jobs_of(scene, field, variant), None if variant else TABLE_1[scene].get(field)
@@ -52,4 +53,6 @@ def scene_table(results: Results, scene: str) -> str:
         rows.append([NAMES[field, variant], *each, *average])
     best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])
+    truth = [cell(repeatability(f"scene{scene}", ghz)) for ghz in (*([f] for f in GHZ_10), GHZ_10)]
+    rows.append(["truth against itself", *truth, "", ""])
     return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)

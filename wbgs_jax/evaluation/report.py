@@ -126,6 +126,8 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
             f"strongest direction: {report['angle_error_deg']:.1f} degrees off (median); best predicted beam: "
             f"{report['beam_loss_db']:.2f} dB lost, best of three {report['beam_loss_top3_db']:.2f} dB (means)"
         )
+    if (same := report.get("truth_repeats")) is not None:
+        lines.append(f"truth against itself, traced with more rays: {same:.3f} (median): no score says more than that")
     if "snapshot_correlation" in report:
         alike, error = report["snapshot_correlation"], report["power_error_db"]
         lines.append(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")

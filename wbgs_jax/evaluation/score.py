@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.repeatability import repeatability
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
@@ -43,6 +44,8 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
     report |= metrics.summarise(figures, *known)
+    repeats = repeatability(dataset.name, np.unique(known[0]) / 1e9)
+    report |= {} if repeats is None else {"truth_repeats": repeats}
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}

@@ -1,0 +1,85 @@
+"""How well the tracer repeats itself: spectra of the released number of rays against those of three times as many.
+
+No model's score can be told from the truth beyond it. Written beside the released scenes, where evaluations and tables find it.
+
+python -m data_gen.repeatability --scenes 1 2
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from data_gen.convergence import scaled, settings, traced
+from data_gen.llvm import ensure_backend
+from data_gen.scenes import get_scene
+from data_gen.settings import ArraySettings
+from wbgs_jax._util.command import run_command
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.data.load import RELEASED
+from wbgs_jax.data.repeatability import FILE
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.radio.array import snapshot_to_pas
+
+if TYPE_CHECKING:
+    from data_gen.scenes import SceneSpec
+
+TX_SEED = 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """Trace some transmitters of scenes twice, with the usual and with more rays, and compare their spectra."""
+
+    scenes: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
+    """Numbers of scenes."""
+    tx: int = 40
+    """Number of transmitters, drawn at random by a fixed seed."""
+    effort: float = 3.0
+    """All numbers of rays times this, the second time."""
+    out: Path = RELEASED / FILE
+    """What is written, scene by scene; other scenes in it stay."""
+
+
+def repeatability(spec: "SceneSpec", tx_count: int, effort: float) -> dict[str, Any]:
+    """Returns the median and the 10th percentile of the SSIM of a scene's spectra at its frequencies (GHz)."""
+    from data_gen.solve import Simulator
+
+    tx = spec.accessible_tx()
+    tx = tx[np.random.default_rng(TX_SEED).permutation(len(tx))[:tx_count]]
+    once, again = (traced(Simulator(spec, settings(much)), tx, spec.frequencies_hz) for much in (1.0, effort))
+    scores = {f"{hz / 1e9:g}": _scores(*pair) for hz, *pair in zip(spec.frequencies_hz, once, again, strict=True)}
+    return {
+        "effort": effort,
+        "n_tx": len(tx),
+        "median_ssim": {ghz: round(float(np.median(values)), 4) for ghz, values in scores.items()},
+        "p10_ssim": {ghz: round(float(np.percentile(values, 10)), 4) for ghz, values in scores.items()},
+    }
+
+
+def _scores(once: Any, again: Any) -> Float[np.ndarray, "n"]:
+    elements = jnp.asarray(ArraySettings().element_positions())
+    few, many = (np.asarray(snapshot_to_pas(scaled(snapshots), elements)) for snapshots in (once, again))
+    return ssim(few, many)
+
+
+def main() -> None:
+    """Runs the command line."""
+    options = tyro.cli(Options)
+    if options.tx < 1 or options.effort <= 0:
+        raise UserError("--tx and --effort must be positive")
+    ensure_backend()
+    for number in options.scenes:
+        spec = get_scene(number)
+        known = read_json(options.out) if options.out.exists() else {}
+        write_json(options.out, known | {f"scene{number}": repeatability(spec, options.tx, options.effort)})
+        print(f"scene {number}: {options.out}")
+
+
+if __name__ == "__main__":
+    run_command(main)
