@@ -45,7 +45,7 @@ def without_learning(results: Results) -> str:
     for scene in SCENES:
         fields = [median_cell(scores(results, table1.jobs_of(scene, field), GHZ_10)) for field in ("wideband", "wave")]
         others = [cell(baseline_average(results, Job(scene, BASELINES), name)) for name in NAMES_OF_BASELINES]
-        truth = cell(repeatability(f"scene{scene}", GHZ_10))
+        truth = cell(repeatability(f"scene{scene}", map(float, GHZ_10)))
         rows.append([scene, *fields, *others, cell(ceiling(scene, GHZ_10)), truth])
     note = (
         "Predictors that learn nothing, on all held-out transmitters: the mean of all training spectra, that of the nearest"

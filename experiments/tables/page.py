@@ -9,9 +9,9 @@ from pathlib import Path
 from experiments.catalogue import unique_jobs
 from experiments.profiles import PROFILES, Profile
 from experiments.results import Results
-from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
+from experiments.tables import baselines, default_field, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
-PAGES = (headline, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
+PAGES = (headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
 """In the order of the paper, for readers."""
 
 

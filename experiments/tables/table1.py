@@ -53,6 +53,7 @@ def scene_table(results: Results, scene: str) -> str:
         rows.append([NAMES[field, variant], *each, *average])
     best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])
-    truth = [cell(repeatability(f"scene{scene}", ghz)) for ghz in (*([f] for f in GHZ_10), GHZ_10)]
+    known = [float(f) for f in GHZ_10]
+    truth = [cell(repeatability(f"scene{scene}", ghz)) for ghz in (*([f] for f in known), known)]
     rows.append(["truth against itself", *truth, "", ""])
     return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)

@@ -1,0 +1,78 @@
+"""What a user gets who asks for nothing: evaluations of the hybrid field on the released scenes and on others' data.
+
+They are no jobs of the runner but files that `wbgs-jax eval --results experiments/results` wrote, each with its command.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from experiments.jobs import Job
+from experiments.markdown import markdown
+from experiments.paper import GHZ_10, SCENES
+from experiments.results import Results
+from experiments.tables.cells import NOT_RUN, cell
+from wbgs_jax._util.files import read_json
+
+TITLE = "The default field: what one command gives"
+DATA = {
+    **{f"scene {scene}": f"scene{scene}" for scene in SCENES},
+    "published sample (Wideband 3DGS)": "example1",
+    "RFID sample": "s23",
+}
+HEAD = ["data", "SSIM median", "mean", "5 %", "10 %", "in sight", "out of sight", "truth against itself",
+        "angle (degrees)", "best beam (dB)", "best of 3", "power (dB)", "90 % intervals hold", "training (min)"]  # fmt: skip
+NOTE = (
+    "`wbgs-jax train` and `eval`, the `cpu` preset, nothing else said; one seed. SSIM of all held-out transmitters: median,"
+    " mean, 5th and 10th percentile, medians in and out of sight of the receiver, and the truth's own repeatability. Angle:"
+    " median error of the strongest direction; beams: mean loss of received power when the predicted best beam of a codebook is"
+    " used, or the best of the three predicted best; power: mean absolute error of the received power."
+)
+POWER_NOTE = (
+    "Mean absolute error of the received power (dB) by frequency (GHz); below, the power of the nearest training transmitter:"
+)
+
+
+def jobs() -> list[Job]:
+    """Nothing that the runner runs."""
+    return []
+
+
+def render(results: Results, images: Path) -> str:
+    """Two tables: all figures of every data set, and received power by frequency."""
+    reports = {name: _report(results.folder, file) for name, file in DATA.items()}
+    rows = [[name, *_figures(report)] for name, report in reports.items()]
+    power = [row for name, report in reports.items() if name.startswith("scene") for row in _power_rows(name, report)]
+    return "\n\n".join([NOTE, markdown(HEAD, rows), POWER_NOTE, markdown(["data", *(f"{f:g}" for f in GHZ_10)], power)])
+
+
+def _report(folder: Path, name: str) -> dict[str, Any] | None:
+    path = folder / f"quality_{name}_hybrid_cpu_cpu.json"
+    return read_json(path) if path.exists() else None
+
+
+def _figures(report: dict[str, Any] | None) -> list[str]:
+    if report is None:
+        return [NOT_RUN] + [""] * (len(HEAD) - 2)
+    sight = [(report.get(part) or {}).get("median_ssim") for part in ("in_sight", "out_of_sight")]
+    scores = [report["median_ssim"], report["mean_ssim"], report["p5_ssim"], report["p10_ssim"], *sight]
+    sure = report.get("confidence")
+    return [
+        *(cell(value) if value is not None else "" for value in (*scores, report.get("truth_repeats"))),
+        f"{report['angle_error_deg']:.1f}",
+        f"{report['beam_loss_db']:.2f}",
+        f"{report['beam_loss_top3_db']:.2f}",
+        f"{report['power']['power_mae_db']:.2f}" if "power" in report else "",
+        f"{100 * sure['coverage']:.0f} %" if sure else "",
+        f"{report['provenance']['training_seconds'] / 60:.0f}",
+    ]
+
+
+def _power_rows(name: str, report: dict[str, Any] | None) -> list[list[str]]:
+    if report is None or "power" not in report:
+        return [[name, NOT_RUN, *[""] * (len(GHZ_10) - 1)]]
+    power = report["power"]
+    nearest = power["baselines"]["nearest_tx"]
+    return [
+        [label, *(f"{row['power_mae_db']:.2f}" for row in figures["per_frequency"])]
+        for label, figures in ((name, power), ("nearest TX", nearest))
+    ]
