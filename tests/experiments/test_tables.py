@@ -12,7 +12,8 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.results import Results
 from experiments.tables import __main__ as command_line
-from experiments.tables import baselines, cells, figure8, headline, page, table1, table2, table3
+from experiments.tables import baselines, cells, default_field, figure8, headline, page, table1, table2, table3
+from wbgs_jax._util.files import write_json
 
 LEVELS = {
     ("wideband", ""): 0.8,
@@ -71,7 +72,7 @@ def test_what_has_not_been_run_says_so_everywhere(nothing, tmp_path):
         assert cells.NOT_RUN in module.render(nothing, tmp_path), module.__name__
     known = re.compile(r"not run yet|\(.*\)|ceiling")
     for name, *values in rows(table1.render(nothing, tmp_path)):
-        assert "ceiling" in name or all(known.search(value) for value in values), name
+        assert "ceiling" in name or "truth" in name or all(known.search(value) for value in values), name
 
 
 def test_the_papers_values_stand_beside_the_cells(nothing, tmp_path):
@@ -162,8 +163,24 @@ def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path, monkeypatc
         assert f"## {module.TITLE}" in text
     shown = set(re.findall(rf"\({tmp_path.name}/(\S+?)\)", text))
     assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
-    assert cells.NOT_RUN not in text
+    assert cells.NOT_RUN not in text.replace(default_field.render(everything, tmp_path), "")  # whose files are no jobs
     assert "`abc123`" in text and "nan" not in text
+
+
+def test_the_default_field_is_shown_with_its_percentiles_and_powers(tmp_path):
+    powers = {"per_frequency": [{"power_mae_db": 1.5 + i} for i in range(10)]}
+    report = {
+        "median_ssim": 0.9, "mean_ssim": 0.85, "p5_ssim": 0.5, "p10_ssim": 0.6, "in_sight": {"median_ssim": 0.95},
+        "out_of_sight": None, "truth_repeats": 0.97, "angle_error_deg": 1.25, "beam_loss_db": 0.5, "beam_loss_top3_db": 0.25,
+        "power": powers | {"power_mae_db": 2.0, "baselines": {"nearest_tx": powers}},
+        "confidence": {"coverage": 0.9}, "provenance": {"training_seconds": 600.0},
+    }  # fmt: skip
+    write_json(tmp_path / "quality_scene3_hybrid_cpu_cpu.json", report)
+    text = default_field.render(Results("quick", tmp_path), tmp_path)
+    figures = ["0.900", "0.850", "0.500", "0.600", "0.950", "", "0.970", "1.2", "0.50", "0.25", "2.00", "90 %", "10"]
+    assert row(text, "scene 3") == figures
+    assert row(text.split(default_field.POWER_NOTE)[1], "nearest TX")[-1] == "10.50"
+    assert row(text, "scene 1")[0] == cells.NOT_RUN
 
 
 def test_pages_of_two_profiles_share_no_picture(tmp_path):
