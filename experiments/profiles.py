@@ -78,7 +78,7 @@ PROFILES = {
     "paper_form": Profile("paper", 30_000, 4000, {"density": {"max_gaussians": 4000}}, {"wideband": {"gaussians": 3000}}),
     "to_ours": Profile(
         "paper",
-        8000,
+        4000,
         4000,
         changes=QUICK["changes"] | {"density": {"max_gaussians": 3000}},
         fields={"wideband": GAUSSIANS},

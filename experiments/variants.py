@@ -174,8 +174,7 @@ def _together(all_changes: Sequence[Changes]) -> Changes:
 
 
 TO_OURS = {
-    f"to_{name}": Variant(_together(list(_STEPS_TO_OURS.values())[: i + 1]), steps=1000)
-    for i, name in enumerate(_STEPS_TO_OURS)
+    f"to_{name}": Variant(_together(list(_STEPS_TO_OURS.values())[: i + 1]), steps=500) for i, name in enumerate(_STEPS_TO_OURS)
 }
 """Each with all changes before it, and as many spectra as the paper's form saw one at a time."""
 VARIANTS: dict[str, Variant] = {
