@@ -5,7 +5,7 @@ from types import ModuleType
 
 from experiments.jobs import Job
 from experiments.series import choices, curve, frequency, paper_form, rates, robustness, rooms, schedules, tuning, wave_choices
-from experiments.tables import baselines, default_field, figure4, figure6, figure7, figure8, headline, table1, table2, table3
+from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
     # In the order of importance, for the runner.
@@ -18,7 +18,6 @@ TABLES: dict[str, ModuleType] = {
     "figure8": figure8,
     "table2": table2,
     "baselines": baselines,
-    "default_field": default_field,
 }
 SERIES: dict[str, ModuleType] = {
     "choices": choices,

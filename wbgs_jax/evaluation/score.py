@@ -51,7 +51,8 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     report |= {"power": power} if power else {}
     confidence = for_receiver(trained.confidence, dataset.receiver())
     if confidence and part == "test":  # it has been learned from the validation part
-        expected = expect_many(confidence, np.asarray(seen.pas), dataset.tx_positions[index], dataset.frequencies_hz[index])
+        asked = dataset.tx_positions[index], dataset.frequencies_hz[index]
+        expected = expect_many(confidence, np.asarray(seen.pas), *asked, said)
         report["confidence"] = calibration(expected, figures["ssim"])
     report |= time_queries(trained, dataset)
     report["baselines"] = {

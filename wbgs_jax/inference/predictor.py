@@ -77,7 +77,13 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
     """
     dataset = trained.dataset()
     check_power(trained.field, dataset)
-    plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
+    return unscaled_power_predictor(trained, dataset.receiver() if receiver is None else receiver)
+
+
+def unscaled_power_predictor(trained: Trained, receiver: Receiver) -> Predictor:
+    """Returns the same of a field that may have learned from spectra without a scale: what it says is right but for one factor,
+    or means nothing."""
+    plan = trained.field.plan(trained.params, receiver)
     return on_any_shape(lambda query: _render_power(trained.field, trained.params, plan, query), ())
 
 

@@ -15,16 +15,16 @@ from scipy.stats import t as student_t
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
-from wbgs_jax.inference.confidence import LEVEL, MARGIN, Confidence, features
+from wbgs_jax.inference.confidence import FEATURES, LEVEL, MARGIN, Confidence, features
 from wbgs_jax.inference.neighbours import Neighbours, correct
-from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.inference.predictor import observe_links
 
 FEWEST, MOST = 8, 300
 """Validation spectra below which nothing is said; those that are looked at, at most."""
 FEW = 20
 """Rests below which their own quantiles do not reach `LEVEL`."""
-SETS = (0, 1, 3, 5)
-"""Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency."""
+SETS = (0, 1, 3, 5, FEATURES)
+"""Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
 RIDGE = 1.0
 """Of the scaled features: that of one spectrum."""
 _features = jax.jit(features)
@@ -39,12 +39,14 @@ def learn_confidence(field: Field, params: Any, dataset: Dataset, neighbours: Ne
         return None
     index = np.random.default_rng(1).permutation(dataset.validation)[:MOST]
     query, trained = dataset.query(index), np.unique(dataset.tx_positions[dataset.train], axis=0)
-    pas = np.asarray(correct(neighbours, jnp.asarray(predict_spectra(field, params, dataset, index)), query))
-    known = np.asarray(_features(jnp.asarray(pas), query, jnp.asarray(trained, jnp.float32)), np.float64)
+    seen, rx = observe_links(field, params, dataset, index), np.asarray(dataset.receiver().position)
+    pas = np.asarray(correct(neighbours, jnp.asarray(seen.pas), query))
+    places = jnp.asarray(rx, jnp.float32), jnp.asarray(trained, jnp.float32)
+    power = None if seen.power_db is None else jnp.asarray(seen.power_db)
+    known = np.asarray(_features(jnp.asarray(pas), query, *places, power), np.float64)
     error = np.log(1 + MARGIN - np.minimum(ssim(pas, np.asarray(dataset.pas(index))), 1))
     learned = fit(known, error, dataset.tx_index[index])
-    places = np.asarray(dataset.receiver().position), trained
-    return Confidence(*(jnp.asarray(array, jnp.float32) for array in (*places, *learned)))
+    return Confidence(*places, *(jnp.asarray(array, jnp.float32) for array in learned))
 
 
 def fit(
