@@ -69,9 +69,9 @@ def test_a_cloud_has_no_faces(tmp_path):
 
 def test_a_large_mixed_mesh_loads_in_about_a_second(shared_data):
     path = shared_data("wideband3dgs_example1") / "point_cloud.ply"
-    start = time.perf_counter()
+    start = time.process_time()  # whatever else the machine does
     vertices, faces = read_ply(path)
-    assert time.perf_counter() - start < 5  # 0.3 s on a free core
+    assert time.process_time() - start < 5  # 0.3 s of processor time
     assert vertices.shape == (71_102, 3)
     assert faces.shape == (107_717 + 2 * 12, 3)  # triangles, and quads as two each
 

@@ -106,6 +106,6 @@ def test_nothing_to_score():
 
 def test_a_scene_is_scored_in_seconds(rng):
     images = rng.random((40, 90, 360), np.float32)
-    start = time.perf_counter()
+    start = time.process_time()  # whatever else the machine does
     score(images, images[::-1], np.ones(40))
-    assert (time.perf_counter() - start) / 40 * 1700 < 60  # a test split of 1,700 spectra takes 2 s on a free core
+    assert (time.process_time() - start) / 40 * 1700 < 60  # a test split of 1,700 spectra takes 2 s of processor time
