@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.radio.array import snapshot_to_pas
@@ -32,7 +32,7 @@ def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]
     if not len(paths.delays):
         return np.full(len(NAMES), np.nan)
     partial = [paths.coefficients[paths.order <= order].sum(0) for order in range(MAX_ORDER + 1)]
-    truth, *images = _images(np.stack([paths.coefficients.sum(0), *partial]), element_positions)
+    truth, *images = scaled_images(np.stack([paths.coefficients.sum(0), *partial]), element_positions)
     images.append(phase_blind_image(paths, element_positions))
     return ssim(np.stack(images), np.stack([truth] * len(NAMES)))
 
@@ -40,13 +40,17 @@ def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]
 def phase_blind_image(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "90 360"]:
     """Returns the mean PAS over `PHASE_DRAWS` draws of random path phases (always the same draws)."""
     phases = np.random.default_rng(PHASE_SEED).uniform(0, 2 * np.pi, (PHASE_DRAWS, len(paths.delays)))
-    return _images(np.exp(1j * phases) @ paths.coefficients, element_positions).mean(0)
+    return scaled_images(np.exp(1j * phases) @ paths.coefficients, element_positions).mean(0)
 
 
-def _images(
+def scaled_images(
     snapshots: Complex[np.ndarray, "n elements"], element_positions: Float[np.ndarray, "elements 3"]
 ) -> Float[np.ndarray, "n 90 360"]:
-    # Scaled before the cast: a PAS has no scale, and weak sums of few paths stay normal complex64 numbers.
+    """Returns the PAS of snapshots of any scale; element positions are in wavelengths."""
+    return np.asarray(snapshot_to_pas(scaled(snapshots), jnp.asarray(element_positions)))
+
+
+def scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
+    """Returns snapshots with a maximum of 1: what is compared has no scale, and squares of weak ones stay normal numbers."""
     peak = np.abs(snapshots).max(-1, keepdims=True)
-    scaled = (snapshots / np.where(peak > 0, peak, 1)).astype(np.complex64)
-    return np.asarray(snapshot_to_pas(jnp.asarray(scaled), jnp.asarray(element_positions)))
+    return jnp.asarray(snapshots / np.where(peak > 0, peak, 1), jnp.complex64)

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Complex, Float
 
+from data_gen.ceilings import scaled
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings, SolverSettings
@@ -24,6 +25,7 @@ from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.radio.channel import correlation
 
 if TYPE_CHECKING:
+    from data_gen.scenes import SceneSpec
     from data_gen.solve import Simulator
 
 TX_SEED = 0
@@ -62,8 +64,7 @@ def convergence(options: Options) -> list[str]:
     from data_gen.solve import Simulator
 
     spec = get_scene(options.scene)
-    tx = spec.accessible_tx()
-    tx = tx[np.random.default_rng(TX_SEED).permutation(len(tx))[: options.tx]]
+    tx = some_tx(spec, options.tx, TX_SEED)
     frequencies = [ghz * 1e9 for ghz in options.frequencies]
     snapshots, costs = [], []
     for effort in options.effort:
@@ -73,6 +74,12 @@ def convergence(options: Options) -> list[str]:
         snapshots.append(traced(simulator, tx, frequencies))
         costs.append((time.perf_counter() - start) / len(tx))
     return _lines(options, snapshots, costs)
+
+
+def some_tx(spec: "SceneSpec", count: int, seed: int) -> Float[np.ndarray, "tx 3"]:
+    """Returns transmitters of a scene, drawn at random."""
+    tx = spec.accessible_tx()
+    return tx[np.random.default_rng(seed).permutation(len(tx))[:count]]
 
 
 def traced(
@@ -98,12 +105,6 @@ def _lines(options: Options, snapshots: Sequence[Complex[np.ndarray, "freq tx el
                      *(f"{v:.3f}" for v in (np.median(score), np.percentile(score, 10))), f"{cost:.2f}")  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
     return lines
-
-
-def scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
-    """Returns snapshots with a maximum of 1: what is compared has no scale, and squares of weak ones stay normal numbers."""
-    peak = np.abs(snapshots).max(-1, keepdims=True)
-    return jnp.asarray(snapshots / np.where(peak > 0, peak, 1), jnp.complex64)
 
 
 def main() -> None:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Float
 
-from data_gen.convergence import scaled, settings, traced
+from data_gen.ceilings import scaled_images
+from data_gen.convergence import settings, some_tx, traced
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings
@@ -24,7 +23,6 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.repeatability import FILE
 from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.radio.array import snapshot_to_pas
 
 if TYPE_CHECKING:
     from data_gen.scenes import SceneSpec
@@ -50,22 +48,19 @@ def repeatability(spec: "SceneSpec", tx_count: int, effort: float) -> dict[str, 
     """Returns the median and the 10th percentile of the SSIM of a scene's spectra at its frequencies (GHz)."""
     from data_gen.solve import Simulator
 
-    tx = spec.accessible_tx()
-    tx = tx[np.random.default_rng(TX_SEED).permutation(len(tx))[:tx_count]]
+    tx = some_tx(spec, tx_count, TX_SEED)
+    elements = ArraySettings().element_positions()
     once, again = (traced(Simulator(spec, settings(much)), tx, spec.frequencies_hz) for much in (1.0, effort))
-    scores = {f"{hz / 1e9:g}": _scores(*pair) for hz, *pair in zip(spec.frequencies_hz, once, again, strict=True)}
+    scores = {
+        f"{hz / 1e9:g}": ssim(scaled_images(few, elements), scaled_images(many, elements))
+        for hz, few, many in zip(spec.frequencies_hz, once, again, strict=True)
+    }
     return {
         "effort": effort,
         "n_tx": len(tx),
         "median_ssim": {ghz: round(float(np.median(values)), 4) for ghz, values in scores.items()},
         "p10_ssim": {ghz: round(float(np.percentile(values, 10)), 4) for ghz, values in scores.items()},
     }
-
-
-def _scores(once: Any, again: Any) -> Float[np.ndarray, "n"]:
-    elements = jnp.asarray(ArraySettings().element_positions())
-    few, many = (np.asarray(snapshot_to_pas(scaled(snapshots), elements)) for snapshots in (once, again))
-    return ssim(few, many)
 
 
 def main() -> None:

@@ -33,14 +33,13 @@ from wbgs_jax.fields import Field, Observation, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
-from wbgs_jax.inference.maps import predict_many
 from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import BLOCK, check_power, predictor, trained_band, unscaled_power_predictor
+from wbgs_jax.inference.predictor import check_power, observe_queries, trained_band
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
 from wbgs_jax.training.run_folder import TrainedField, load_trained
-from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Query, Receiver
+from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Query, Receiver, make_query
 
 SHOWN = 12
 """Spectra in a picture."""
@@ -137,14 +136,12 @@ def ask(
     """Returns the spectra of every transmitter at every frequency."""
     shape = len(tx_positions), len(frequencies_hz)
     tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
-    pas = predict_many(predictor(trained, dataset.receiver()), tx, frequency, block=min(BLOCK, len(tx)))
+    seen = observe_queries(trained, dataset.receiver(), make_query(tx, frequency))
+    pas, power = np.asarray(seen.pas), None if seen.power_db is None else np.asarray(seen.power_db)
     confidence = for_receiver(trained.confidence, dataset.receiver())
     expected = None
     if confidence is not None:
-        knows_power = "power" in trained.field.known()
-        power = unscaled_power_predictor(trained, dataset.receiver()) if knows_power else None
-        power_db = None if power is None else predict_many(power, tx, frequency, block=min(BLOCK, len(tx)))
-        expected = np.stack(expect_many(confidence, pas, tx, frequency, power_db), -1).reshape(*shape, 3)
+        expected = np.stack(expect_many(confidence, pas, tx, frequency, power), -1).reshape(*shape, 3)
     return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz, expected)
 
 

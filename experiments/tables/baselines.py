@@ -10,8 +10,7 @@ from experiments.paper import GHZ_10, SCENES
 from experiments.profiles import SCORED_SLOW
 from experiments.results import Results
 from experiments.tables import table1
-from experiments.tables.cells import NAMES, ceiling, cell, median_cell, paired_cells, scores
-from wbgs_jax.data.repeatability import repeatability
+from experiments.tables.cells import NAMES, ceiling, cell, median_cell, paired_cells, scores, truth_repeats
 
 TITLE = "Baselines"
 NAMES_OF_BASELINES = ("mean_image", "nearest_tx", "inverse_distance", "line_of_sight")
@@ -45,8 +44,7 @@ def without_learning(results: Results) -> str:
     for scene in SCENES:
         fields = [median_cell(scores(results, table1.jobs_of(scene, field), GHZ_10)) for field in ("wideband", "wave")]
         others = [cell(baseline_average(results, Job(scene, BASELINES), name)) for name in NAMES_OF_BASELINES]
-        truth = cell(repeatability(f"scene{scene}", map(float, GHZ_10)))
-        rows.append([scene, *fields, *others, cell(ceiling(scene, GHZ_10)), truth])
+        rows.append([scene, *fields, *others, cell(ceiling(scene, GHZ_10)), cell(truth_repeats(scene, GHZ_10))])
     note = (
         "Predictors that learn nothing, on all held-out transmitters: the mean of all training spectra, that of the nearest"
         " training transmitter, their average weighted by 1/d², and the array's answer to the straight line. The phase-blind"

@@ -10,6 +10,7 @@ from experiments.jobs import Job
 from experiments.results import Results
 from experiments.statistics import compare, estimate, level
 from wbgs_jax.data import released_scenes
+from wbgs_jax.data.repeatability import repeatability
 from wbgs_jax.data.scene_file import load_scene
 
 NOT_RUN = "not run yet"
@@ -89,3 +90,8 @@ def ceiling(scene: str, ghz: Sequence[float]) -> float | None:
     """Their average over frequencies."""
     known = ceilings(scene)
     return float(np.mean([known[f] for f in ghz])) if known else None
+
+
+def truth_repeats(scene: str, ghz: Sequence[float]) -> float | None:
+    """The truth's own repeatability, its average over frequencies."""
+    return repeatability(f"scene{scene}", map(float, ghz))

@@ -6,8 +6,7 @@ from experiments.jobs import BASELINES, SEEDS, Job
 from experiments.markdown import markdown
 from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
 from experiments.results import Results
-from experiments.tables.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells
-from wbgs_jax.data.repeatability import repeatability
+from experiments.tables.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells, truth_repeats
 
 TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"
 MODELS = (
@@ -53,7 +52,6 @@ def scene_table(results: Results, scene: str) -> str:
         rows.append([NAMES[field, variant], *each, *average])
     best = [cell(ceiling(scene, [f])) for f in GHZ_10] + [cell(ceiling(scene, GHZ_10)), "", ""]
     rows.append(["phase-blind ceiling", *best])
-    known = [float(f) for f in GHZ_10]
-    truth = [cell(repeatability(f"scene{scene}", ghz)) for ghz in (*([f] for f in known), known)]
-    rows.append(["truth against itself", *truth, "", ""])
+    truth = [cell(truth_repeats(scene, [f])) for f in GHZ_10] + [cell(truth_repeats(scene, GHZ_10)), "", ""]
+    rows.append(["truth against itself", *truth])
     return f"**Scene {scene}**\n\n" + markdown(["model", *(f"{f:g}" for f in GHZ_10), *SUMMARY], rows)

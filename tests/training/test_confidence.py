@@ -38,18 +38,20 @@ def drawn(rng, n_tx, per_tx=5, slope=0.5, noise=0.3):
 
 
 def test_intervals_hold_nine_of_ten_new_scores(rng):
-    known, error, tx = drawn(rng, 60)
-    mean, scale, weights, quantiles, surplus = fit(known, error, tx)
-    again, truth, _ = drawn(rng, 400)
-    predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
-    inside = (predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])
-    assert 0.8 < inside.mean() < 0.98  # 0.9 are expected; another draw of the 300 moves that by 0.02
-    assert np.mean(np.exp(predicted) * surplus) == pytest.approx(np.exp(truth).mean(), rel=0.2)
+    inside, ratios = [], []
+    for _ in range(10):  # one draw of the 300 that are learned from moves the share by 0.02
+        mean, scale, weights, quantiles, surplus = fit(*drawn(rng, 60))
+        again, truth, _ = drawn(rng, 400)
+        predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
+        inside.append(np.mean((predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])))
+        ratios.append(np.mean(np.exp(predicted) * surplus) / np.exp(truth).mean())
+    assert 0.85 < np.mean(inside) < 0.95
+    assert np.mean(ratios) == pytest.approx(1, rel=0.1)
 
 
 def test_what_says_nothing_is_left_out(rng):
-    taken = [np.any(fit(*drawn(rng, 40, slope=0.0))[2][:-1] != 0) for _ in range(20)]
-    assert sum(taken) <= 6  # by chance 3 in 100
+    taken = [np.any(fit(*drawn(rng, 40, slope=0.0))[2][:-1] != 0) for _ in range(100)]
+    assert sum(taken) <= 12  # by chance 3
     weights = fit(*drawn(rng, 40, slope=1.0))[2]
     assert weights[0] == pytest.approx(1.0, abs=0.25)
 
@@ -69,11 +71,11 @@ def test_few_scores_give_a_wide_interval(rng):
     low, high = interval(np.array([0.3, -1.0, 2.0]))
     assert low < -1 and high > 2
     held = []
-    for _ in range(400):
+    for _ in range(2000):
         *rest, new = rng.normal(size=9)
         low, high = interval(np.array(rest))
         held.append(low <= new <= high)
-    assert 0.82 < np.mean(held) < 0.98
+    assert 0.85 < np.mean(held) < 0.96
     many = np.arange(199.0)
     np.testing.assert_array_equal(interval(many), [9, 189])
 

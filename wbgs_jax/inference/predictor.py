@@ -1,6 +1,6 @@
 """Asking a trained field: as a pure function of (transmitter, frequency), or about the links of a dataset."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -77,13 +77,7 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
     """
     dataset = trained.dataset()
     check_power(trained.field, dataset)
-    return unscaled_power_predictor(trained, dataset.receiver() if receiver is None else receiver)
-
-
-def unscaled_power_predictor(trained: Trained, receiver: Receiver) -> Predictor:
-    """Returns the same of a field that may have learned from spectra without a scale: what it says is right but for one factor,
-    or means nothing."""
-    plan = trained.field.plan(trained.params, receiver)
+    plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
     return on_any_shape(lambda query: _render_power(trained.field, trained.params, plan, query), ())
 
 
@@ -109,7 +103,13 @@ def render_pas(
     field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None = None
 ) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
-    return correct(neighbours, field.render(params, plan, query).pas, query)
+    return _render(field, params, plan, query, neighbours).pas
+
+
+@jax.jit
+def _render(field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None) -> Observation:
+    seen = field.render(params, plan, query)
+    return seen._replace(pas=correct(neighbours, seen.pas, query))
 
 
 @jax.jit
@@ -147,13 +147,32 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
     for number in np.unique(dataset.receiver_index[index]):
         plan = field.plan(params, dataset.receiver(int(number)), None, cache)
         of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
-        for start in range(0, len(of_receiver), BLOCK):
-            block = of_receiver[start : start + BLOCK]
-            filled = np.concatenate([block, np.repeat(block[-1:], BLOCK - len(block))])  # the last link fills the last block up
+        for block, filled in _blocks(of_receiver, BLOCK):
             seen = _observe(field, params, plan, cache, jax.tree.map(lambda leaf, i=filled: leaf[i], links))
             total = _like(seen, len(index)) if total is None else total
             _put(total, block, seen)
     return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
+
+
+def observe_queries(trained: Trained, receiver: Receiver, query: Query) -> Observation:
+    """Returns what a trained field says of any number of queries, as NumPy arrays in their order, the spectra with what the
+    neighbours say. Powers have no scale where the data had none (`check_power`)."""
+    plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
+    count = len(query.frequency_hz)
+    total: Observation | None = None
+    for block, filled in _blocks(np.arange(count), min(BLOCK, count)):
+        asked = jax.tree.map(lambda leaf, i=filled: leaf[i], query)
+        seen = _render(trained.field, trained.params, plan, asked, neighbours)
+        total = _like(seen, count) if total is None else total
+        _put(total, block, seen)
+    return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
+
+
+def _blocks(numbers: Int[np.ndarray, "n"], size: int) -> Iterator[tuple[Int[np.ndarray, "k"], Int[np.ndarray, "size"]]]:
+    """Gives numbers block by block, and each filled up to one size with its last one: one compilation."""
+    for start in range(0, len(numbers), max(size, 1)):
+        block = numbers[start : start + size]
+        yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
 def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
