@@ -1,6 +1,7 @@
 """The command line of the generator, and the checked job that it asks for."""
 
 import dataclasses
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,8 @@ from wbgs_jax.data.load import RELEASED
 
 HERE = Path(__file__).parent
 SUBSET_SEED = 0
+NAME = re.compile(r"[A-Za-z0-9_-]+")
+"""What a data set may be called: run folders are named after it."""
 CEILING_TX = 50
 """Number of transmitters the ceilings are measured on."""
 
@@ -79,6 +82,8 @@ class Options(SceneOptions):
 
     out: Path | None = None
     """Scene file to write; wbgs_jax/data/released/scene<N>.npz or <name of your file>.npz unless given."""
+    name: str | None = None
+    """What the data set is called; the scene's name unless given."""
     frequencies: tuple[float, ...] = ()
     """GHz; those of the frequency set unless given."""
     frequency_set: Literal["10", "21"] = "10"
@@ -128,8 +133,8 @@ def make_job(options: Options) -> Job:
         FREQUENCIES_21_HZ if options.frequency_set == "21" else ()
     )
     spec = options.spec(frequencies)
-    if options.frequency_set == "21":  # another data set of the same room
-        spec = dataclasses.replace(spec, name=f"{spec.name}_21f")
+    suffix = "_21f" if options.frequency_set == "21" else ""  # another data set of the same room
+    spec = dataclasses.replace(spec, name=options.name or f"{spec.name}{suffix}")
     frequencies = frequencies or spec.frequencies_hz
     check_material_frequencies([p.material for p in spec.parts], frequencies)
     settings = SolverSettings(
@@ -148,6 +153,8 @@ def _check_numbers(options: Options) -> None:
         name: getattr(options, name) for name in ("samples", "depth", "max_paths", "workers", "threads", "max_tx", "scale")
     }
     array = options.array
+    if options.name is not None and not NAME.fullmatch(options.name):
+        raise UserError(f"--name {options.name!r} is no name; give letters, digits, - and _ alone")
     numbers |= {"array.rows": array.rows, "array.columns": array.columns}
     for name, value in numbers.items():
         if value is not None and not value >= (1 if isinstance(value, int) else 1e-9):

@@ -83,7 +83,8 @@ def module_entry(name: str, module: ModuleType) -> str:
     """Returns the entry of a field's module: its plain functions and its field."""
     lines = [f"### `{name}`", "", (inspect.getdoc(module) or "").strip(), ""]
     for function, value in vars(module).items():
-        if not function.startswith("_") and getattr(value, "__module__", "") == module.__name__ and callable(value):
+        own = getattr(value, "__module__", "") == module.__name__ or function in getattr(module, "__all__", ())
+        if own and not function.startswith("_") and callable(value):
             first = (inspect.getdoc(inspect.unwrap(value)) or "").split("\n\n")[0].replace("\n", " ")
             lines.append(f"* `{name}.{function}`: {first}")
     return "\n".join(lines) + "\n"

@@ -80,6 +80,8 @@ class SearchConfig:
     """Transmitters that are looked at for that."""
     geometry_width: float = 0.02
     """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""
+    placement_spectra: int = 96
+    """Training spectra that are looked at for how far they may still be off."""
 
 
 @dataclass(frozen=True)

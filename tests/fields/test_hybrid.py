@@ -13,6 +13,7 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.hybrid import HybridField, Trust
+from wbgs_jax.fields.trust import constant
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
@@ -34,7 +35,7 @@ def run(dataset, tmp_path_factory):
 
 
 def trusting(params, spectra, power):
-    return dataclasses.replace(params, trust=Trust(jnp.asarray(spectra), jnp.asarray(power)))
+    return dataclasses.replace(params, trust=Trust(constant(spectra), constant(power)))
 
 
 def parts(run, params, index):
@@ -51,9 +52,11 @@ def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
     params, index = trusting(run.state.params, *shares), run.dataset.validation
     seen = observe_links(run.field, params, run.dataset, index)
     wave, wideband = parts(run, params, index)
-    np.testing.assert_allclose(seen.pas, shares[0] * wave.pas + (1 - shares[0]) * wideband.pas, atol=1e-5)
-    np.testing.assert_allclose(seen.power_db, shares[1] * wave.power_db + (1 - shares[1]) * wideband.power_db, atol=1e-3)
-    np.testing.assert_array_equal(seen.snapshots, wave.snapshots)
+    spectra, power = np.clip(shares, 1e-3, 1 - 1e-3)
+    # Roots of small powers, in single precision.
+    np.testing.assert_allclose(seen.pas, spectra * wave.pas + (1 - spectra) * wideband.pas, atol=3e-4)
+    np.testing.assert_allclose(seen.power_db, power * wave.power_db + (1 - power) * wideband.power_db, atol=1e-2)
+    np.testing.assert_allclose(seen.snapshots, wave.snapshots, rtol=1e-4, atol=1e-7)  # two programs
     plan = run.field.plan(params, run.dataset.receiver())
     again = run.field.render(params, plan, run.dataset.query(index))
     np.testing.assert_allclose(again.pas, seen.pas, atol=2e-3)  # traced by another program, in single precision, at 94 GHz
@@ -68,9 +71,10 @@ def test_the_share_is_what_explains_other_links_best(run, share):
     power = (1 - share) * wave.power_db + share * wideband.power_db  # that of the power is another one
     batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
     found, report = run.field.calibrate(params, run.cache, [batch])
-    assert float(found.trust.spectra) == pytest.approx(share, abs=0.05)
-    assert float(found.trust.power) == pytest.approx(1 - share, abs=0.05)
-    assert report["coherent_share"]["spectra"] == pytest.approx(share, abs=0.05)
+    assert not np.any(found.trust.spectra.weights) and not np.any(found.trust.power.weights)  # of few transmitters
+    assert float(jax.nn.sigmoid(found.trust.spectra.bias)) == pytest.approx(share, abs=0.05)
+    assert float(jax.nn.sigmoid(found.trust.power.bias)) == pytest.approx(1 - share, abs=0.05)
+    assert report["coherent_share"]["spectra"] == {"mean": pytest.approx(share, abs=0.05), "by_query": False}
 
 
 def test_its_loss_is_the_sum_and_no_field_knows_of_the_other(run):
@@ -112,7 +116,7 @@ def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
     again = load_trained(tmp_path / "run")
     for a, b in zip(jax.tree.leaves((result.field, result.params)), jax.tree.leaves((again.field, again.params)), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert 0 <= float(again.params.trust.spectra) <= 1
+    assert np.isfinite(float(again.params.trust.spectra.bias))
     resumed = Run(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")
     assert resumed.restore() and resumed.step == SETTINGS.optim.steps
 

@@ -20,7 +20,8 @@ from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import wave
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.inference.predictor import observe_links, predictor
-from wbgs_jax.radio.array import pas_directions
+from wbgs_jax.radio.array import pas_directions, snapshot_to_pas
+from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import Links, make_query, make_receiver
 
@@ -200,6 +201,22 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(rng):
     beams = np.exp(2j * np.pi * pas_directions().reshape(-1, 3) @ elements.T).conj() @ y.T
     power = np.mean(np.abs(beams) ** 2, -1).reshape(90, 360)
     np.testing.assert_allclose(found, np.sqrt(power / power.max()), atol=0.07)
+
+
+def test_spectra_are_those_of_snapshots_where_places_are_known_and_of_added_powers_where_they_are_not(rng):
+    _, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0, 0.0), **SMALL)
+    query = make_query(rng.uniform([3.5, 0.5, 0.5], [5.5, 3.5, 2.5], (3, 3)), [5e9, 28e9, 94e9])
+    see = jax.jit(lambda params: wave.observe(params, plan, wave.trace(plan, query.tx_position), query.frequency_hz))
+    known, unknown = (
+        see(dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(m)))) for m in (1e-7, 1.0)
+    )
+    np.testing.assert_allclose(known.pas, snapshot_to_pas(known.snapshots, plan.receiver.element_positions), atol=2e-3)
+    np.testing.assert_allclose(known.power_db, received_power_db(known.snapshots), atol=1e-3)
+    blind = dataclasses.replace(plan, config=dataclasses.replace(plan.config, coherent=False))
+    # Paths whose lengths depend on all places alike, such as a line of sight and what passes through it, stay together.
+    assert np.mean(np.abs(unknown.pas - jax.jit(wave.render)(params, blind, query))) < 0.02
+    assert np.mean(np.abs(unknown.pas - known.pas)) > 0.03
+    np.testing.assert_array_equal(unknown.snapshots, known.snapshots)
 
 
 def test_more_facets_than_can_be_numbered_are_refused():

@@ -8,7 +8,7 @@ from rooms import box, facets_of, room, search_of, trace
 from wbgs_jax.propagation.edges import edges_of_facets
 from wbgs_jax.propagation.facets import moved
 from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.motion import length_changes
+from wbgs_jax.propagation.motion import coherence, length_changes, length_gradient
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
@@ -61,3 +61,43 @@ def test_nothing_changes_where_nothing_moves():
     same = moved(facets, np.zeros((len(PARTS), 3)))
     for name in ("corners", "normal", "offset"):
         np.testing.assert_allclose(getattr(same, name), getattr(facets, name), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["specular", "diffracted"])
+def test_the_gradient_says_what_the_changes_say(kind, rng):
+    search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
+    paths = getattr(trace(search, TX), kind)
+    motion = jnp.asarray(rng.normal(size=(len(PARTS), 3)), jnp.float32)
+    alive = np.asarray(paths.alive)
+    by_gradient = jnp.sum(length_gradient(paths, search, len(PARTS))[:, :-1] * motion, (-2, -1))
+    np.testing.assert_allclose(by_gradient[alive], length_changes(paths, search, motion)[alive], atol=1e-5)
+
+
+def test_lengths_follow_the_transmitter(rng):
+    search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
+    step = rng.normal(0, 1e-3, 3)
+    paths = trace(search, TX).specular
+    first, second = lengths(paths), lengths(trace(search, np.add(TX, step)).specular)
+    both = [name for name in first if name in second]
+    said = np.asarray(length_gradient(paths, search, len(PARTS)))[:, -1] @ step
+    assert len(both) > 10
+    for name in both:
+        assert second[name][1] - first[name][1] == pytest.approx(said[first[name][0]], abs=2e-5)
+
+
+def test_coherence_is_the_mean_of_phases_over_places(rng):
+    """Against draws of places from normal distributions."""
+    gradient, spread, wavenumber = rng.normal(size=(5, 4, 3)), rng.uniform(0.0, 2e-3, 4), 400.0
+    found = coherence(*(jnp.asarray(x, jnp.float32) for x in (gradient, spread, wavenumber)))
+    places = rng.normal(size=(200_000, 4, 3)) * spread[:, None]
+    phases = np.exp(-1j * wavenumber * np.einsum("kmx,nmx->nk", gradient, places))
+    np.testing.assert_allclose(found, (phases.T @ phases.conj() / len(places)).real, atol=0.02)
+    assert np.asarray(found)[~np.eye(5, dtype=bool)].min() < 0.6
+    np.testing.assert_allclose(np.diag(found), 1, atol=1e-4)
+
+
+def test_paths_off_the_same_wall_stay_coherent_and_a_common_length_is_none():
+    """What turns alike at the same mover grows alike, however little its place is known."""
+    turn = jnp.zeros((3, 2, 3)).at[:2, 0].set(jnp.array([0.0, 0.6, 0.8])).at[2, 1].set(jnp.array([1.0, 0.0, 0.0]))
+    found = coherence(turn, jnp.array([0.05, 0.05]), jnp.float32(2000.0))
+    np.testing.assert_allclose(found, [[1, 1, 0], [1, 1, 0], [0, 0, 1]], atol=1e-3)

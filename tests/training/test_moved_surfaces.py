@@ -1,4 +1,4 @@
-"""Surfaces that stand elsewhere than the mesh says are put where the spectra say they are; right ones stay."""
+"""Surfaces that stand elsewhere than the mesh says are put where spectra say they are, or believed less; right ones stay."""
 
 import dataclasses
 import json
@@ -6,6 +6,7 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
@@ -14,6 +15,8 @@ from wbgs_jax.fields import wave
 from wbgs_jax.training import search
 from wbgs_jax.training.geometry import GeometryReport, Place, is_doubtful, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
+from wbgs_jax.training.placement import SPREADS_M, search_placement
+from wbgs_jax.training.scores import make_scores
 from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
@@ -97,3 +100,43 @@ def test_only_phases_that_get_worse_with_the_frequency_make_a_mesh_doubtful(rng)
     worse = np.repeat([-3.0, -2.0, -0.5, -0.3], 20)
     assert is_doubtful(worse, frequency) and not is_doubtful(worse[::-1], frequency)
     assert not is_doubtful(np.full(80, -1.0), frequency) and not is_doubtful(worse[:40], frequency[:40])
+
+
+def shifted(parts, metres, rng):
+    return [part.copy().apply_translation(rng.normal(0, metres, 3)) for part in parts]
+
+
+@pytest.mark.parametrize(("metres", "lowest", "highest"), [(0.0, SPREADS_M[0], 1e-3), (0.01, 3e-3, SPREADS_M[-1])])
+def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, highest, tmp_path, rng):
+    heard, params = truth
+    run = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, heard)
+    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train[:60]), phases=False)
+    found, report = search_placement(params, score)
+    assert lowest * 0.99 < float(jnp.exp(found.placement[0])) < highest * 1.01 and np.ptp(found.placement) == 0
+    if metres:
+        assert report.uncertain < report.certain
+
+
+@pytest.mark.slow
+def test_training_believes_the_wrong_surface_less(truth, tmp_path):
+    """One wall stands 5 mm off: the image loss learns that it may, and that the other surfaces are where they are."""
+    heard, params = truth
+    wrong = [PARTS[0].copy().apply_translation(0.005 * PARTS[0].face_normals[0]), *PARTS[1:]]
+    run = run_in(wrong, SETTINGS, tmp_path, PLACES, FREQUENCIES, heard)
+    batch = run.data.batch(jnp.asarray(run.dataset.train[:24]), jax.random.key(0))
+    optimizer = optax.adam(0.3)
+
+    @jax.jit
+    def learn(placement):
+        def loss(placement):
+            return run.field.loss(dataclasses.replace(params, placement=placement), run.cache, batch)[0]
+
+        def step(carry, _):
+            updates, state = optimizer.update(jax.grad(loss)(carry[0]), carry[1])
+            return (optax.apply_updates(carry[0], updates), state), None
+
+        return jax.lax.scan(step, (placement, optimizer.init(placement)), length=25)[0][0]
+
+    spread = np.exp(np.asarray(learn(jnp.full_like(params.placement, np.log(1e-3)))))
+    (wall,) = np.unique(np.asarray(run.field.facets.mover)[part_of(run, wrong) == 0])
+    assert 1e-3 < spread[wall] < 2e-2 and spread[wall] > 2 * np.delete(spread, wall).max(), np.round(1e3 * spread, 2)

@@ -3,7 +3,8 @@
     PAS = w PAS of the waves + (1 - w) PAS of the Gaussians
 
 The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
-needs neither and blurs. Both are trained on the same batches, and the share w is what explains validation transmitters best.
+needs neither and blurs. Both are trained on the same batches; the share w, query by query, is what explains validation
+transmitters best (trust.py).
 Without a mesh, or with several receivers, of which the coherent field knows nothing, it is the splatting field by itself.
 """
 
@@ -22,13 +23,11 @@ from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, Quantity, register
 from wbgs_jax.fields.losses import ssim
+from wbgs_jax.fields.trust import SHARES, Scored, Share, constant, features, learn_share, share_of
 from wbgs_jax.fields.wave import PreparedPaths, WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
-
-SHARES = np.linspace(0, 1, 21)
-"""Shares of the coherent field that are tried."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +40,10 @@ class HybridConfig:
 
 @pytree
 class Trust:
-    """The coherent field's share, 0 to 1."""
+    """The coherent field's shares."""
 
-    spectra: Float[Array, ""]
-    power: Float[Array, ""]
+    spectra: Share
+    power: Share
     """Of the received power in decibels."""
 
 
@@ -115,8 +114,7 @@ class HybridField(Field):
     def init(self, key: Key[Array, ""]) -> HybridParams:
         """Returns initial parameters, both fields trusted alike."""
         wave = None if self.wave is None else self.wave.init(key)
-        share = 0.0 if wave is None else 0.5
-        return HybridParams(wave, self.wideband.init(key), Trust(jnp.asarray(share), jnp.asarray(share)))
+        return HybridParams(wave, self.wideband.init(key), Trust(constant(0.5), constant(0.5)))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
         """Returns the paths of all transmitters of some links (host)."""
@@ -142,12 +140,12 @@ class HybridField(Field):
     def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
         if coherent is None:
             return self.wideband.render(params.wideband, plan.wideband, query)
-        known, trust = coherent._replace(snapshots=None), params.trust
-        alone = (trust.spectra >= 1) & (trust.power >= 1)
-        other = jax.lax.cond(alone, lambda: known, lambda: self.wideband.render(params.wideband, plan.wideband, query))
-        shares = Observation(trust.spectra, None, trust.power)
-        mixed = jax.tree.map(lambda share, a, b: share * a + (1 - share) * b, shares, known, other)
-        return mixed._replace(snapshots=coherent.snapshots)
+        blurred = self.wideband.render(params.wideband, plan.wideband, query)
+        told = features(query, plan.wave.receiver.position, coherent, blurred)
+        spectra, power = (share_of(share, told) for share in (params.trust.spectra, params.trust.power))
+        pas = spectra[:, None, None] * coherent.pas + (1 - spectra)[:, None, None] * blurred.pas
+        assert coherent.power_db is not None and blurred.power_db is not None, "both fields know powers"
+        return Observation(pas, coherent.snapshots, power * coherent.power_db + (1 - power) * blurred.power_db)
 
     def probe(self, params: HybridParams) -> Any:
         """Returns that of the splatting field."""
@@ -165,14 +163,20 @@ class HybridField(Field):
         return loss + coherent, aux._replace(metrics=figures)
 
     def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
-        """Returns the parameters with the share of the coherent field that explains best what neither field was trained on."""
+        """Returns the parameters with the shares of the coherent field that explain best what neither field was trained on."""
         if self.wave is None or not batches:
             return params, {}
         plan = self.plan(params, batches[0].receiver, None, cache)
-        scores = [_scores(self, params, plan, cache, batch) for batch in batches]
-        trust = Trust(*(_best(of_one_kind) for of_one_kind in zip(*scores, strict=True)))
-        report = {name: round(float(share), 3) for name, share in vars(trust).items()}
-        return dataclasses.replace(params, trust=trust), {"coherent_share": report}
+        seen = [jax.tree.map(np.asarray, _scores(self, params, plan, cache, batch)) for batch in batches]
+        told, *scores = (None if part[0] is None else np.concatenate(part) for part in zip(*seen, strict=True))
+        assert told is not None
+        tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
+        shares = [constant(1.0) if s is None else learn_share(Scored(told, s, tx_index)) for s in scores]
+        report = {
+            name: {"mean": round(float(share_of(share, jnp.asarray(told)).mean()), 3), "by_query": bool(np.any(share.weights))}
+            for name, share in zip(("spectra", "power"), shares, strict=True)
+        }
+        return dataclasses.replace(params, trust=Trust(*shares)), {"coherent_share": report}
 
     def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
         """Returns every path of B queries: amplitudes, directions, lengths."""
@@ -226,22 +230,17 @@ def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
 @jax.jit
 def _scores(
     hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch
-) -> tuple[Float[Array, "shares b"] | None, Float[Array, "shares b"] | None]:
-    """Returns what every share of the coherent field is worth on every link: SSIM, and the negative error of the power (dB)."""
+) -> tuple[Float[Array, "b features"], Float[Array, "b shares"] | None, Float[Array, "b shares"] | None]:
+    """Returns the features of every link, and what every share of the coherent field is worth on it: SSIM, and the negative
+    error of the power (dB)."""
     coherent: Any = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
     blurred: Any = hybrid.wideband.render(params.wideband, plan.wideband, batch.links.query)
-    spectra = power = None
+    told = features(batch.links.query, batch.receiver.position, coherent, blurred)
+    shares, spectra, power = jnp.asarray(SHARES, jnp.float32), None, None
     if batch.pas is not None:
-        spectra = jax.lax.map(lambda w: ssim(w * coherent.pas + (1 - w) * blurred.pas, batch.pas), jnp.asarray(SHARES))
+        spectra = jax.lax.map(lambda w: ssim(w * coherent.pas + (1 - w) * blurred.pas, batch.pas), shares).T
     if batch.received_db is not None:
-        shares = jnp.asarray(SHARES)[:, None]
-        error = jnp.abs(shares * coherent.power_db + (1 - shares) * blurred.power_db - batch.received_db)
-        power = jnp.where(batch.received_db > NOT_HEARD_DB, -error, 0)
-    return spectra, power
-
-
-def _best(scores: Sequence[Float[Array, "shares b"] | None]) -> Float[Array, ""]:
-    """Returns the share whose mean score is largest; 1 where nothing is known."""
-    known = [np.asarray(score) for score in scores if score is not None]
-    best = SHARES[np.argmax(np.concatenate(known, 1).mean(1))] if known else 1.0
-    return jnp.asarray(best, jnp.float32)
+        said = shares * coherent.power_db[:, None] + (1 - shares) * blurred.power_db[:, None]
+        heard = (batch.received_db > NOT_HEARD_DB)[:, None]
+        power = jnp.where(heard, -jnp.abs(said - batch.received_db[:, None]), 0)
+    return told, spectra, power

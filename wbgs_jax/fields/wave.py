@@ -4,8 +4,9 @@
 
 The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (propagation/).
 What arrives over a path follows from the slabs it is reflected by and passes through, and those are learned: permittivity,
-conductivity and (where it is not known) thickness of every material, a small correction of every facet, and the antennas where
-nobody has said what they are. Phase-blind models cannot follow interference; this one does, and it yields the channel itself.
+conductivity and (where it is not known) thickness of every material, a small correction of every facet, how far every surface
+may stand from where the mesh has it, and the antennas where nobody has said what they are. Phase-blind models cannot follow
+interference; this one does, as far as lengths are known, and it yields the channel itself.
 """
 
 import dataclasses
@@ -20,76 +21,50 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, single_receiver
 from wbgs_jax.fields.losses import snapshot_losses
+from wbgs_jax.fields.wave_channel import (
+    Materials,
+    WaveParams,
+    WavePlan,
+    arrivals_at,
+    observe,
+    path_arrivals,
+    path_covariances,
+    path_snapshots,
+    phase_blind_pas,
+    slabs_at,
+)
 from wbgs_jax.fields.wave_settings import PRESETS, WaveConfig
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
 from wbgs_jax.propagation.facets import Facets, facets_from_mesh
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
-from wbgs_jax.propagation.motion import length_changes
-from wbgs_jax.propagation.paths import (
-    DIFFRACTED,
-    MAX_FACETS,
-    REFLECTED,
-    TRANSMITTED,
-    Paths,
-    TracedPaths,
-    trace_paths,
-)
-from wbgs_jax.propagation.slab import Slabs, complex_permittivity
-from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, snapshot_to_pas, squared_magnitude
-from wbgs_jax.radio.channel import Arrivals, added_powers, received_power_db
-from wbgs_jax.radio.patterns import Antenna, upright
+from wbgs_jax.propagation.paths import MAX_FACETS, TracedPaths, trace_paths
+from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.patterns import upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
+
+__all__ = [
+    "Materials",
+    "PreparedPaths",
+    "WaveConfig",
+    "WaveField",
+    "WaveParams",
+    "WavePlan",
+    "arrivals_at",
+    "channels",
+    "make_field",
+    "observe",
+    "path_covariances",
+    "path_snapshots",
+    "phase_blind_pas",
+    "render",
+    "slabs_at",
+    "snapshots",
+    "trace",
+]
 
 TRACED_AT_ONCE = 16
 """Transmitters."""
-LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
-"""Beyond it (S/m) every material is a mirror, and single precision ends."""
-
-
-@pytree
-class Materials:
-    """Stored (unconstrained) properties of M materials, those of ITU-R P.2040: eps_r, and sigma = c f^d with f in GHz."""
-
-    log_susceptibility: Float[Array, "m"]
-    """log(eps_r - 1)."""
-    log_conductivity: Float[Array, "m"]
-    """log c, c in S/m."""
-    slope: Float[Array, "m"]
-    """d."""
-    log_thickness: Float[Array, "m"]
-    """log of metres, where the scene does not say."""
-
-
-@pytree
-class WaveParams:
-    """What is trained."""
-
-    materials: Materials
-    facet_correction: Float[Array, "f 2"]
-    """Logarithm of amplitude and phase (radians) by which a facet's reflection differs from its material's."""
-    excess_loss: Float[Array, "2 3"]
-    """Loss per interaction beyond its slab or wedge (nepers), of (specular, diffracted) paths at (transmission, reflection,
-    diffraction)."""
-    log_gain: Float[Array, ""]
-    """Logarithm of the gain of the transmitter and whatever else scales all snapshots."""
-    transmitter: Antenna
-    """Of all transmitters, in the world frame."""
-    element: Antenna
-    """What every element of the array is besides its known pattern, in the receiver's frame."""
-
-
-@pytree
-class WavePlan:
-    """What is independent of the query: geometry alone. No parameter is frozen in it."""
-
-    search: Search
-    receiver: Receiver
-    known_thickness: Float[Array, "m"]
-    motion: Float[Array, "movers 3"] | None
-    """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
-    config: WaveConfig = static()
 
 
 @pytree
@@ -112,6 +87,8 @@ class WaveField(Field):
     edges: Edges
     known_thickness: Float[Array, "m"]
     """Thickness of every material, metres; 0 where it is not known, and learned."""
+    first_placement: Float[Array, "places"]
+    """`WaveParams.placement` before training."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -143,7 +120,7 @@ class WaveField(Field):
         amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
         corrections = jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(())
         transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
-        return WaveParams(materials, *corrections, transmitter, element)
+        return WaveParams(materials, *corrections, transmitter, element, jnp.array(self.first_placement))
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host, unless they are prepared)."""
@@ -176,13 +153,13 @@ class WaveField(Field):
     def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
         """Returns spectra, snapshots and received power of B queries."""
         check_query(query)
-        return _observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+        return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
 
     def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
         """Returns the same of links whose transmitters' paths are prepared."""
         place = jnp.searchsorted(cache.tx_index, links.tx_index)
         paths = jax.tree.map(lambda leaf: leaf[place], cache.paths)
-        return _observe(params, plan, paths, links.query.frequency_hz)
+        return observe(params, plan, paths, links.query.frequency_hz)
 
     def loss(
         self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
@@ -218,18 +195,19 @@ class WaveField(Field):
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns groups for materials, thicknesses, corrections and antennas."""
+        """Returns groups for materials, thicknesses, corrections, antennas and placement."""
         return {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
             "corrections": Group(config.corrections_lr),
             "antennas": Group(config.antennas_lr),
+            "placement": Group(config.placement_lr),
         }
 
     @classmethod
     def labels(cls, params: WaveParams) -> Any:
         """Returns the group of every parameter."""
-        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4)
+        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4, "placement")
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
@@ -237,7 +215,8 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
     config = config or WaveConfig()
     facets = facets_from_mesh(mesh, config.max_facets)
     edges = edges_of_facets(facets)
-    return WaveField(_to_device(facets), _to_device(edges), jnp.asarray(mesh.thickness, jnp.float32), config)
+    placement = jnp.full(int(facets.mover.max()) + 2, np.log(config.placement), jnp.float32)
+    return WaveField(_to_device(facets), _to_device(edges), jnp.asarray(mesh.thickness, jnp.float32), placement, config)
 
 
 def _to_device(tree: Any) -> Any:
@@ -262,7 +241,7 @@ _trace = jax.jit(trace)
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
     """Returns the power angular spectra of B queries."""
     check_query(query)
-    return _observe(params, plan, trace(plan, query.tx_position), query.frequency_hz).pas
+    return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz).pas
 
 
 def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array, "b elements"]:
@@ -274,65 +253,4 @@ def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array
 def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
     """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
     check_query(query)
-    paths = trace(plan, query.tx_position)
-    found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, query.frequency_hz)
-    return found
-
-
-def path_snapshots(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
-) -> Complex[Array, "b elements"]:
-    """Returns the snapshots of B transmitters whose paths are known."""
-    return jax.vmap(lambda paths, f: snapshots_from_paths(arrivals_at(params, plan, paths, f), plan.receiver, f))(
-        paths, frequency_hz
-    )
-
-
-def _observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Observation:
-    if not plan.config.coherent:
-        return Observation(phase_blind_pas(params, plan, paths, frequency_hz))
-    y = path_snapshots(params, plan, paths, frequency_hz)
-    unit = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + 1e-30)
-    return Observation(snapshot_to_pas(unit, plan.receiver.element_wavelengths(frequency_hz)), y, received_power_db(y))
-
-
-def phase_blind_pas(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
-) -> Float[Array, "b 90 360"]:
-    """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
-    return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
-        paths, frequency_hz
-    )
-
-
-def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
-    """Returns what every facet is made of at one frequency."""
-    m, material = params.materials, plan.search.facets.material
-    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
-    permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
-    thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
-    return Slabs(permittivity[material], thickness[material])
-
-
-def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
-    """Returns what one transmitter sends over all of its paths."""
-    slabs, found = slabs_at(params, plan, frequency_hz), []
-    for row, some in enumerate((paths.specular, paths.diffracted)):
-        antennas = params.transmitter, params.element
-        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
-        gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
-        if plan.motion is not None:
-            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
-            gain = gain * jnp.exp(-2j * jnp.pi * turns)
-        found.append(one._replace(amplitude=one.amplitude * gain))
-    return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
-
-
-def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "k"]:
-    """Returns the factor by which paths differ from their slabs and wedges."""
-    kind = paths.interaction_type
-    counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
-    reflects = kind == REFLECTED
-    correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
-    total = jnp.where(reflects[..., None], correction, 0).sum(-2)
-    return jnp.exp(total[:, 0] - counts @ params.excess_loss[row] + 1j * total[:, 1])
+    return path_arrivals(params, plan, trace(plan, query.tx_position), query.frequency_hz)

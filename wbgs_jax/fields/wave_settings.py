@@ -37,6 +37,8 @@ class WaveConfig:
     """... and metres, where the scene does not say."""
     excess_amplitude: float = 0.7
     """Amplitude that diffracted waves keep at every further interaction, beyond its slab, at the start."""
+    placement: float = 1e-6
+    """Metres: how far surfaces and transmitters may stand from where they are said to be, before the search for that."""
     coherent: bool = True
     """False: the powers of the paths are added instead of their amplitudes, as phase-blind models do (an ablation)."""
     ssim_weight: float = 0.2
@@ -55,6 +57,8 @@ class WaveConfig:
     """Learning rate of facet corrections, excess losses and the gain."""
     antennas_lr: float = 3e-4
     """Learning rate of the antennas' orientations and exponents."""
+    placement_lr: float = 2e-2
+    """Learning rate of the logarithm of `placement`."""
 
 
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}

@@ -112,6 +112,25 @@ def snapshots_from_paths(arrived: Arrivals, receiver: Receiver, frequency_hz: Fl
     return jnp.matmul(arrived.amplitude, steering, precision=EXACT)
 
 
+def covariance_from_paths(
+    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], coherence: Float[Array, "k k"]
+) -> Complex[Array, "elements elements"]:
+    """Returns the mean product y y^H of the snapshots of a transmitter whose K paths are partially coherent.
+
+    Args:
+        arrived: what arrives over K paths, each by itself.
+        receiver: whose elements it is received with.
+        frequency_hz: of the carrier.
+        coherence: what is left of the mean product of two paths' amplitudes (`motion.coherence`); where it is 1 everywhere
+            the result is the snapshot's own product.
+    """
+    steering = steering_vector(receiver.element_wavelengths(frequency_hz), arrived.direction)
+    voltages = arrived.amplitude[:, None] * steering
+    return jnp.matmul(
+        voltages.T, jnp.matmul(coherence.astype(voltages.dtype), voltages.conj(), precision=EXACT), precision=EXACT
+    )
+
+
 def _dot(a: Array, b: Array) -> Array:
     """Returns the scalar product over the last axis."""
     return jnp.sum(a * b, -1)

@@ -24,6 +24,10 @@ EXACT = jax.lax.Precision.HIGHEST
 """Of matrix products on positions and phases: the default of a GPU may be TF32, whose ten bits are millimetres in a room."""
 
 
+FAINTEST_POWER = 1e-8
+"""Of a pixel of the spectrum of covariances of unit trace: its root stays differentiable."""
+
+
 def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float[np.ndarray, "elements 3"]:
     """Returns the element positions (wavelengths, float64) of a planar array in the local y-z plane, centred on the origin.
 
@@ -94,6 +98,21 @@ def snapshot_to_pas(
     if positions.ndim == 3:
         return jax.vmap(snapshot_to_pas)(snapshot, positions)
     return normalise(cbf(snapshot, steering_vector(positions, jnp.asarray(pas_directions(), positions.dtype))))
+
+
+def covariance_to_pas(
+    covariance: Complex[Array, "*n elements elements"],
+    element_positions: Float[Array, "elements 3"] | Float[Array, "n elements 3"],
+) -> Float[Array, "*n 90 360"]:
+    """Returns the power angular spectra, each scaled to a maximum of 1, of mean products y y^H of random snapshots: the root of
+    the mean of |a^H y|^2. Element positions are as in `snapshot_to_pas`, which it agrees with where nothing is random."""
+    positions = jnp.asarray(element_positions, covariance.real.dtype)
+    if positions.ndim == 3:
+        return jax.vmap(covariance_to_pas)(covariance, positions)
+    steering = steering_vector(positions, jnp.asarray(pas_directions(), positions.dtype))
+    turned = jnp.einsum("hwe,...ef->...hwf", steering.conj(), covariance, precision=EXACT)
+    power = jnp.sum(turned.real * steering.real - turned.imag * steering.imag, -1)
+    return normalise(jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)))
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, normalise, pas_directions, squared_magnitude, steering_vector
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, covariance_to_pas, squared_magnitude, steering_vector
 
 
 class Arrivals(NamedTuple):
@@ -84,11 +84,8 @@ def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements
 def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
     """Returns the spectrum, maximum 1, that an array sees of one transmitter's paths if their powers are added instead of their
     amplitudes. Element positions are in wavelengths."""
-    steering = steering_vector(elements, arrivals.direction)
     strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))
     power = squared_magnitude(arrivals.amplitude / jnp.maximum(strongest, FAINTEST))
+    steering = steering_vector(elements, arrivals.direction)
     weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
-    covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)  # sum of power times a a^H
-    grid = steering_vector(elements, jnp.asarray(pas_directions(), jnp.float32))
-    beams = jnp.einsum("hwe,ef,hwf->hw", grid.conj(), covariance, grid, precision=EXACT)
-    return normalise(jnp.sqrt(jnp.maximum(beams.real, 1e-12)))
+    return covariance_to_pas(jnp.matmul(steering.T, weighted.conj(), precision=EXACT), elements)

@@ -36,7 +36,7 @@ from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoc
 
 CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": Search}
 """Host controls by the names that fields and settings give them."""
-CALIBRATED, BLOCK = 240, 16
+CALIBRATED, BLOCK = 720, 16
 """Validation links that a field is calibrated by, at most, and how many at a time."""
 
 

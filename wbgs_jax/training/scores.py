@@ -2,6 +2,7 @@
 searches before a training, and the choices after it, compare."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,23 +19,25 @@ Scores = Callable[[Sequence[Any]], Float[np.ndarray, "k n"]]
 """K candidates for all parameters -> how badly each explains N spectra: log decorrelation, or log error of spectra alone."""
 
 
-def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"]) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver."""
+def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"], phases: bool = True) -> Scores:
+    """Returns the function that scores candidates on some spectra of one receiver; without `phases` by the spectra alone,
+    where snapshots are known too."""
 
     def score(candidates: Sequence[Any]) -> Float[np.ndarray, "k n"]:
-        return np.asarray(_score(field, jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates), cache, data, spectra))
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
+        return np.asarray(_score(field, stacked, cache, data, spectra, phases))
 
     return score
 
 
-@jax.jit
-def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"]):
+@partial(jax.jit, static_argnames=("phases",))
+def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"], phases: bool):
     batch = data.batch(spectra, jax.random.key(0))
     plan = field.plan(jax.tree.map(lambda leaf: leaf[0], candidates), batch.receiver, None, cache)
 
     def one(params):
         seen = field.render_links(params, plan, cache, batch.links)
-        if seen.snapshots is not None and batch.snapshots is not None:
+        if phases and seen.snapshots is not None and batch.snapshots is not None:
             return log_decorrelation(seen.snapshots, batch.snapshots)
         assert batch.pas is not None, "candidates are scored by spectra or snapshots"
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))

@@ -1,7 +1,7 @@
 """Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, places of surfaces.
 
 The first two are a choice among known ones by how well they explain some training spectra; surfaces are moved where the mesh is
-doubtful. Training goes on from there.
+doubtful, and how far they may still be off is guessed. Training goes on from there.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.controls import Context, Edit
 from wbgs_jax.training.geometry import Place, is_doubtful, learn_geometry
 from wbgs_jax.training.materials import search_materials
+from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import make_scores
 
 
@@ -44,22 +45,26 @@ class Search:
     ) -> Edit:
         """Returns the antennas and materials that explain some training spectra best, and the field with its surfaces moved if
         the mesh is doubtful."""
-        config, data = self.config, context.data
+        config, data, cache = self.config, context.data, context.cache
         spectra = rng.choice(context.train, min(config.spectra, len(context.train)), replace=False)
         report = {}
         if config.antenna_rounds:
             some = spectra[: config.antenna_spectra]
-            score = make_scores(field, context.cache, data, jnp.asarray(some, jnp.int32))
+            score = make_scores(field, cache, data, jnp.asarray(some, jnp.int32))
             known = bool(np.any(np.asarray(data.receivers.pattern_exponents) != 0))
             params, found = search_antennas(params, score, np.asarray(data.links.tx_index)[some], config, known)
             report["antennas"] = dataclasses.asdict(found)
         if config.rounds:
-            score = make_scores(field, context.cache, data, jnp.asarray(spectra, jnp.int32))
+            score = make_scores(field, cache, data, jnp.asarray(spectra, jnp.int32))
             params, named = search_materials(params, score, config)
             report["search"] = dataclasses.asdict(named)
             frequency_hz = np.asarray(data.links.query.frequency_hz)[spectra]
             if config.geometry_steps and is_doubtful(score([params])[0], frequency_hz):
-                place, moved = learn_geometry(Place(field, params, context.cache), data, context.train, config, rng)
+                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng)
                 report["geometry"] = dataclasses.asdict(moved)
-                return Edit(place.params, (), None, report, place.field, place.cache)
-        return Edit(params, (), None, report)
+                params, field, cache = place.params, place.field, place.cache
+            some = spectra[: config.placement_spectra]
+            score = make_scores(field, cache, data, jnp.asarray(some, jnp.int32), phases=False)
+            params, guessed = search_placement(params, score)
+            report["placement"] = dataclasses.asdict(guessed)
+        return Edit(params, (), None, report, field, cache)

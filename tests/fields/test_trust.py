@@ -1,0 +1,60 @@
+"""Whom to believe is learned from links where one is right and the other is not, and only where there are enough of them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.trust import FEATURES, SHARES, Scored, constant, features, learn_share, share_of
+from wbgs_jax.types import make_query
+
+
+def scored(rng, n_tx, per_tx, best_share, noise=0.0):
+    """Links whose best share follows the first feature, by as much as `best_share` says."""
+    told = rng.normal(size=(n_tx * per_tx, FEATURES)).astype(np.float32)
+    best = best_share(told[:, 0]) + noise * rng.normal(size=len(told))
+    scores = 0.9 - 0.3 * np.abs(SHARES - best[:, None])
+    return Scored(told, scores, np.repeat(np.arange(n_tx), per_tx)), best
+
+
+def test_a_share_that_follows_a_feature_is_found(rng):
+    known, best = scored(rng, 60, 10, lambda x: 1 / (1 + np.exp(-2 * x)), noise=0.05)
+    share = learn_share(known)
+    found = np.asarray(share_of(share, jnp.asarray(known.features)))
+    assert np.any(share.weights) and np.corrcoef(found, best)[0, 1] > 0.9
+    again, best = scored(rng, 60, 10, lambda x: 1 / (1 + np.exp(-2 * x)), noise=0.05)
+    assert np.mean(np.abs(share_of(share, jnp.asarray(again.features)) - best)) < 0.12 < np.mean(np.abs(0.5 - best))
+
+
+def test_what_the_features_do_not_say_is_one_share_for_all(rng):
+    found = [learn_share(scored(rng, 40, 5, lambda x: 0.7 + 0 * x, noise=0.2)[0]) for _ in range(10)]
+    shares = np.array([float(share_of(share, jnp.zeros((1, FEATURES)))[0]) for share in found])
+    np.testing.assert_allclose(shares, 0.7, atol=0.1)
+    assert sum(bool(np.any(share.weights)) for share in found) <= 6
+
+
+def test_few_transmitters_say_one_share_at_most(rng):
+    known, _ = scored(rng, 9, 20, lambda x: (x > 0).astype(float))
+    assert not np.any(learn_share(known).weights)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_a_common_share_is_that_of_all_queries(share, rng):
+    found = share_of(constant(share), jnp.asarray(rng.normal(size=(5, FEATURES)), jnp.float32))
+    np.testing.assert_allclose(found, share, atol=2e-3)
+
+
+def test_a_feature_that_never_changes_is_left_out(rng):
+    known, _ = scored(rng, 40, 5, lambda x: 1 / (1 + np.exp(-3 * x)))
+    known.features[:, 3] = -60.0
+    share = learn_share(known)
+    assert share.weights[3] == 0 and all(np.isfinite(leaf).all() for leaf in (share.weights, share.bias, share.scale))
+
+
+def test_features_are_finite_of_nothing_and_of_an_unknown_power():
+    query = make_query([[1.0, 2.0, 1.0]], 28e9)
+    dark, bright = jnp.zeros((1, 90, 360)), jnp.ones((1, 90, 360))
+    silent = Observation(dark, None, jnp.array([-300.0]))
+    told = features(query, jnp.zeros(3), silent, Observation(bright))
+    assert told.shape == (1, FEATURES) and np.isfinite(told).all()
+    assert told[0, 3] == -60 and told[0, 4] == 0

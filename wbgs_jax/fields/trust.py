@@ -1,0 +1,151 @@
+"""How far the coherent field is to be trusted, query by query, learned from links that neither field was trained on.
+
+    share = sigmoid(bias + weights . z)
+
+with z what is known beforehand and tells where phases fail: the frequency, how much the two fields disagree, how far below free
+space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
+is. The weights are those by which validation links are explained best; where, left out transmitter by transmitter, they explain
+them no surer than a common share does, they are zero.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.fields.base import Observation
+from wbgs_jax.radio.channel import free_space_db
+from wbgs_jax.types import Query
+
+SHARES = np.linspace(0, 1, 21)
+"""Shares of the coherent field that links are scored at."""
+FEATURES = 7
+FOLDS = 5
+RIDGE = 5e-3
+"""Penalty on the squared weights, in the unit of the scores' spread over shares."""
+STEPS, RATE = 400, 0.03
+"""Of Adam, which finds the weights."""
+FAINTEST_DB = 60.0
+"""Received powers are told apart down to so many decibels below free space."""
+
+
+@pytree
+class Share:
+    """The logit of a share: linear in the features."""
+
+    bias: Float[Array, ""]
+    weights: Float[Array, "features"]
+    mean: Float[Array, "features"]
+    """Of the features over the links that it was learned from ..."""
+    scale: Float[Array, "features"]
+    """... and their standard deviation."""
+
+
+class Scored(NamedTuple):
+    """What some links say."""
+
+    features: Float[np.ndarray, "n features"]
+    scores: Float[np.ndarray, "n shares"]
+    """What every share of `SHARES` is worth on each link: the larger, the better."""
+    tx_index: Int[np.ndarray, "n"]
+
+
+def constant(share: float) -> Share:
+    """Returns the same share for all queries."""
+    share = min(max(share, 1e-3), 1 - 1e-3)
+    weights, mean = jnp.zeros(FEATURES), jnp.zeros(FEATURES)  # two arrays: training gives every one away once
+    return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
+
+
+def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, "b"]:
+    """Returns the coherent field's share, 0 to 1, of B queries."""
+    return jax.nn.sigmoid(share.bias + (features - share.mean) / share.scale @ share.weights)
+
+
+def features(
+    query: Query, rx_position: Float[Array, "3"], coherent: Observation, blurred: Observation
+) -> Float[Array, "b features"]:
+    """Returns what tells how far the coherent field is right for B queries."""
+    octave = jnp.log2(query.frequency_hz / 1e10)
+    range_m = jnp.sqrt(jnp.sum((query.tx_position - rx_position) ** 2, -1) + 1e-4)
+    lit = free_space_db(range_m, query.frequency_hz)
+    beyond = [
+        jnp.zeros_like(octave) if seen.power_db is None else jnp.clip(seen.power_db - lit, -FAINTEST_DB, 0.0)
+        for seen in (coherent, blurred)
+    ]
+    brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, blurred)]
+    disagreement = jnp.log(jnp.mean(jnp.abs(coherent.pas - blurred.pas), (-2, -1)) + 1e-3)
+    return jnp.stack([octave, octave**2, disagreement, *beyond, *brightness], -1)
+
+
+def learn_share(known: Scored) -> Share:
+    """Returns the share that explains links best (host): one for all, unless the features say surely more."""
+    common = constant(_best(known.scores))
+    folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
+    if len(np.unique(known.tx_index)) < 2 * FOLDS:
+        return common
+    gains = np.zeros(len(folds))
+    for fold in range(FOLDS):
+        own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
+        by_features, by_all = _fit(rest), constant(_best(rest.scores))
+        gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
+    by_tx = np.array([gains[known.tx_index == tx].mean() for tx in np.unique(known.tx_index)])
+    sure = by_tx.mean() > by_tx.std(ddof=1) / np.sqrt(len(by_tx))
+    return _fit(known) if sure else common
+
+
+def _best(scores: Float[np.ndarray, "n shares"]) -> float:
+    return float(SHARES[np.argmax(scores.mean(0))])
+
+
+def _worth(share: Share, known: Scored) -> Float[np.ndarray, "n"]:
+    return np.asarray(_between(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
+
+
+def _between(scores: Float[Array, "n shares"], share: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Returns the score at a share between those that were tried."""
+    place = share * (len(SHARES) - 1)
+    low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
+    left, right = (jnp.take_along_axis(scores, (low + step)[:, None], 1)[:, 0] for step in (0, 1))
+    return left + (place - low) * (right - left)
+
+
+def _fit(known: Scored) -> Share:
+    """Returns the weights that make the mean score largest, standardised and shrunk towards none."""
+    start = constant(min(max(_best(known.scores), 0.05), 0.95))
+    mean, scale = known.features.mean(0), known.features.std(0)
+    used = scale > 1e-6
+    start = Share(start.bias, start.weights, jnp.asarray(mean), jnp.asarray(np.where(used, scale, 1)))
+    unit = max(float(np.ptp(known.scores, 1).mean()), 1e-6)
+    learned: Share = _ascend(start, jnp.asarray(known.features), jnp.asarray(known.scores / unit), jnp.asarray(used))
+    return learned
+
+
+@jax.jit
+def _ascend(
+    start: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"], used: Bool[Array, "features"]
+) -> Share:
+    """Maximises the mean score by Adam: a smooth function of eight numbers."""
+
+    def with_learned(learned: tuple[Array, Array]) -> Share:
+        return Share(learned[0], learned[1] * used, start.mean, start.scale)
+
+    def loss(learned: tuple[Array, Array]) -> Float[Array, ""]:
+        worth = _between(scores, share_of(with_learned(learned), features))
+        return RIDGE * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
+
+    def step(i: int, carry: tuple) -> tuple:
+        learned, first, second = carry
+        gradient = jax.grad(loss)(learned)
+        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, gradient)
+        second = jax.tree.map(lambda v, g: 0.99 * v + 0.01 * g**2, second, gradient)
+        size = RATE * jnp.sqrt(1 - 0.99 ** (i + 1.0)) / (1 - 0.9 ** (i + 1.0))
+        learned = jax.tree.map(lambda p, m, v: p - size * m / (jnp.sqrt(v) + 1e-8), learned, first, second)
+        return learned, first, second
+
+    learned = start.bias, start.weights
+    zeros = jax.tree.map(jnp.zeros_like, learned)
+    return with_learned(jax.lax.fori_loop(0, STEPS, step, (learned, zeros, zeros))[0])

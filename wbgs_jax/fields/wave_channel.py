@@ -1,0 +1,171 @@
+"""What the coherent field's parameters make of paths that are known: what arrives over each, snapshots, and spectra.
+
+Waves are coherent as far as the places of surfaces are known:
+
+    R = sum over pairs of paths  coherence(i, j) y_i y_j^H        PAS = sqrt(a^H R a) / max
+
+with y_i the snapshot of path i alone. Where all places are known the coherence is 1 and the PAS that of the snapshot itself;
+where nobody knows them within a wavelength, powers add.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.wave_settings import WaveConfig
+from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.motion import coherence, length_changes, length_gradient
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
+from wbgs_jax.propagation.slab import Slabs, complex_permittivity
+from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, covariance_to_pas, snapshot_to_pas, squared_magnitude
+from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels, received_power_db
+from wbgs_jax.radio.patterns import Antenna
+from wbgs_jax.types import Receiver
+
+LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
+"""Beyond it (S/m) every material is a mirror, and single precision ends."""
+
+
+@pytree
+class Materials:
+    """Stored (unconstrained) properties of M materials, those of ITU-R P.2040: eps_r, and sigma = c f^d with f in GHz."""
+
+    log_susceptibility: Float[Array, "m"]
+    """log(eps_r - 1)."""
+    log_conductivity: Float[Array, "m"]
+    """log c, c in S/m."""
+    slope: Float[Array, "m"]
+    """d."""
+    log_thickness: Float[Array, "m"]
+    """log of metres, where the scene does not say."""
+
+
+@pytree
+class WaveParams:
+    """What is trained."""
+
+    materials: Materials
+    facet_correction: Float[Array, "f 2"]
+    """Logarithm of amplitude and phase (radians) by which a facet's reflection differs from its material's."""
+    excess_loss: Float[Array, "2 3"]
+    """Loss per interaction beyond its slab or wedge (nepers), of (specular, diffracted) paths at (transmission, reflection,
+    diffraction)."""
+    log_gain: Float[Array, ""]
+    """Logarithm of the gain of the transmitter and whatever else scales all snapshots."""
+    transmitter: Antenna
+    """Of all transmitters, in the world frame."""
+    element: Antenna
+    """What every element of the array is besides its known pattern, in the receiver's frame."""
+    placement: Float[Array, "places"]
+    """Logarithm of how far (metres, standard deviation along each axis) the movers of the facets and, last, the transmitters
+    stand from where they are said to be."""
+
+
+@pytree
+class WavePlan:
+    """What is independent of the query: geometry alone. No parameter is frozen in it."""
+
+    search: Search
+    receiver: Receiver
+    known_thickness: Float[Array, "m"]
+    motion: Float[Array, "movers 3"] | None
+    """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
+    config: WaveConfig = static()
+
+
+def path_snapshots(
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
+) -> Complex[Array, "b elements"]:
+    """Returns the snapshots of B transmitters whose paths are known."""
+    return _snapshots(plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
+
+
+def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Arrivals:
+    """Returns every path of B transmitters whose paths are known, leading axis B."""
+    found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, frequency_hz)
+    return found
+
+
+def _snapshots(plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, "b"]) -> Complex[Array, "b elements"]:
+    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
+
+
+def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Observation:
+    """Returns spectra, snapshots and received power of B transmitters whose paths are known."""
+    if not plan.config.coherent:
+        return Observation(phase_blind_pas(params, plan, paths, frequency_hz))
+    arrived = path_arrivals(params, plan, paths, frequency_hz)
+    y, elements = _snapshots(plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
+    if plan.motion is not None:  # places that are being learned need no allowance for being unknown
+        unit = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + FAINTEST)
+        return Observation(snapshot_to_pas(unit, elements), y, received_power_db(y))
+    covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
+    return Observation(covariance_to_pas(covariance, elements), y, decibels(power))
+
+
+def path_covariances(
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, "b"]
+) -> tuple[Complex[Array, "b elements elements"], Float[Array, "b"]]:
+    """Returns the mean products y y^H of the snapshots of B transmitters over the places where surfaces may stand
+    (`WaveParams.placement`), scaled to a trace of 1; and the mean power that an element receives."""
+    movers, spread = params.placement.shape[0] - 1, jnp.exp(params.placement)
+
+    def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
+        strongest = jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude))), FAINTEST)
+        arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
+        gradient = jnp.concatenate([length_gradient(some, plan.search, movers) for some in (paths.specular, paths.diffracted)])
+        left = coherence(gradient, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
+        covariance = covariance_from_paths(arrived, plan.receiver, f, left)
+        trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
+        return covariance / trace, trace / len(covariance) * strongest**2
+
+    found: Any = jax.vmap(one)(paths, arrived, frequency_hz)
+    return found
+
+
+def phase_blind_pas(
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
+) -> Float[Array, "b 90 360"]:
+    """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
+    return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
+        paths, frequency_hz
+    )
+
+
+def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
+    """Returns what every facet is made of at one frequency."""
+    m, material = params.materials, plan.search.facets.material
+    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
+    permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
+    thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
+    return Slabs(permittivity[material], thickness[material])
+
+
+def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
+    """Returns what one transmitter sends over all of its paths."""
+    slabs, found = slabs_at(params, plan, frequency_hz), []
+    for row, some in enumerate((paths.specular, paths.diffracted)):
+        antennas = params.transmitter, params.element
+        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
+        gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
+        if plan.motion is not None:
+            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
+            gain = gain * jnp.exp(-2j * jnp.pi * turns)
+        found.append(one._replace(amplitude=one.amplitude * gain))
+    return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+
+
+def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "k"]:
+    """Returns the factor by which paths differ from their slabs and wedges."""
+    kind = paths.interaction_type
+    counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
+    reflects = kind == REFLECTED
+    correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
+    total = jnp.where(reflects[..., None], correction, 0).sum(-2)
+    return jnp.exp(total[:, 0] - counts @ params.excess_loss[row] + 1j * total[:, 1])
