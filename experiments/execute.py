@@ -20,8 +20,10 @@ from wbgs_jax.data import Dataset
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.fields import default_field
+from wbgs_jax.inference.predictor import corrected, predict_spectra
 from wbgs_jax.training.loop import train
+from wbgs_jax.training.neighbours import learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 CURVE_POINTS = 200
@@ -76,6 +78,9 @@ def part(job: Job, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: 
     may_go_on()
     begin = time.perf_counter()
     predicted = predict_spectra(trained.field, trained.params, dataset, dataset.test)
+    if job.field == default_field():
+        beside = learn_neighbours(trained.field, trained.params, dataset).neighbours
+        predicted = corrected(beside, predicted, dataset, dataset.test)
     scores = score(dataset, predicted)
     seconds = np.array([trained.seconds, time.perf_counter() - begin])
     sizes = np.array([trained.steps, trained.sizes.get("gaussians", 0)])

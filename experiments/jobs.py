@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
+from experiments.faults import Fault, faulty
 from experiments.paper import COMBINATIONS, DENSE_SCENE, GHZ_10, GHZ_21, SCENES
 from experiments.profiles import PROFILES, SCORED_SLOW, TABLE_PROFILES
 from experiments.variants import VARIANTS
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_box, hold_out_validation, select_frequencies, unseen_frequencies
+from wbgs_jax.fields import default_field
 
 SEEDS = (0, 1, 2)
 """Of the headline rows."""
@@ -110,8 +111,10 @@ class Job:
             dataset = validation_as_test(dataset)
         if VARIANTS[self.variant].room:
             dataset = hold_out_box(dataset, *ROOMS[self.scene])
-        if displacement := VARIANTS[self.variant].displacement:
-            dataset = displaced(dataset, displacement, self.seed)
+        if (fault := VARIANTS[self.variant].fault) != Fault():
+            dataset = faulty(dataset, fault, self.seed)
+        if self.field == default_field():  # it learns from a validation part whom to trust, as it does for users
+            dataset = hold_out_validation(dataset)
         if self.all_tx:
             everything = np.arange(len(dataset))
             dataset = dataclasses.replace(dataset, train=everything, test=everything)
@@ -141,11 +144,3 @@ def validation_as_test(dataset: Dataset) -> Dataset:
     """Returns the data set with the validation part in the place of the test, which is gone."""
     held = hold_out_validation(dataset)
     return dataclasses.replace(held, validation=held.validation[:0], test=held.validation)
-
-
-def displaced(dataset: Dataset, metres: float, seed: int) -> Dataset:
-    """Returns the same spectra with every part of the mesh in a wrong place."""
-    corners = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
-    part = trimesh.graph.connected_component_labels(corners.edges, node_count=len(dataset.vertices))
-    shift = np.random.default_rng([seed, 7]).normal(0, metres, (part.max() + 1, 3))
-    return dataclasses.replace(dataset, vertices=(dataset.vertices + shift[part]).astype(np.float32))

@@ -71,7 +71,8 @@ PROFILES = {
     "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_SLOW),
     "curve": Profile("cpu", 1000, 600, **QUICK),
     "rooms": Profile("cpu", 1000, 600, **QUICK),
-    "robustness": Profile("cpu", 1000, 600, **QUICK),
+    # What a user gets who asks for nothing.
+    "robustness": Profile("cpu", 2400, 2000),
     "schedules": Profile("cpu", 2000, 600, fields={"wideband": BY_ADAM}, validation=True),
     "frequency": Profile("cpu", 1000, 600, fields={"wideband": BY_ADAM}, validation=True),
     # What an hour on one core allows of the preset `paper`, Gaussians and steps.

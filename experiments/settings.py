@@ -1,7 +1,9 @@
 """The settings of a job: the preset of its profile, what profile and variant change, schedules in proportion to the steps."""
 
+import dataclasses
 from typing import Any
 
+from experiments.faults import Fault
 from experiments.jobs import BASELINES, ONE_FREQUENCY, Job
 from experiments.profiles import PROFILES
 from experiments.variants import VARIANTS
@@ -10,6 +12,8 @@ from wbgs_jax.fields import get_field
 
 HOUSEKEEPING = ("loop.evaluate_every", "loop.evaluate_spectra", "loop.checkpoint_every", "loop.keep_checkpoints")
 """Settings that change no result."""
+FAULT_NAMES = {"displaced_m": "mesh.displacement"}
+"""Of faults in result files that older ones had."""
 
 
 def settings(job: Job) -> Settings:
@@ -55,8 +59,9 @@ def differences(job: Job) -> dict[str, Any]:
     if job.field == BASELINES:
         return {}
     found = unlike_preset(job, _flat(settings(job), job.field))
-    if displacement := VARIANTS[job.variant].displacement:
-        found["mesh.displacement"] = displacement
+    for name, value in dataclasses.asdict(VARIANTS[job.variant].fault).items():
+        if value != getattr(Fault(), name):
+            found[FAULT_NAMES.get(name, f"fault.{name}")] = value
     return found
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from experiments.faults import Fault
 from experiments.profiles import Changes
 
 
@@ -20,8 +21,8 @@ class Variant:
     """Factor of all learning rates of the field."""
     room: bool = False
     """Whether a whole room is the test (`jobs.ROOMS`), and nothing of it trains."""
-    displacement: float = 0
-    """Metres by which every part of the mesh stands in a wrong place (standard deviation along each axis)."""
+    fault: Fault = Fault()  # noqa: RUF009 (frozen)
+    """What is wrong with the data."""
 
 
 def _of_field(**values: object) -> Variant:
@@ -135,18 +136,38 @@ COHERENT = {
     "untrained": Variant({"field": _UNTRAINED, **_NO_SEARCH}),
     "no_snapshot_loss": _of_field(correlation_weight=0.0, power_weight=0.0),
     "more_candidates": _of_field(diffracted_tried=4096, diffracted_kept=512, mirror_areas=(0.0, 0.02, 0.3)),
-    "mesh_moved_3mm": Variant(_AS_IT_IS, displacement=0.003),
-    "mesh_moved_3cm": Variant(_AS_IT_IS, displacement=0.03),
-    "mesh_moved_1m": Variant(_AS_IT_IS, displacement=1.0),
+    "mesh_moved_3mm": Variant(_AS_IT_IS, fault=Fault(displaced_m=0.003)),
+    "mesh_moved_3cm": Variant(_AS_IT_IS, fault=Fault(displaced_m=0.03)),
+    "mesh_moved_1m": Variant(_AS_IT_IS, fault=Fault(displaced_m=1.0)),
 }
-MESHES = {
-    "mesh_moved_1cm": Variant(_AS_IT_IS, displacement=0.01),
-    **{
-        f"mesh_put_right_{name}": Variant(displacement=metres)
-        for name, metres in {"3mm": 0.003, "1cm": 0.01, "3cm": 0.03}.items()
-    },
+FAULTS = {
+    name: Variant(fault=fault)
+    for name, fault in {
+        "mesh_1mm": Fault(displaced_m=0.001),
+        "mesh_3mm": Fault(displaced_m=0.003),
+        "mesh_1cm": Fault(displaced_m=0.01),
+        "mesh_3cm": Fault(displaced_m=0.03),
+        "tilted": Fault(tilted_deg=0.2),
+        "missing_10": Fault(missing=0.1),
+        "missing_30": Fault(missing=0.3),
+        "added_10": Fault(added=0.1),
+        "added_30": Fault(added=0.3),
+        "thickness_unknown": Fault(thickness_unknown=True),
+        "one_material": Fault(one_material=True),
+        "wrong_materials": Fault(wrong_materials=0.3),
+        "receiver_off": Fault(receiver_m=0.02, receiver_deg=1.0),
+        "array_off": Fault(array_deg=5.0),
+        "pattern_unknown": Fault(pattern_unknown=True),
+        "snr_30": Fault(snr_db=30.0),
+        "snr_20": Fault(snr_db=20.0),
+        "snr_10": Fault(snr_db=10.0),
+        "tx_20": Fault(tx=20),
+        "tx_100": Fault(tx=100),
+        "images": Fault(images_only=True),
+        "all_together": Fault(displaced_m=0.01, missing=0.1, thickness_unknown=True, snr_db=20.0),
+    }.items()
 }
-"""Meshes whose bodies and walls all stand in a wrong place, with and without moving them back."""
+"""What can be wrong, one thing at a time, and the middle ones together."""
 _STEPS_TO_OURS: dict[str, Changes] = {
     "batch_of_8": {"optim": {"batch": 8}, "field": {"network_lr": 4e-3}},
     "small_networks": {"field": {"width": 64, "depth": 4, "skip": 2, "fusion": 1, "radiance_widths": (32,)}},
@@ -187,6 +208,6 @@ VARIANTS: dict[str, Variant] = {
     **POOLED,
     **VOLUME,
     **COHERENT,
-    **MESHES,
+    **FAULTS,
     **TO_OURS,
 }

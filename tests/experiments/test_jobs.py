@@ -8,12 +8,12 @@ from synthetic import tiny_scene
 
 from experiments import paper
 from experiments.catalogue import EXPERIMENTS, unique_jobs
-from experiments.jobs import BASELINES, ONE_FREQUENCY, SCORED_TRAINED, Job, displaced
+from experiments.faults import Fault, faulty
+from experiments.jobs import BASELINES, ONE_FREQUENCY, SCORED_TRAINED, Job
 from experiments.profiles import PROFILES, SCORED_SLOW, TABLE_PROFILES
 from experiments.settings import settings
 from experiments.tables import figure8, table1, table2
 from wbgs_jax.config import check
-from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import get_field
 
@@ -163,27 +163,11 @@ def test_variants_change_what_they_name():
     assert dataclasses.replace(fast.field, network_lr=usual.field.network_lr) == usual.field
 
 
-def test_a_displaced_mesh_is_moved_part_by_part():
-    scene = tiny_scene(4)
-    twice = dataclasses.replace(
-        scene,
-        vertices=np.concatenate([scene.vertices, scene.vertices + 50]),
-        faces=np.concatenate([scene.faces, scene.faces + len(scene.vertices)]),
-        face_part=np.concatenate([scene.face_part, scene.face_part]),
-    )
-    dataset = scene_dataset(twice)
-    shift = displaced(dataset, 0.1, 3).vertices - dataset.vertices
-    first, second = shift[: len(scene.vertices)], shift[len(scene.vertices) :]
-    for part in (first, second):
-        np.testing.assert_allclose(part, np.tile(part[0], (len(part), 1)), atol=1e-4)
-    assert np.abs(first[0] - second[0]).max() > 1e-3
-
-
 def test_a_job_of_a_displaced_mesh_trains_on_it(tmp_path):
     path = tmp_path / "box.npz"
     save_scene(path, tiny_scene(4))
     whole, moved = (Job(str(path), "wave", variant=variant, seed=3).dataset() for variant in ("", "mesh_moved_3cm"))
-    np.testing.assert_array_equal(moved.vertices, displaced(whole, 0.03, 3).vertices)
+    np.testing.assert_array_equal(moved.vertices, faulty(whole, Fault(displaced_m=0.03), 3).vertices)
     assert np.abs(moved.vertices - whole.vertices).max() > 1e-3
 
 

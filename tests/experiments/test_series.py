@@ -37,7 +37,7 @@ def test_a_change_is_one_and_can_work(job):
 @pytest.mark.parametrize("series", [one for module in SERIES.values() for one in module.SERIES], ids=lambda one: one.title)
 def test_no_two_rows_of_a_table_are_the_same(series):
     jobs = [series.jobs_of(series.scenes[0], variant)[0] for variant in series.variants]
-    rows = [(settings(job), VARIANTS[job.variant].displacement) for job in jobs]
+    rows = [(settings(job), VARIANTS[job.variant].fault) for job in jobs]
     assert all(one != other for one, other in itertools.combinations(rows, 2))
 
 

@@ -178,16 +178,20 @@ def _blocks(numbers: Int[np.ndarray, "n"], size: int) -> Iterator[tuple[Int[np.n
 def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
     """Returns what `observe_links` does, the spectra with what the neighbours say."""
     seen = observe_links(trained.field, trained.params, dataset, index)
-    neighbours = for_receiver(trained.neighbours, dataset.receiver()) if dataset.n_receivers == 1 else None
-    if neighbours is not None:
-        spectra = np.asarray(seen.pas)
-        for start in range(0, len(index), BLOCK):
-            block = slice(start, start + BLOCK)
-            spectra[block] = _correct(neighbours, spectra[block], dataset.query(index[block]))
-    return seen
+    if dataset.n_receivers > 1:
+        return seen
+    neighbours = for_receiver(trained.neighbours, dataset.receiver())
+    return seen._replace(pas=jnp.asarray(corrected(neighbours, np.asarray(seen.pas), dataset, index)))
 
 
-_correct = jax.jit(correct)
+def corrected(
+    neighbours: Neighbours | None, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 90 360"]:
+    """Returns predicted spectra of some of a dataset's links with what the neighbours say."""
+    if neighbours is None:
+        return pas
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(index), BLOCK)]
+    return np.concatenate([_correct(neighbours, pas[block], dataset.query(index[block])) for block in blocks])
 
 
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:

@@ -1,0 +1,203 @@
+"""What can be wrong with data and scene descriptions that people bring, one fault at a time: a data set with the fault in it.
+
+The truth of the test stays as it is, but for what is the receiver's own: an array out of tune hears everything so.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Complex, Float, Int
+
+from wbgs_jax.data import Dataset
+from wbgs_jax.data.dataset import Materials
+from wbgs_jax.types import Receiver
+
+FURNITURE_M = 3.0
+"""Parts whose bounding box has a shorter diagonal are furniture."""
+PAS_AT_ONCE = 512
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong. Lengths and angles are standard deviations along each axis, unless they say otherwise."""
+
+    displaced_m: float = 0
+    """Every part of the mesh stands elsewhere ..."""
+    tilted_deg: float = 0
+    """... and is turned about its centre."""
+    missing: float = 0
+    """Share of the furniture that the mesh lacks ..."""
+    added: float = 0
+    """... and share of it that stands in a second place too."""
+    thickness_unknown: bool = False
+    one_material: bool = False
+    """All parts are said to be of one material."""
+    wrong_materials: float = 0
+    """Share of the parts that are said to be of a material drawn at random."""
+    receiver_m: float = 0
+    """The receiver stands elsewhere, by so much in a random direction, ..."""
+    receiver_deg: float = 0
+    """... and is turned by so much about a random axis."""
+    array_deg: float = 0
+    """Phases of the elements."""
+    pattern_unknown: bool = False
+    """The elements are said to be isotropic."""
+    snr_db: float | None = None
+    """Of the training snapshots."""
+    tx: int | None = None
+    """Training transmitters."""
+    images_only: bool = False
+    """8-bit pictures of the spectra instead of snapshots."""
+
+
+def faulty(dataset: Dataset, fault: Fault, seed: int) -> Dataset:
+    """Returns the data set with a fault; equal seeds draw equal faults."""
+    dataset = with_wrong_mesh(dataset, fault, np.random.default_rng([seed, 7]))
+    dataset = with_wrong_materials(dataset, fault, np.random.default_rng([seed, 8]))
+    dataset = with_wrong_receiver(dataset, fault, np.random.default_rng([seed, 9]))
+    dataset = with_wrong_snapshots(dataset, fault, np.random.default_rng([seed, 10]))
+    if fault.tx is not None:
+        kept = np.random.default_rng([seed, 11]).permutation(np.unique(dataset.tx_index[dataset.train]))[: fault.tx]
+        dataset = dataclasses.replace(dataset, train=dataset.train[np.isin(dataset.tx_index[dataset.train], kept)])
+    return as_images(dataset) if fault.images_only else dataset
+
+
+def with_wrong_mesh(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
+    """Returns it with parts that stand elsewhere, are turned, are missing or stand there twice."""
+    part, vertices = parts_of(dataset), dataset.vertices.astype(np.float64)
+    shift = rng.normal(0, fault.displaced_m, (part.max() + 1, 3))
+    turn = np.deg2rad(rng.normal(0, fault.tilted_deg, (part.max() + 1, 3)))
+    centre = np.array([vertices[part == k].mean(0) for k in range(part.max() + 1)])
+    arm = vertices - centre[part]
+    vertices += np.cross(turn[part], arm) + shift[part]
+    dataset = dataclasses.replace(dataset, vertices=vertices.astype(np.float32))
+    movable = rng.permutation(
+        [k for k in range(part.max() + 1) if np.linalg.norm(np.ptp(arm[part == k], axis=0)) < FURNITURE_M]
+    )
+    gone, doubled = (movable[: round(share * len(movable))] for share in (fault.missing, fault.added))
+    if len(doubled):
+        dataset = _doubled(dataset, part, doubled, rng)
+    return _without(dataset, np.isin(part[dataset.faces[:, 0] % len(part)], gone) & (dataset.faces[:, 0] < len(part)))
+
+
+def parts_of(dataset: Dataset) -> Int[np.ndarray, "vertices"]:
+    """Returns the number of the connected part that every vertex belongs to."""
+    corners = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
+    return trimesh.graph.connected_component_labels(corners.edges, node_count=len(dataset.vertices))
+
+
+def with_wrong_materials(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
+    """Returns it with parts said to be of other materials, or of unknown thickness."""
+    known = dataset.materials
+    if known is None:
+        return dataset
+    if fault.one_material:
+        known = Materials(np.zeros_like(known.material), ("all",), np.zeros(1))
+    if fault.wrong_materials:
+        part = parts_of(dataset)[dataset.faces[:, 0]]
+        wrong = rng.random(part.max() + 1) < fault.wrong_materials
+        other = rng.integers(len(known.names), size=part.max() + 1)
+        material = np.where(wrong[part], other[part], known.material).astype(np.int32)
+        known = dataclasses.replace(known, material=material)
+    if fault.thickness_unknown:
+        known = dataclasses.replace(known, thickness=np.zeros_like(known.thickness))
+    return dataclasses.replace(dataset, materials=known)
+
+
+def with_wrong_receiver(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
+    """Returns it with a receiver that is said to stand elsewhere, to be turned, or to have isotropic elements."""
+    receivers, n = dataset.receivers, dataset.n_receivers
+    step, axis = (_directions(rng, n) for _ in range(2))
+    half = np.deg2rad(fault.receiver_deg) / 2
+    turn = np.concatenate([np.full((n, 1), np.cos(half)), np.sin(half) * axis], 1)
+    exponents = receivers.pattern_exponents * (0 if fault.pattern_unknown else 1)
+    wrong = Receiver(
+        jnp.asarray(np.asarray(receivers.position) + fault.receiver_m * step, jnp.float32),
+        jnp.asarray(_product(turn, np.asarray(receivers.orientation)), jnp.float32),
+        receivers.element_positions,
+        exponents,
+        receivers.unit,
+    )
+    return dataclasses.replace(dataset, receivers=wrong)
+
+
+def with_wrong_snapshots(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
+    """Returns it with noise on the training snapshots, and with elements out of tune on all."""
+    if dataset.snapshots is None:
+        return dataset
+    heard = dataset.snapshots
+    if fault.array_deg:
+        heard = heard * np.exp(1j * np.deg2rad(rng.normal(0, fault.array_deg, heard.shape[-1])))
+    if fault.snr_db is not None:
+        heard = heard.copy()
+        heard[dataset.train] += _noise(heard[dataset.train], fault.snr_db, rng)
+    return dataclasses.replace(dataset, snapshots=heard.astype(np.complex64))
+
+
+def as_images(dataset: Dataset) -> Dataset:
+    """Returns it with the spectra as 8-bit pictures."""
+    blocks = [
+        np.asarray(dataset.pas(np.arange(start, min(start + PAS_AT_ONCE, len(dataset)))))
+        for start in range(0, len(dataset), PAS_AT_ONCE)
+    ]
+    images = np.concatenate([(255 * block).round().astype(np.uint8) for block in blocks])
+    return dataclasses.replace(dataset, snapshots=None, images=images)
+
+
+def _without(dataset: Dataset, gone: Bool[np.ndarray, "faces"]) -> Dataset:
+    """Returns it without some triangles."""
+    known, part = dataset.materials, dataset.face_part
+    return dataclasses.replace(
+        dataset,
+        faces=dataset.faces[~gone],
+        face_part=None if part is None else part[~gone],
+        materials=known and dataclasses.replace(known, material=known.material[~gone]),
+    )
+
+
+def _doubled(
+    dataset: Dataset, part: Int[np.ndarray, "vertices"], chosen: Int[np.ndarray, "k"], rng: np.random.Generator
+) -> Dataset:
+    """Returns it with copies of some parts elsewhere in the room, at their height."""
+    vertices, faces, copied = [dataset.vertices], [dataset.faces], [np.arange(len(dataset.faces))]
+    low, high = dataset.vertices.min(0), dataset.vertices.max(0)
+    for k in chosen:
+        own, triangles = np.flatnonzero(part == k), np.flatnonzero(part[dataset.faces[:, 0]] == k)
+        place = rng.uniform(low, high) - dataset.vertices[own].mean(0)
+        number = np.zeros(len(part), np.int64)
+        number[own] = sum(map(len, vertices)) + np.arange(len(own))
+        vertices.append((dataset.vertices[own] + [*place[:2], 0]).astype(np.float32))
+        faces.append(number[dataset.faces[triangles]].astype(np.int32))
+        copied.append(triangles)
+    triangles = np.concatenate(copied)
+    known, parts = dataset.materials, dataset.face_part
+    return dataclasses.replace(
+        dataset,
+        vertices=np.concatenate(vertices),
+        faces=np.concatenate(faces),
+        face_part=None if parts is None else parts[triangles],
+        materials=known and dataclasses.replace(known, material=known.material[triangles]),
+    )
+
+
+def _noise(
+    heard: Complex[np.ndarray, "n elements"], snr_db: float, rng: np.random.Generator
+) -> Complex[np.ndarray, "n elements"]:
+    """Returns complex normal noise, so many decibels below the mean power of every snapshot."""
+    power = np.mean(np.abs(heard) ** 2, -1, keepdims=True) * 10 ** (-snr_db / 10)
+    return np.sqrt(power / 2) * (rng.normal(size=heard.shape) + 1j * rng.normal(size=heard.shape))
+
+
+def _directions(rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 3"]:
+    drawn = rng.normal(size=(n, 3))
+    return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+
+
+def _product(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    """Returns the product of quaternions (wxyz): first b, then a."""
+    w, v = a[:, :1], a[:, 1:]
+    scalar = w * b[:, :1] - np.sum(v * b[:, 1:], -1, keepdims=True)
+    return np.concatenate([scalar, w * b[:, 1:] + b[:, :1] * v + np.cross(v, b[:, 1:])], -1)
