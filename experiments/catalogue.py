@@ -4,7 +4,19 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from experiments.jobs import Job
-from experiments.series import choices, curve, frequency, paper_form, rates, robustness, rooms, schedules, tuning, wave_choices
+from experiments.series import (
+    choices,
+    curve,
+    fixed_array,
+    frequency,
+    paper_form,
+    rates,
+    robustness,
+    rooms,
+    schedules,
+    tuning,
+    wave_choices,
+)
 from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
@@ -28,6 +40,7 @@ SERIES: dict[str, ModuleType] = {
     "robustness": robustness,
     "schedules": schedules,
     "frequency": frequency,
+    "fixed_array": fixed_array,
     "paper_form": paper_form,
     "wave_choices": wave_choices,
 }

@@ -19,6 +19,12 @@ from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_box, hold_out_validation, select_frequencies, unseen_frequencies
 from wbgs_jax.fields import default_field
 
+FIXED_SCENE = "2_fixed"
+"""Scene 2 seen by an array of fixed size, half a wavelength apart at 10 GHz ..."""
+GHZ_FIXED = (2.4, 3.5, 5, 7, 10, 14, 18, 22, 25, 28)
+"""... at these frequencies."""
+RELEASED_GHZ = dict.fromkeys(SCENES, GHZ_10) | {DENSE_SCENE: GHZ_21, FIXED_SCENE: GHZ_FIXED}
+"""Released scenes and their frequencies."""
 SEEDS = (0, 1, 2)
 """Of the headline rows."""
 ONE_FREQUENCY = ("wrfgs",)
@@ -46,7 +52,7 @@ class Job:
     """One training and its evaluation (of a model for every frequency, if the field knows one alone)."""
 
     scene: str
-    """Released scene (1, 2, ..., 1_21f), or a scene file or folder of spectra by its path."""
+    """Released scene (1, 2, ..., 1_21f, 2_fixed), or a scene file or folder of spectra by its path."""
     field: str
     """A field, or `BASELINES`."""
     combination: str = ""
@@ -69,7 +75,7 @@ class Job:
     @property
     def is_released(self) -> bool:
         """Whether the scene is one of the released ones."""
-        return self.scene in (*SCENES, DENSE_SCENE)
+        return self.scene in RELEASED_GHZ
 
     @property
     def budget(self) -> float:
@@ -80,7 +86,7 @@ class Job:
     def known_ghz(self) -> tuple[float, ...]:
         """Frequencies of the data."""
         if self.is_released:
-            return tuple(float(f) for f in (GHZ_21 if self.scene == DENSE_SCENE else GHZ_10))
+            return tuple(float(f) for f in RELEASED_GHZ[self.scene])
         return tuple((np.unique(load_dataset(self.scene).frequencies_hz) / 1e9).tolist())
 
     @property

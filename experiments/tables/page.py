@@ -38,7 +38,7 @@ published and the data here are others: compare orders and ratios, not single va
   for every frequency as ours has for all of them.
 * **coherent (ours)**: the [coherent field](wave.md); one model for all frequencies. It is told more than the others: complex
   snapshots in training, the exact mesh and the walls' thickness, the list that the materials come from, and the physics that
-  made the data.
+  made the data. Its rows in tables 1 and 2 and figures 7 and 8 are of before it learned how far surfaces may stand elsewhere.
 * **NeRF2-style**: a volume marched along rays, with the frequency as an input; rebuilt here too.
 * **Predictors that learn nothing**, and the **phase-blind ceiling**: the mean spectrum over random phases of all true paths,
   about the best that can be said without phases; measured on 50 transmitters of each scene ([dataset card](dataset.md)).

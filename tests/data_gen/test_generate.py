@@ -170,6 +170,7 @@ def test_no_path_at_all_is_told_after_the_first_batch(simulator_backend, tmp_pat
         ({"scene": "nowhere.glb"}, "--rx"),
         ({"materials": Path("m.toml")}, "scene of your own"),
         ({"frequency_set": "21"}, "two ways"),
+        ({"name": "../elsewhere"}, "--name"),
         ({"rx_orientation": (0.0, 0.0, 0.0, 0.0)}, "quaternion"),
         ({"array": ArraySettings(rows=0)}, "--array.rows"),
         ({"array": ArraySettings(spacing=0)}, "--array.spacing"),

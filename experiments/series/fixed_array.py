@@ -1,0 +1,43 @@
+"""An array of fixed size in metres, as receivers are built: its beams narrow with the frequency, and spectra change with it."""
+
+from experiments.jobs import FIXED_SCENE, GHZ_FIXED, SEEDS, Job
+from experiments.markdown import markdown
+from experiments.results import Results
+from experiments.series.series import Series, jobs_of_all
+from experiments.tables.cells import cell, median_cell, scores
+from wbgs_jax.data import released_scenes
+from wbgs_jax.data.scene_file import load_scene
+
+TITLE = "An array of fixed size"
+SERIES = (
+    Series("wideband (ours)", "wideband", ("",), "curve", (FIXED_SCENE,), seeds=SEEDS),
+    Series("wideband, not told the frequency", "wideband", ("pooled",), "curve", (FIXED_SCENE,), seeds=SEEDS),
+    Series("WRF-GS, a model a frequency", "wrfgs", ("",), "curve", (FIXED_SCENE,), seeds=SEEDS),
+    Series("coherent (ours)", "wave", ("",), "curve", (FIXED_SCENE,)),
+)
+NAMES_OF_BASELINES = {
+    "mean_image": "mean image",
+    "nearest_tx": "nearest TX",
+    "inverse_distance": "1/d² weighting",
+    "phase_blind": "phase-blind ceiling",
+}
+
+
+def jobs() -> list[Job]:
+    """Returns a job a model and seed."""
+    return jobs_of_all(SERIES)
+
+
+def render(results: Results) -> str:
+    """Returns a table by frequency: every model, what learns nothing, and the ceiling."""
+    rows = []
+    for series in SERIES:
+        values = scores(results, series.jobs(), GHZ_FIXED)
+        each = [median_cell(None if values is None else values[..., i : i + 1]) for i in range(len(GHZ_FIXED))]
+        rows.append([series.title, *each, median_cell(values), "" if values is None else f"{len(values)}"])
+    known = {row["frequency_ghz"]: row for row in load_scene(released_scenes()[FIXED_SCENE]).meta["ceilings"]}
+    for key, name in NAMES_OF_BASELINES.items():
+        each = [known[f][key] for f in GHZ_FIXED]
+        rows.append([name, *map(cell, each), cell(sum(each) / len(each)), ""])
+    head = ["model", *(f"{f:g}" for f in GHZ_FIXED), "average", "seeds"]
+    return f"Median SSIM of held-out transmitters by frequency (GHz), profile `{SERIES[0].profile}`:\n\n{markdown(head, rows)}"
