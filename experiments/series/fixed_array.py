@@ -37,7 +37,8 @@ def render(results: Results) -> str:
         rows.append([series.title, *each, median_cell(values), "" if values is None else f"{len(values)}"])
     known = {row["frequency_ghz"]: row for row in load_scene(released_scenes()[FIXED_SCENE]).meta["ceilings"]}
     for key, name in NAMES_OF_BASELINES.items():
-        each = [known[f][key] for f in GHZ_FIXED]
-        rows.append([name, *map(cell, each), cell(sum(each) / len(each)), ""])
+        learned_nothing = [float(known[f][key]) for f in GHZ_FIXED]
+        average = sum(learned_nothing) / len(learned_nothing)
+        rows.append([name, *map(cell, learned_nothing, [None] * len(GHZ_FIXED)), cell(average), ""])
     head = ["model", *(f"{f:g}" for f in GHZ_FIXED), "average", "seeds"]
     return f"Median SSIM of held-out transmitters by frequency (GHz), profile `{SERIES[0].profile}`:\n\n{markdown(head, rows)}"

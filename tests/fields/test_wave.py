@@ -148,7 +148,7 @@ def test_prepared_links_are_rendered_as_others_are(rng):
     np.testing.assert_array_equal(cache.tx_index, [3, 7])
     prepared = jax.jit(WaveField.render_links)(field, params, field.plan(params, plan.receiver, cache=cache), cache, links)
     for a, b in zip(prepared, jax.jit(WaveField.render)(field, params, plan, query), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5 * np.abs(b).max())
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(b).max())  # roots of small powers
 
 
 def test_without_surfaces_the_message_says_so(scene):

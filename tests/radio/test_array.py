@@ -7,7 +7,16 @@ import pytest
 
 from wbgs_jax.data import load_dataset
 from wbgs_jax.radio import array
-from wbgs_jax.radio.array import PAS_SHAPE, lag_basis, normalise, pas_directions, planar_array
+from wbgs_jax.radio.array import (
+    PAS_SHAPE,
+    beams_of,
+    covariance_to_pas,
+    lag_basis,
+    normalise,
+    pas_directions,
+    planar_array,
+    wide_covariance_to_pas,
+)
 from wbgs_jax.types import make_receiver
 
 ELEMENTS = jnp.asarray(planar_array(), jnp.float32)
@@ -154,3 +163,29 @@ def test_spectra_of_arrays_of_their_own(rng):
     for i in range(3):
         alone = snapshot_to_pas(jnp.tile(y[i], (3, 1)), own[i])[0]
         np.testing.assert_allclose(snapshot_to_pas(y, own)[i], alone, atol=1e-5)
+
+
+def test_the_spectrum_of_a_snapshots_own_product_is_its_own(rng):
+    positions = planar_array()
+    y = rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))
+    y = jnp.asarray(y / np.linalg.norm(y, axis=-1, keepdims=True), jnp.complex64)
+    covariance, truth = y[:, :, None] * y[:, None].conj(), snapshot_to_pas(y, jnp.asarray(positions))
+    np.testing.assert_allclose(covariance_to_pas(covariance, beams_of(positions)), truth, atol=2e-3)
+    everywhere = jnp.broadcast_to(jnp.asarray(positions, jnp.float32), (3, 16, 3))
+    np.testing.assert_allclose(wide_covariance_to_pas(covariance, everywhere), truth, atol=2e-3)
+
+
+def test_beams_of_any_array_add_the_powers_of_what_is_not_coherent(rng):
+    """An irregular array: the mean power of independent waves from two directions is the sum of their powers."""
+    positions = rng.normal(size=(5, 3))
+    directions = np.array([[1.0, 0, 0], [0, 0.6, 0.8]])
+    steering = np.exp(2j * np.pi * directions @ positions.T)
+    covariance = np.einsum("pe,pf->ef", steering * [[0.14], [0.06]], steering.conj())
+    grid = np.exp(2j * np.pi * pas_directions() @ positions.T)
+    power = sum(share * np.abs(grid.conj() @ one) ** 2 for share, one in zip((0.14, 0.06), steering, strict=True))
+    found = covariance_to_pas(jnp.asarray(covariance, jnp.complex64), beams_of(positions))
+    np.testing.assert_allclose(found, np.sqrt(power / power.max()), atol=2e-3)
+
+
+def test_a_regular_array_has_few_lags():
+    assert beams_of(planar_array()).basis.shape == (90 * 360, 2 * 25)  # 49 differences, opposite ones alike

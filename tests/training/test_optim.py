@@ -17,7 +17,7 @@ from wbgs_jax.training.optim import ADAMS_RMS, make_muon, make_optimizer, schedu
 OPTIM = OptimConfig(steps=6, final_fraction=0.1)
 RATES = {
     "wideband": {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "opacity": 0.4, "features": 0.6, "network": 0.5},
-    "wave": {"materials": 0.1, "thickness": 0.2, "corrections": 0.3, "antennas": 0.4},
+    "wave": {"materials": 0.1, "thickness": 0.2, "corrections": 0.3, "antennas": 0.4, "placement": 0.5},
     "nerf2": {"network": 0.1},
 }
 """The settings that hold a learning rate, NAME_lr, by field."""
@@ -38,6 +38,7 @@ PLACES = {
         ".log_gain": "corrections",
         ".transmitter": "antennas",
         ".element": "antennas",
+        ".placement": "placement",
     },
     "nerf2": {"[": "network"},
 }

@@ -39,6 +39,7 @@ from wbgs_jax.propagation.facets import Facets, facets_from_mesh
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.paths import MAX_FACETS, TracedPaths, trace_paths
+from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.patterns import upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
@@ -72,6 +73,8 @@ class PreparedPaths:
     """A receiver's mirror images, and the paths of some transmitters."""
 
     search: Search
+    beams: Beams | None
+    """Of its array; None where they differ from frequency to frequency."""
     paths: TracedPaths
     """Leading axis: transmitters."""
     tx_index: Int[Array, "tx"]
@@ -125,8 +128,8 @@ class WaveField(Field):
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host, unless they are prepared)."""
         check_receiver(receiver)
-        search = self._search(receiver) if cache is None else cache.search
-        return WavePlan(search, receiver, self.known_thickness, None, self.config)
+        search, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.search, cache.beams)
+        return WavePlan(search, receiver, self.known_thickness, None, beams, self.config)
 
     def _search(self, receiver: Receiver) -> Search:
         config = self.config
@@ -148,7 +151,7 @@ class WaveField(Field):
             index = np.minimum(np.arange(start, start + TRACED_AT_ONCE), n - 1)  # blocks of one shape: one compilation
             parts.append(jax.tree.map(np.asarray, _trace(planned, jnp.asarray(positions[index]))))
         paths = jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:n]), *parts)
-        return PreparedPaths(planned.search, paths, jnp.asarray(numbers, jnp.int32))
+        return PreparedPaths(planned.search, planned.beams, paths, jnp.asarray(numbers, jnp.int32))
 
     def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
         """Returns spectra, snapshots and received power of B queries."""
@@ -217,6 +220,10 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
     edges = edges_of_facets(facets)
     placement = jnp.full(int(facets.mover.max()) + 2, np.log(config.placement), jnp.float32)
     return WaveField(_to_device(facets), _to_device(edges), jnp.asarray(mesh.thickness, jnp.float32), placement, config)
+
+
+def _beams(receiver: Receiver) -> Beams | None:
+    return beams_of(np.asarray(receiver.element_positions)) if receiver.unit == "wavelengths" else None
 
 
 def _to_device(tree: Any) -> Any:

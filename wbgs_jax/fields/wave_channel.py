@@ -23,7 +23,14 @@ from wbgs_jax.propagation.motion import coherence, length_changes, length_gradie
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, covariance_to_pas, snapshot_to_pas, squared_magnitude
+from wbgs_jax.radio.array import (
+    SPEED_OF_LIGHT,
+    Beams,
+    covariance_to_pas,
+    snapshot_to_pas,
+    squared_magnitude,
+    wide_covariance_to_pas,
+)
 from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels, received_power_db
 from wbgs_jax.radio.patterns import Antenna
 from wbgs_jax.types import Receiver
@@ -76,6 +83,8 @@ class WavePlan:
     known_thickness: Float[Array, "m"]
     motion: Float[Array, "movers 3"] | None
     """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
+    beams: Beams | None
+    """Of the array; None where they differ from frequency to frequency."""
     config: WaveConfig = static()
 
 
@@ -106,7 +115,11 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz
         unit = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + FAINTEST)
         return Observation(snapshot_to_pas(unit, elements), y, received_power_db(y))
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
-    return Observation(covariance_to_pas(covariance, elements), y, decibels(power))
+    if plan.beams is not None:
+        pas = covariance_to_pas(covariance, plan.beams)
+    else:
+        pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (len(y), *elements.shape[-2:])))
+    return Observation(pas, y, decibels(power))
 
 
 def path_covariances(

@@ -14,7 +14,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from wbgs_jax._util.pytree import pytree
 
 PAS_HEIGHT, PAS_WIDTH = 90, 360
 PAS_SHAPE = (PAS_HEIGHT, PAS_WIDTH)
@@ -100,19 +102,65 @@ def snapshot_to_pas(
     return normalise(cbf(snapshot, steering_vector(positions, jnp.asarray(pas_directions(), positions.dtype))))
 
 
-def covariance_to_pas(
-    covariance: Complex[Array, "*n elements elements"],
-    element_positions: Float[Array, "elements 3"] | Float[Array, "n elements 3"],
-) -> Float[Array, "*n 90 360"]:
+@pytree
+class Beams:
+    """How the squared spectrum of an array follows from the mean product y y^H of its snapshots: linearly, by its lags.
+
+    Lags are the differences of element positions.
+    """
+
+    basis: Float[Array, "pixels terms"]
+    """One, twice the cosine and minus twice the sine of 2 pi lag.k, pixels in row-major order."""
+    lag: Int[Array, "elements elements"]
+    """Which lag every pair of elements has, ..."""
+    once: Bool[Array, "elements elements"]
+    """... and whether it counts: of two pairs with opposite lags one does."""
+
+
+def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
+    """Returns the beams of an array whose element positions (wavelengths) are known on the host."""
+    positions = np.asarray(element_positions, np.float64)
+    lags = np.round(positions[None] - positions[:, None], 9) + 0.0
+    first = np.argmax(np.abs(lags) > 0, -1)
+    once = np.take_along_axis(lags, first[..., None], -1)[..., 0] >= 0
+    different, lag = np.unique(lags[once], axis=0, return_inverse=True)
+    number = np.zeros(once.shape, np.int32)
+    number[once] = lag.reshape(-1)
+    phase = 2 * np.pi * (_pas_directions().reshape(-1, 3) @ different.T)
+    twice = np.where(np.any(different, -1), 2.0, 1.0)
+    basis = np.concatenate([twice * np.cos(phase), -twice * np.sin(phase)], -1)
+    return Beams(jnp.asarray(basis, jnp.float32), jnp.asarray(number), jnp.asarray(once))
+
+
+def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams: Beams) -> Float[Array, "*n 90 360"]:
     """Returns the power angular spectra, each scaled to a maximum of 1, of mean products y y^H of random snapshots: the root of
-    the mean of |a^H y|^2. Element positions are as in `snapshot_to_pas`, which it agrees with where nothing is random."""
-    positions = jnp.asarray(element_positions, covariance.real.dtype)
-    if positions.ndim == 3:
-        return jax.vmap(covariance_to_pas)(covariance, positions)
-    steering = steering_vector(positions, jnp.asarray(pas_directions(), positions.dtype))
-    turned = jnp.einsum("hwe,...ef->...hwf", steering.conj(), covariance, precision=EXACT)
-    power = jnp.sum(turned.real * steering.real - turned.imag * steering.imag, -1)
-    return normalise(jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)))
+    the mean of |a^H y|^2. Covariances have a trace of about 1.
+
+    Where nothing is random it agrees with `snapshot_to_pas`, to the root of single precision.
+    """
+    count, flat = beams.basis.shape[1] // 2, covariance.reshape(-1, *covariance.shape[-2:])
+    counted = jnp.where(beams.once, flat, 0).reshape(len(flat), -1)
+    sums = jax.vmap(lambda pairs: jnp.zeros(count, pairs.dtype).at[beams.lag.reshape(-1)].add(pairs))(counted)
+    power = jnp.matmul(jnp.concatenate([sums.real, sums.imag], -1), beams.basis.T, precision=EXACT)
+    return normalise(jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)).reshape(*covariance.shape[:-2], *PAS_SHAPE))
+
+
+def wide_covariance_to_pas(
+    covariance: Complex[Array, "n elements elements"], element_positions: Float[Array, "n elements 3"]
+) -> Float[Array, "n 90 360"]:
+    """Returns what `covariance_to_pas` does where every covariance has element positions (wavelengths) of its own.
+
+    An array of fixed size in metres has others at every frequency.
+    """
+    grid = jnp.asarray(pas_directions(), covariance.real.dtype)
+
+    def one(own: Complex[Array, "elements elements"], positions: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
+        steering = steering_vector(positions, grid)
+        turned = jnp.matmul(steering.conj(), own, precision=EXACT)
+        power = jnp.sum(turned.real * steering.real - turned.imag * steering.imag, -1)
+        return jnp.sqrt(jnp.maximum(power, FAINTEST_POWER))
+
+    return normalise(jax.vmap(one)(covariance, element_positions))
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, covariance_to_pas, squared_magnitude, steering_vector
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
 
 class Arrivals(NamedTuple):
@@ -88,4 +88,5 @@ def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Fl
     power = squared_magnitude(arrivals.amplitude / jnp.maximum(strongest, FAINTEST))
     steering = steering_vector(elements, arrivals.direction)
     weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
-    return covariance_to_pas(jnp.matmul(steering.T, weighted.conj(), precision=EXACT), elements)
+    covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)
+    return wide_covariance_to_pas(covariance[None], elements[None])[0]
