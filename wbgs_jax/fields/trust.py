@@ -8,7 +8,7 @@ is. The weights are those by which validation links are explained best; where, l
 them no surer than a common share does, they are zero.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -137,7 +137,7 @@ def _ascend(
         worth = _between(scores, share_of(with_learned(learned), features))
         return RIDGE * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
 
-    def step(i: int, carry: tuple) -> tuple:
+    def step(i: Int[Array, ""], carry: Any) -> Any:
         learned, first, second = carry
         gradient = jax.grad(loss)(learned)
         first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, gradient)
