@@ -20,7 +20,7 @@ from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import wave
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.inference.predictor import observe_links, predictor
-from wbgs_jax.radio.array import pas_directions, snapshot_to_pas
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import Links, make_query, make_receiver
@@ -217,6 +217,18 @@ def test_spectra_are_those_of_snapshots_where_places_are_known_and_of_added_powe
     assert np.mean(np.abs(unknown.pas - jax.jit(wave.render)(params, blind, query))) < 0.02
     assert np.mean(np.abs(unknown.pas - known.pas)) > 0.03
     np.testing.assert_array_equal(unknown.snapshots, known.snapshots)
+
+
+def test_an_array_in_metres_is_that_of_its_wavelengths_at_one_frequency(rng):
+    field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), **SMALL)
+    params = dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(2e-3)))
+    query = make_query(rng.uniform([3.5, 0.5, 0.5], [5.5, 3.5, 2.5], (3, 3)), 10e9)
+    metres = dataclasses.replace(
+        plan.receiver, element_positions=plan.receiver.element_positions * (SPEED_OF_LIGHT / 10e9), unit="metres"
+    )
+    fixed = field.plan(params, metres)
+    assert fixed.beams is None and plan.beams is not None
+    np.testing.assert_allclose(jax.jit(wave.render)(params, fixed, query), jax.jit(wave.render)(params, plan, query), atol=2e-3)
 
 
 def test_more_facets_than_can_be_numbered_are_refused():

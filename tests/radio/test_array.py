@@ -189,3 +189,11 @@ def test_beams_of_any_array_add_the_powers_of_what_is_not_coherent(rng):
 
 def test_a_regular_array_has_few_lags():
     assert beams_of(planar_array()).basis.shape == (90 * 360, 2 * 25)  # 49 differences, opposite ones alike
+
+
+def test_of_nothing_there_is_nothing_to_see():
+    nothing = jnp.zeros((1, 16, 16), jnp.complex64)
+    assert not np.any(covariance_to_pas(nothing, beams_of(planar_array())))
+    assert not np.any(wide_covariance_to_pas(nothing, jnp.asarray(planar_array(), jnp.float32)[None]))
+    slope = jax.grad(lambda r: jnp.sum(covariance_to_pas(r * (1 + 0j), beams_of(planar_array()))))(nothing.real)
+    assert np.isfinite(slope).all()

@@ -27,7 +27,7 @@ EXACT = jax.lax.Precision.HIGHEST
 
 
 FAINTEST_POWER = 1e-8
-"""Of a pixel of the spectrum of covariances of unit trace: its root stays differentiable."""
+"""Of a pixel of the spectrum of a covariance of unit trace; what is fainter is nothing."""
 
 
 def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float[np.ndarray, "elements 3"]:
@@ -142,7 +142,7 @@ def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams:
     counted = jnp.where(beams.once, flat, 0).reshape(len(flat), -1)
     sums = jax.vmap(lambda pairs: jnp.zeros(count, pairs.dtype).at[beams.lag.reshape(-1)].add(pairs))(counted)
     power = jnp.matmul(jnp.concatenate([sums.real, sums.imag], -1), beams.basis.T, precision=EXACT)
-    return normalise(jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)).reshape(*covariance.shape[:-2], *PAS_SHAPE))
+    return normalise(_root(power).reshape(*covariance.shape[:-2], *PAS_SHAPE))
 
 
 def wide_covariance_to_pas(
@@ -158,9 +158,14 @@ def wide_covariance_to_pas(
         steering = steering_vector(positions, grid)
         turned = jnp.matmul(steering.conj(), own, precision=EXACT)
         power = jnp.sum(turned.real * steering.real - turned.imag * steering.imag, -1)
-        return jnp.sqrt(jnp.maximum(power, FAINTEST_POWER))
+        return _root(power)
 
     return normalise(jax.vmap(one)(covariance, element_positions))
+
+
+def _root(power: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Returns the root of powers, 0 for the faintest: of nothing there is nothing to see, and no gradient is infinite."""
+    return jnp.where(power > FAINTEST_POWER, jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)), 0)
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
