@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Complex, Float, Int
+from scipy.spatial.transform import Rotation
 
 from wbgs_jax.data import Dataset
 from wbgs_jax.data.dataset import Materials
@@ -72,11 +73,10 @@ def with_wrong_mesh(dataset: Dataset, fault: Fault, rng: np.random.Generator) ->
     turn = np.deg2rad(rng.normal(0, fault.tilted_deg, (part.max() + 1, 3)))
     centre = np.array([vertices[part == k].mean(0) for k in range(part.max() + 1)])
     arm = vertices - centre[part]
-    vertices += np.cross(turn[part], arm) + shift[part]
+    vertices = centre[part] + Rotation.from_rotvec(turn[part]).apply(arm) + shift[part]
     dataset = dataclasses.replace(dataset, vertices=vertices.astype(np.float32))
-    movable = rng.permutation(
-        [k for k in range(part.max() + 1) if np.linalg.norm(np.ptp(arm[part == k], axis=0)) < FURNITURE_M]
-    )
+    sizes = {int(k): np.linalg.norm(np.ptp(arm[part == k], axis=0)) for k in np.unique(part[dataset.faces])}
+    movable = rng.permutation([k for k, size in sizes.items() if size < FURNITURE_M]).astype(int)
     gone, doubled = (movable[: round(share * len(movable))] for share in (fault.missing, fault.added))
     if len(doubled):
         dataset = _doubled(dataset, part, doubled, rng)

@@ -287,8 +287,9 @@ def test_released_files_are_those_of_the_dataset_card(monkeypatch):
     for number, file in files.items():
         assert hashlib.sha256(file.read_bytes()).hexdigest()[:16] == card[f"scene{number}"]
         scene = load_scene(file)
-        assert scene.snapshots.shape[1:] == (1, len(scene.frequencies_hz), 16) and scene.meta["format"] == 1
-        assert (scene.element_unit, scene.element_pattern) == ("wavelengths", "tr38901")
+        unit, edition = ("metres", 2) if number == "2_fixed" else ("wavelengths", 1)
+        assert scene.snapshots.shape[1:] == (1, len(scene.frequencies_hz), 16) and scene.meta["format"] == edition
+        assert (scene.element_unit, scene.element_pattern) == (unit, "tr38901")
 
 
 @pytest.mark.parametrize("save", [save_scene, save_format_1])

@@ -51,10 +51,12 @@ def test_order_is_cumulative(rng):
 
 
 def test_images_are_those_of_the_array(rng):
-    made = paths(rng, [1, 0.5], [0, 1])
     across = np.roll(planar_array(), 1, axis=1)  # in another plane, the same paths make another image
-    assert measure(made, across)["order<=1"] == 1.0
-    assert abs(measure(made, across)["order<=0"] - measure(made)["order<=0"]) > 1e-3
+    differences = []
+    for made in [paths(rng, [1, 0.5], [0, 1]) for _ in range(10)]:
+        assert measure(made, across)["order<=1"] == 1.0
+        differences.append(abs(measure(made, across)["order<=0"] - measure(made)["order<=0"]))
+    assert np.median(differences) > 1e-3
 
 
 def test_nothing_is_measured_without_a_path(rng):

@@ -41,14 +41,15 @@ def test_parts_move_as_a_whole(dataset, rng):
     seed = int(rng.integers(2**31))
     moved = faulty(dataset, Fault(displaced_m=0.05), seed)
     part, step = parts_of(dataset), moved.vertices - dataset.vertices
-    assert part.max() + 1 == len(PARTS)
-    for k in range(len(PARTS)):
+    parts = np.unique(part[dataset.faces])
+    assert len(parts) == len(PARTS)
+    for k in parts:
         np.testing.assert_allclose(step[part == k], step[part == k][:1].repeat((part == k).sum(), 0), atol=1e-5)
     assert 0.02 < step.std() < 0.1
     turned = faulty(dataset, Fault(tilted_deg=1.0), seed).vertices
-    for k in range(len(PARTS)):  # bodies keep their shape
+    for k in parts:  # bodies keep their shape
         own, before = (np.linalg.norm(v[part == k] - v[part == k][0], axis=-1) for v in (turned, dataset.vertices))
-        np.testing.assert_allclose(own, before, atol=5e-3)
+        np.testing.assert_allclose(own, before, atol=1e-4)
     assert np.abs(turned - dataset.vertices).max() > 1e-3
 
 

@@ -108,7 +108,8 @@ def random_arguments(rng, name):
     if name.startswith("wave"):
         start = np.log([3.0, 0.02, np.e, 0.1])  # log susceptibility, log conductivity, slope, log thickness
         materials = params.materials
-        params = replaced(params, materials=with_leaves(materials, *(jax.tree.leaves(materials) + start[:, None])))
+        materials = with_leaves(materials, *(jax.tree.leaves(materials) + start[:, None]))
+        params = replaced(params, materials=materials, placement=params.placement + np.log(3e-3))
     elif name != "nerf2":
         points, gaussians = np.asarray(field.surface.points), params.gaussians
         alive = np.arange(len(gaussians.means)) < len(points)

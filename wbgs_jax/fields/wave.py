@@ -223,7 +223,11 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
 
 
 def _beams(receiver: Receiver) -> Beams | None:
-    return beams_of(np.asarray(receiver.element_positions)) if receiver.unit == "wavelengths" else None
+    """Returns the beams of an array that is the same at all frequencies and known on the host."""
+    positions = receiver.element_positions
+    if receiver.unit != "wavelengths" or isinstance(positions, jax.core.Tracer):
+        return None
+    return beams_of(np.asarray(positions))
 
 
 def _to_device(tree: Any) -> Any:

@@ -84,7 +84,7 @@ class WavePlan:
     motion: Float[Array, "movers 3"] | None
     """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
     beams: Beams | None
-    """Of the array; None where they differ from frequency to frequency."""
+    """Of the array; None where they differ from frequency to frequency, or are traced."""
     config: WaveConfig = static()
 
 

@@ -194,6 +194,9 @@ def corrected(
     return np.concatenate([_correct(neighbours, pas[block], dataset.query(index[block])) for block in blocks])
 
 
+_correct = jax.jit(correct)
+
+
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns the predicted spectra (float32) of some of a dataset's links."""
     return np.asarray(observe_links(field, params, dataset, index).pas)

@@ -165,7 +165,7 @@ def wide_covariance_to_pas(
 
 def _root(power: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Returns the root of powers, 0 for the faintest: of nothing there is nothing to see, and no gradient is infinite."""
-    return jnp.where(power > FAINTEST_POWER, jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)), 0)
+    return jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)) - FAINTEST_POWER**0.5
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
