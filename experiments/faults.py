@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from wbgs_jax.data import Dataset
 from wbgs_jax.data.dataset import Materials
-from wbgs_jax.types import Receiver
 
 FURNITURE_M = 3.0
 """Parts whose bounding box has a shorter diagonal are furniture."""
@@ -111,15 +110,13 @@ def with_wrong_receiver(dataset: Dataset, fault: Fault, rng: np.random.Generator
     """Returns it with a receiver that is said to stand elsewhere, to be turned, or to have isotropic elements."""
     receivers, n = dataset.receivers, dataset.n_receivers
     step, axis = (_directions(rng, n) for _ in range(2))
-    half = np.deg2rad(fault.receiver_deg) / 2
-    turn = np.concatenate([np.full((n, 1), np.cos(half)), np.sin(half) * axis], 1)
-    exponents = receivers.pattern_exponents * (0 if fault.pattern_unknown else 1)
-    wrong = Receiver(
-        jnp.asarray(np.asarray(receivers.position) + fault.receiver_m * step, jnp.float32),
-        jnp.asarray(_product(turn, np.asarray(receivers.orientation)), jnp.float32),
-        receivers.element_positions,
-        exponents,
-        receivers.unit,
+    turn = Rotation.from_rotvec(np.deg2rad(fault.receiver_deg) * axis)
+    xyzw = (turn * Rotation.from_quat(np.roll(receivers.orientation, -1, axis=1))).as_quat()
+    wrong = dataclasses.replace(
+        receivers,
+        position=jnp.asarray(np.asarray(receivers.position) + fault.receiver_m * step, jnp.float32),
+        orientation=jnp.asarray(np.roll(xyzw, 1, axis=1), jnp.float32),
+        pattern_exponents=receivers.pattern_exponents * (0 if fault.pattern_unknown else 1),
     )
     return dataclasses.replace(dataset, receivers=wrong)
 
@@ -149,13 +146,8 @@ def as_images(dataset: Dataset) -> Dataset:
 
 def _without(dataset: Dataset, gone: Bool[np.ndarray, "faces"]) -> Dataset:
     """Returns it without some triangles."""
-    known, part = dataset.materials, dataset.face_part
-    return dataclasses.replace(
-        dataset,
-        faces=dataset.faces[~gone],
-        face_part=None if part is None else part[~gone],
-        materials=known and dataclasses.replace(known, material=known.material[~gone]),
-    )
+    kept = np.flatnonzero(~gone)
+    return _with_triangles(dataset, dataset.faces[kept], kept)
 
 
 def _doubled(
@@ -172,14 +164,18 @@ def _doubled(
         vertices.append((dataset.vertices[own] + [*place[:2], 0]).astype(np.float32))
         faces.append(number[dataset.faces[triangles]].astype(np.int32))
         copied.append(triangles)
-    triangles = np.concatenate(copied)
-    known, parts = dataset.materials, dataset.face_part
+    dataset = dataclasses.replace(dataset, vertices=np.concatenate(vertices))
+    return _with_triangles(dataset, np.concatenate(faces), np.concatenate(copied))
+
+
+def _with_triangles(dataset: Dataset, faces: Int[np.ndarray, "k 3"], like: Int[np.ndarray, "k"]) -> Dataset:
+    """Returns it with other triangles, each of the part and material that an old one has."""
+    known, part = dataset.materials, dataset.face_part
     return dataclasses.replace(
         dataset,
-        vertices=np.concatenate(vertices),
-        faces=np.concatenate(faces),
-        face_part=None if parts is None else parts[triangles],
-        materials=known and dataclasses.replace(known, material=known.material[triangles]),
+        faces=faces,
+        face_part=None if part is None else part[like],
+        materials=known and dataclasses.replace(known, material=known.material[like]),
     )
 
 
@@ -194,10 +190,3 @@ def _noise(
 def _directions(rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 3"]:
     drawn = rng.normal(size=(n, 3))
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
-
-
-def _product(a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Returns the product of quaternions (wxyz): first b, then a."""
-    w, v = a[:, :1], a[:, 1:]
-    scalar = w * b[:, :1] - np.sum(v * b[:, 1:], -1, keepdims=True)
-    return np.concatenate([scalar, w * b[:, 1:] + b[:, :1] * v + np.cross(v, b[:, 1:])], -1)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields.base import Observation
-from wbgs_jax.radio.channel import free_space_db
+from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
@@ -70,10 +70,11 @@ def features(
 ) -> Float[Array, "b features"]:
     """Returns what tells how far the coherent field is right for B queries."""
     octave = jnp.log2(query.frequency_hz / 1e10)
-    range_m = jnp.sqrt(jnp.sum((query.tx_position - rx_position) ** 2, -1) + 1e-4)
-    lit = free_space_db(range_m, query.frequency_hz)
+    link = query.tx_position, rx_position, query.frequency_hz
     beyond = [
-        jnp.zeros_like(octave) if seen.power_db is None else jnp.clip(seen.power_db - lit, -FAINTEST_DB, 0.0)
+        jnp.zeros_like(octave)
+        if seen.power_db is None
+        else jnp.clip(beyond_free_space_db(seen.power_db, *link), -FAINTEST_DB, 0.0)
         for seen in (coherent, blurred)
     ]
     brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, blurred)]

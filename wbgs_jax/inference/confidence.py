@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.radio.channel import free_space_db
+from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query
 
 MARGIN = 0.02
@@ -75,9 +75,10 @@ def features(
     distance = jnp.sqrt(jnp.min(jnp.sum(offset**2, -1), -1) + 1e-4)
     mean, spread = jnp.mean(pas, (-2, -1)), jnp.std(pas, (-2, -1))
     octave = jnp.log2(query.frequency_hz / 1e10)
-    range_m = jnp.sqrt(jnp.sum((query.tx_position - rx_position) ** 2, -1) + 1e-4)
-    lit = free_space_db(range_m, query.frequency_hz)
-    beyond = jnp.zeros_like(octave) if power_db is None else jnp.clip(power_db - lit, *BEYOND_FREE_SPACE_DB)
+    beyond = jnp.zeros_like(octave)
+    if power_db is not None:
+        excess = beyond_free_space_db(power_db, query.tx_position, rx_position, query.frequency_hz)
+        beyond = jnp.clip(excess, *BEYOND_FREE_SPACE_DB)
     return jnp.stack([jnp.log(distance), jnp.log(mean + 1e-3), jnp.log(spread + 1e-3), octave, octave**2, beyond], -1)
 
 

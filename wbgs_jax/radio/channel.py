@@ -48,6 +48,17 @@ def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]
     return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
 
 
+def beyond_free_space_db(
+    power_db: Float[Array, "*b"],
+    tx_position: Float[Array, "*b 3"],
+    rx_position: Float[Array, "3"],
+    frequency_hz: Float[Array, "*b"],
+) -> Float[Array, "*b"]:
+    """Returns received powers relative to those over a line of sight (dB): how deep in the shadow transmitters stand."""
+    distance = jnp.sqrt(jnp.sum((tx_position - rx_position) ** 2, -1) + 1e-4)
+    return power_db - free_space_db(distance, frequency_hz)
+
+
 def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Returns the power of the best conventional beam over that of one element (dB, at most 10 log10 of the elements' number).
 
