@@ -24,7 +24,7 @@ PHASE_DRAWS = 32
 PHASE_SEED = 0
 
 
-def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "ceilings"]:
+def measure(paths: "TxPaths", element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, " ceilings"]:
     """Returns the SSIM of every ceiling in `NAMES` for one transmitter at one frequency; NaN without a path.
 
     Element positions are in wavelengths.

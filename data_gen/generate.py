@@ -9,12 +9,14 @@ A killed run loses at most the batches in progress: the same command goes on whe
 
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from jaxtyping import Int
 
 from data_gen import jobs, statistics
 from data_gen.llvm import CUDA, find_backend
@@ -42,7 +44,7 @@ def generate(options: Options) -> Path:
     job = make_job(options)
     if options.own:
         print(describe(job.spec))
-    out = _writable(options.out or options.default_out())
+    out = writable(options.out or options.default_out())
     backend, _ = find_backend()
     folder = options.work / f"{job.spec.name}-{job.digest(backend)}"
     _compute(job, folder, *_processes(options, backend))
@@ -50,8 +52,9 @@ def generate(options: Options) -> Path:
     return out
 
 
-def _writable(out: Path) -> Path:
-    try:  # now, not after the last batch
+def writable(out: Path) -> Path:
+    """Returns the path of a file to be written, its folder made; what is in the way is told now, not after hours."""
+    try:
         out.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out.parent).close()
     except OSError as error:
@@ -87,7 +90,7 @@ def _assemble(job: jobs.Job, folder: Path, backend: str) -> SceneFile:
         name=spec.name, snapshots=found["snapshots"][:, None], tx_positions=tx, frequencies_hz=np.array(job.frequencies_hz),
         rx_position=np.array([spec.rx_position]), rx_orientation=np.array([spec.rx_orientation]),
         element_positions=job.array.element_positions()[None], element_unit=job.array.unit, element_pattern=job.array.pattern,
-        split=_split(len(tx)),
+        split=draw_split(len(tx)),
         vertices=mesh["vertices"], faces=mesh["faces"], face_part=mesh["face_part"], meta=_provenance(job, backend),
     )  # fmt: skip
     scene.meta.update(
@@ -97,7 +100,8 @@ def _assemble(job: jobs.Job, folder: Path, backend: str) -> SceneFile:
     return scene
 
 
-def _split(n_tx: int) -> np.ndarray:
+def draw_split(n_tx: int) -> Int[np.ndarray, " tx"]:
+    """Returns the split of a scene file (int8): a fifth of the transmitters, drawn by a fixed seed, are test."""
     split = np.zeros(n_tx, np.int8)
     split[tx_disjoint_split(np.arange(n_tx), TEST_FRACTION, SPLIT_SEED)[1]] = TEST
     return split
@@ -107,12 +111,13 @@ def _provenance(job: jobs.Job, backend: str) -> dict[str, Any]:
     # Nothing that differs between two runs: no times, no paths, no host.
     spec, settings = job.spec, job.settings
     interactions = ["line of sight", "specular reflection", "refraction", *["diffraction"] * settings.diffraction]
+    interactions += ["diffuse reflection"] * settings.rough
     return {
         "generator": {"name": "data_gen", "simulator": "NVIDIA Sionna RT", "backend": backend, "versions": jobs.versions()},
         "description": spec.description,
         "parts": spec.part_table(),
         "mesh_sha256": spec.mesh_sha256(),
-        "solver": asdict(settings) | {"interactions": interactions, "synthetic_array": True, "deterministic": True},
+        "solver": settings.record() | {"interactions": interactions, "synthetic_array": True, "deterministic": True},
         "rx_array": asdict(job.array),
         "tx_pattern": "iso", "tx_polarization": "V",
         "split_seed": SPLIT_SEED, "test_fraction": TEST_FRACTION,
@@ -121,13 +126,18 @@ def _provenance(job: jobs.Job, backend: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def say_written(work: Callable[[], Path]) -> None:
+    """Does work that goes on where it was interrupted, and says what file it wrote."""
+    try:
+        print(f"wrote {work()}")
+    except KeyboardInterrupt:
+        raise UserError("interrupted; the same command goes on from here") from None
+
+
 def main() -> None:
     """Runs the command line."""
     options = tyro.cli(Options)
-    try:
-        print(f"wrote {generate(options)}")
-    except KeyboardInterrupt:
-        raise UserError("interrupted; the same command goes on from here") from None
+    say_written(lambda: generate(options))
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ class Job:
         """Returns a checksum of the scene, the transmitters, the array, the frequencies, the settings and the versions."""
         decides = {
             "mesh": self.spec.mesh_sha256(), "rx": self.spec.rx_position, "orientation": self.spec.rx_orientation,
-            "settings": asdict(self.settings), "array": asdict(self.array), "frequencies": self.frequencies_hz,
+            "settings": self.settings.record(), "array": asdict(self.array), "frequencies": self.frequencies_hz,
             "tx": self.tx_positions.tolist(), "ceiling_tx": self.ceiling_tx, "versions": versions(), "backend": backend,
         }  # fmt: skip
         return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:16]

@@ -46,7 +46,7 @@ def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, "edges"]:
+def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, " edges"]:
     """Returns at which of its `face_adjacency_edges` a mesh turns back onto itself, so that two triangles lie on each other."""
     vertices = np.asarray(mesh.vertices)
     start, end = vertices[mesh.face_adjacency_edges].swapaxes(0, 1)

@@ -13,7 +13,7 @@ from data_gen.materials import check_material_frequencies
 from data_gen.own_scene import own_scene
 from data_gen.scenes import SceneSpec, get_scene
 from data_gen.scenes.base import FREQUENCIES_21_HZ
-from data_gen.settings import ArraySettings, SolverSettings
+from data_gen.settings import ArraySettings, Solver, SolverSettings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
 
@@ -97,6 +97,12 @@ class Options(SceneOptions):
     """Interactions a path may have."""
     diffraction: bool = True
     """First-order diffraction."""
+    solver: Solver = SolverSettings.solver
+    """The project's own search, materials and diffraction, or those that the simulator comes with."""
+    scattering: tuple[float, float] = SolverSettings.scattering
+    """Scattering coefficients of walls, floor and ceiling, and of furniture; 0 0 is smooth."""
+    seed: int = SolverSettings.seed
+    """Of all that is drawn at random while paths are searched."""
     ceilings: bool = True
     """Measure what truncated and phase-blind predictors could reach."""
     max_paths: int = SolverSettings.max_paths_per_src
@@ -113,7 +119,10 @@ class Options(SceneOptions):
         if self.own:
             return Path(f"{Path(self.scene).stem}.npz")
         usual = Options()
-        same = ("frequencies", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "ceilings")
+        same = (
+            "frequencies", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "solver", "scattering",
+            "seed", "ceilings",
+        )  # fmt: skip
         if any(getattr(self, name) != getattr(usual, name) for name in same):
             raise UserError("with settings of your own the released file must not be replaced; give another one with --out")
         suffix = "_21f" if self.frequency_set == "21" else ""
@@ -139,7 +148,7 @@ def make_job(options: Options) -> Job:
     check_material_frequencies([p.material for p in spec.parts], frequencies)
     settings = SolverSettings(
         max_depth=options.depth, samples_per_src=options.samples, diffraction=options.diffraction,
-        max_paths_per_src=options.max_paths,
+        max_paths_per_src=options.max_paths, solver=options.solver, scattering=options.scattering, seed=options.seed,
     )  # fmt: skip
     tx = spec.accessible_tx()
     if options.max_tx is not None and options.max_tx < len(tx):
@@ -161,6 +170,10 @@ def _check_numbers(options: Options) -> None:
             raise UserError(
                 f"--{name.replace('_', '-')} is {value}; it must be {'at least 1' if isinstance(value, int) else 'positive'}"
             )
+    if options.seed < 0:
+        raise UserError(f"--seed is {options.seed}; it must not be negative")
+    if not all(0 <= value <= 1 for value in options.scattering):
+        raise UserError(f"--scattering is {options.scattering}; both coefficients must be from 0 to 1")
     if array.spacing <= 0:
         raise UserError(f"--array.spacing is {array.spacing} {array.unit}; it must be positive")
 

@@ -42,7 +42,7 @@ class Slab(NamedTuple):
 class OwnScene(SceneSpec):
     """A scene from a file. Its walls need not close a room: being in it means being in the box around everything."""
 
-    def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points are in the box around all objects."""
         low, high = self.bounds()
         return ((points > low) & (points < high)).all(1)

@@ -95,7 +95,7 @@ def _color(material: str) -> str:
     return COLORS.get(material, OTHER_COLOR)
 
 
-def _plan(axes: Axes, spec: SceneSpec, tx: Float[np.ndarray, "tx 3"], seen: Bool[np.ndarray, "tx"]) -> None:
+def _plan(axes: Axes, spec: SceneSpec, tx: Float[np.ndarray, "tx 3"], seen: Bool[np.ndarray, " tx"]) -> None:
     low, high = spec.bounds()
     for part in spec.parts:
         if part.closed:

@@ -70,7 +70,7 @@ class RayLauncher:
         return ray
 
 
-def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, "planes"]]:
+def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.ndarray, " planes"]]:
     """Returns unit normals and offsets (n.x = offset, metres) of the planes of all single sheets, the largest first."""
     area: dict[tuple[float, ...], float] = {}
     for part in spec.parts:

@@ -74,11 +74,11 @@ def draw(scene: SceneFile, out: Path, receiver: int = 0) -> None:
     plt.close(figure)
 
 
-def _near_to_far(distance: Float[np.ndarray, "tx"]) -> Int[np.ndarray, "k"]:
+def _near_to_far(distance: Float[np.ndarray, " tx"]) -> Int[np.ndarray, " k"]:
     return np.argsort(distance)[_spread(len(distance), TX_SHOWN + 2)[1:-1]]
 
 
-def _spread(length: int, count: int) -> Int[np.ndarray, "k"]:
+def _spread(length: int, count: int) -> Int[np.ndarray, " k"]:
     return np.unique(np.linspace(0, length - 1, count).round().astype(int))
 
 

@@ -1,13 +1,19 @@
 """What decides the result of a solve, apart from the scene itself. Imports no simulator."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.types import ElementUnit
+
+Solver = Literal["project", "simulator"]
+OF_THE_PROJECT = ("rays_per_face", "rays_per_mirrored_face", "diffraction_probability")
+"""Settings of the project's own search, which mean nothing to the simulator's own solver."""
+OF_ROUGHNESS = ("scattering", "samples_diffuse")
+"""Settings that mean nothing while all surfaces are smooth."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,26 @@ class SolverSettings:
     """Of the aimed rays and of the solver's choice between reflection and transmission."""
     tx_per_call: int = 8
     """Transmitters traced together. It belongs to the settings: random numbers depend on the place in a batch."""
+    solver: Solver = "project"
+    """project: the search, materials and diffraction of this folder. simulator: the path solver, materials and diffraction
+    that Sionna RT comes with (`public_solver.py`)."""
+    scattering: tuple[float, float] = (0.0, 0.0)
+    """Scattering coefficients, 0 to 1, of single sheets (walls, floor, ceiling) and of solids. A surface sends this share of
+    the reflected amplitude into all directions (Lambertian, no change of polarisation); 0 is smooth."""
+    samples_diffuse: int = 10_000
+    """Evenly spread rays from every transmitter that search for diffuse paths; the simulator's own solver has one search."""
+
+    @property
+    def rough(self) -> bool:
+        """Whether some surface scatters."""
+        return max(self.scattering) > 0
+
+    def record(self) -> dict[str, Any]:
+        """Returns what decides a result, by name: what has no effect is left out, as if it had never been a setting."""
+        idle = {"solver"} if self.solver == "project" else {*OF_THE_PROJECT, "samples_diffuse"}
+        if not self.rough:
+            idle |= {*OF_ROUGHNESS}
+        return {key: value for key, value in asdict(self).items() if key not in idle}
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,10 +23,11 @@ import sionna.rt as rt
 from jaxtyping import Complex, Float, Int
 
 from data_gen.materials import check_frequency
+from data_gen.public_solver import PublicTracer, public_material
 from data_gen.rays import RayLauncher
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
-from data_gen.trace import BalancedMaterial, PathTracer
+from data_gen.trace import BalancedMaterial, DiffuseTracer, PathTracer
 
 FAINT = 1e-15
 """Amplitude (-300 dB) below which a path is left out. Whether the simulator keeps a path whose power is a denormal number is
@@ -40,12 +42,12 @@ class TxPaths:
 
     coefficients: Complex[np.ndarray, "paths elements"]
     """complex128, carrier phase included, one column a receiver element."""
-    delays: Float[np.ndarray, "paths"]
+    delays: Float[np.ndarray, " paths"]
     """Seconds."""
-    order: Int[np.ndarray, "paths"]
+    order: Int[np.ndarray, " paths"]
     """Number of interactions; 0 is the line of sight."""
 
-    def snapshot(self) -> Complex[np.ndarray, "elements"]:
+    def snapshot(self) -> Complex[np.ndarray, " elements"]:
         """Returns the coherent sum of the paths, complex64."""
         return self.coefficients.sum(0).astype(np.complex64)
 
@@ -66,8 +68,8 @@ class Simulator:
         self.array = array or ArraySettings()
         self.read_back_hz: dict[float, float] = {}
         """What the simulator reported (hertz, float32 inside) for every frequency that was asked."""
-        self._scene = _load(spec, self.array)
-        self._tracer = PathTracer(self._scene, RayLauncher(spec, settings), settings)
+        self._scene = _load(spec, self.array, settings)
+        self._tracers = _tracers(self._scene, spec, settings)
 
     def paths(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]) -> list[list[TxPaths]]:
         """Returns all paths from every transmitter (world frame, metres) to the receiver: by frequency, then by transmitter.
@@ -82,11 +84,12 @@ class Simulator:
         for i, position in enumerate(tx_positions):
             self._scene.add(rt.Transmitter(f"tx{i}", position=[float(value) for value in position]))
         self._set_frequency(frequencies_hz[0])
-        traced = self._tracer.trace()
+        traced = [tracer.trace() for tracer in self._tracers]
         result = []
         for frequency in frequencies_hz:
             self._set_frequency(frequency)
-            result.append(_by_transmitter(self._tracer.fields(traced), frequency, len(tx_positions)))
+            found = [tracer.fields(geometry) for tracer, geometry in zip(self._tracers, traced, strict=True)]
+            result.append(_by_transmitter(found, frequency, len(tx_positions)))
         return result
 
     def _set_frequency(self, frequency_hz: float) -> None:
@@ -100,15 +103,23 @@ class Simulator:
         self.read_back_hz[frequency_hz] = read_back
 
 
-def _load(spec: SceneSpec, array: ArraySettings) -> rt.Scene:
+def _tracers(scene: rt.Scene, spec: SceneSpec, settings: SolverSettings) -> tuple[Any, ...]:
+    """Returns what finds the paths: each has `trace() -> geometry` and `fields(geometry) -> rt.Paths`."""
+    if settings.solver == "simulator":
+        return (PublicTracer(scene, settings),)
+    tracer = PathTracer(scene, RayLauncher(spec, settings), settings)
+    return (tracer, DiffuseTracer(scene, spec, settings)) if settings.rough else (tracer,)
+
+
+def _load(spec: SceneSpec, array: ArraySettings, settings: SolverSettings) -> rt.Scene:
     scene = rt.load_scene()
+    material_of = public_material if settings.solver == "simulator" else BalancedMaterial
     objects = []
     with tempfile.TemporaryDirectory() as folder:
         for i, part in enumerate(spec.parts):  # numbered: a user's object may have a name that no file can have
             file = Path(folder) / f"{i}.ply"
             part.mesh.export(file)
-            material = BalancedMaterial(f"material-{i}", part.material, thickness=part.thickness)
-            material.encloses = part.kind == "shell"
+            material = material_of(f"material-{i}", part, settings)
             objects.append(rt.SceneObject(fname=str(file), name=f"part-{i}", radio_material=material))
         scene.edit(add=objects)
     one = {"num_rows": 1, "num_cols": 1}
@@ -133,22 +144,28 @@ def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
     return [float(yaw), float(pitch), float(roll)]
 
 
-def _by_transmitter(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[TxPaths]:
+def _by_transmitter(found: Sequence[rt.Paths], frequency_hz: float, n_tx: int) -> list[TxPaths]:
+    parts = [_arrays(paths, frequency_hz, n_tx) for paths in found]
+    return [_sorted_paths(*map(np.concatenate, zip(*(part[i] for part in parts), strict=True))) for i in range(n_tx)]
+
+
+def _arrays(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Returns the coefficients (paths, elements), delays and numbers of interactions of every transmitter's paths."""
     # a: (receiver, element, tx, tx element, path); tau, valid: (receiver, tx, path); interactions: (depth, receiver, tx, path).
     real, imaginary = (np.array(x)[0, :, :, 0].astype(np.float64) for x in found.a)
     if found.tau.shape[-1] == 0:
-        return [_sorted_paths(np.zeros((0, len(real)), complex), np.zeros(0), np.zeros(0, int))] * n_tx
+        return [(np.zeros((0, len(real)), complex), np.zeros(0), np.zeros(0, int))] * n_tx
     delays = np.array(found.tau)[0].astype(np.float64)
     carrier = np.exp(-2j * np.pi * np.mod(frequency_hz * delays, 1.0))
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]
     valid = np.array(found.valid)[0]
     order = (np.array(found.interactions)[:, 0] != rt.InteractionType.NONE).sum(0)
     valid &= np.abs(coefficients).max(-1) > FAINT
-    return [_sorted_paths(coefficients[i, valid[i]], delays[i, valid[i]], order[i, valid[i]]) for i in range(n_tx)]
+    return [(coefficients[i, valid[i]], delays[i, valid[i]], order[i, valid[i]]) for i in range(n_tx)]
 
 
 def _sorted_paths(
-    coefficients: Complex[np.ndarray, "paths elements"], delays: Float[np.ndarray, "paths"], order: Int[np.ndarray, "paths"]
+    coefficients: Complex[np.ndarray, "paths elements"], delays: Float[np.ndarray, " paths"], order: Int[np.ndarray, " paths"]
 ) -> TxPaths:
     # Two elements break the ties of mirrored paths, which arrive at the same time and equally strong.
     first, last = coefficients[:, 0], coefficients[:, -1]

@@ -8,23 +8,39 @@ Only diffraction differs, where the solver is wrong (`utd.py`).
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import sionna.rt as rt
+from jaxtyping import Int
 from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from sionna.rt.radio_materials.itu import itu_material
 
 from data_gen.materials import own_law
 from data_gen.rays import RayLauncher
+from data_gen.scenes.base import Part, SceneSpec
 from data_gen.settings import SolverSettings
 from data_gen.utd import diffraction_matrix, end_unused_vertices
 from wbgs_jax._util.errors import UserError
+
+
+def electrical_constants(material: str) -> Callable[[Any], tuple[Any, Any]]:
+    """Returns the law by which relative permittivity and conductivity (S/m) of a material follow the frequency (hertz)."""
+    law = own_law(material)
+
+    def constants(frequency_hz: Any) -> tuple[Any, Any]:
+        if law is None:
+            return itu_material(material, frequency_hz)
+        ghz = frequency_hz / 1e9
+        return law.a * dr.power(ghz, law.b), law.c * dr.power(ghz, law.d)
+
+    return constants
 
 
 class BalancedMaterial(rt.RadioMaterial):
@@ -32,22 +48,22 @@ class BalancedMaterial(rt.RadioMaterial):
 
     Sionna draws reflection or transmission by their power. At 1 GHz walls transmit nearly everything, rays leave the room and
     most reflected paths are never found, while at 94 GHz nothing passes through concrete. With equal chances the paths that
-    are found do not depend on the frequency. What a path carries is computed from the exact coefficients, not from chances.
+    are found do not depend on the frequency. What a path carries is computed from the exact coefficients, not from chances;
+    diffuse paths alone, of which each stands for many, are divided by their chance.
     """
 
     encloses: bool = False
     """Part of the room's outer surface: rays are only reflected, for what leaves the room does not come back."""
 
-    def __init__(self, name: str, material: str, thickness: float) -> None:
-        law = own_law(material)
-
-        def constants(frequency_hz: Any) -> tuple[Any, Any]:
-            if law is None:
-                return itu_material(material, frequency_hz)
-            ghz = frequency_hz / 1e9
-            return law.a * dr.power(ghz, law.b), law.c * dr.power(ghz, law.d)
-
-        super().__init__(name, thickness=thickness, frequency_update_callback=constants, color=(0.5, 0.5, 0.5))
+    def __init__(self, name: str, part: Part, settings: SolverSettings) -> None:
+        super().__init__(
+            name,
+            thickness=part.thickness,
+            scattering_coefficient=settings.scattering[part.closed],
+            frequency_update_callback=electrical_constants(part.material),
+            color=(0.5, 0.5, 0.5),
+        )
+        self.encloses = part.kind == "shell"
 
     def _event_probabilities(
         self, r_te: Any, r_tm: Any, t_te: Any, t_tm: Any, enabled_interactions: Any
@@ -58,11 +74,12 @@ class BalancedMaterial(rt.RadioMaterial):
         # Metal lets nothing through: no ray is wasted on it.
         through = dr.squared_norm(mi.Vector2f(dr.abs(t_te), dr.abs(t_tm)))
         reflect = chance(enabled_interactions & rt.InteractionType.SPECULAR > 0)
+        scatter = chance((enabled_interactions & rt.InteractionType.DIFFUSE > 0) & (self.scattering_coefficient > 0))
         transmit = chance((enabled_interactions & rt.InteractionType.REFRACTION > 0) & (through > 0) & (not self.encloses))
-        total = reflect + transmit
+        total = reflect + scatter + transmit
         nothing = total == 0
         scale = dr.select(nothing, 1, dr.rcp(total))
-        return reflect * scale, mi.Float(0), transmit * scale, nothing
+        return reflect * scale, scatter * scale, transmit * scale, nothing
 
     def _diffraction_matrix(
         self, to_world: Any, ki_local: Any, ko_local: Any, si: Any, eta: Any, wavenumber: Any
@@ -82,7 +99,12 @@ def _launching(rays: RayLauncher) -> Iterator[None]:
 
 
 class PathTracer:
-    """Traces the paths between the transmitters and the receiver that a scene holds, and gives the fields they carry."""
+    """Traces the paths between the transmitters and the receiver that a scene holds, and gives the fields they carry.
+
+    All but diffuse ones, which `DiffuseTracer` finds.
+    """
+
+    _diffuse = False
 
     def __init__(self, scene: rt.Scene, rays: RayLauncher, settings: SolverSettings) -> None:
         solver = rt.PathSolver(deterministic=True)
@@ -106,18 +128,20 @@ class PathTracer:
             paths = self._candidates(
                 mi_scene=scene, src_positions=sources[0], tgt_positions=targets[0], samples_per_src=self._rays.count,
                 max_num_paths_per_src=options.max_paths_per_src, max_depth=options.max_depth, los=True,
-                specular_reflection=True, diffuse_reflection=False, refraction=True, diffraction=options.diffraction,
+                specular_reflection=True, diffuse_reflection=self._diffuse, refraction=True, diffraction=options.diffraction,
                 edge_diffraction=False, seed=options.seed,
             )  # fmt: skip
         paths.schedule()
         dr.eval()
         paths.shrink()
-        self._check_room(np.array(paths.source_indices))
+        check_room(np.array(paths.source_indices), options)
         paths.detach_geometry()
         paths = self._image_method(
             scene=scene, paths=paths, src_positions=sources[0], tgt_positions=targets[0], diffraction=options.diffraction,
             diffraction_lit_region=True,
         )  # fmt: skip
+        if self._diffuse:
+            _keep_diffuse(paths)
         paths.discard_invalid()
         end_unused_vertices(paths, targets[0])
         return paths
@@ -142,9 +166,33 @@ class PathTracer:
         """Returns positions, orientations, element positions and velocities of the transmitters and of the receiver."""
         return self._scene.sources(True, True), self._scene.targets(True, True)
 
-    def _check_room(self, source_indices: np.ndarray) -> None:
-        limit = self._settings.max_paths_per_src
-        full = np.flatnonzero(np.bincount(source_indices) >= limit)
-        if len(full):
-            where = f"transmitter {full[0]} of the batch and {len(full) - 1} more"
-            raise UserError(f"more than {limit} candidate paths at {where}; raise --max-paths")
+
+class DiffuseTracer(PathTracer):
+    """Traces the paths with a diffuse reflection, and no others.
+
+    A diffuse path stands for the part of a surface that its ray meets, so rays must be even over the sphere: those aimed at
+    edges would count furniture many times. Sionna allows no path with both a diffuse reflection and a diffraction.
+    """
+
+    _diffuse = True
+
+    def __init__(self, scene: rt.Scene, spec: SceneSpec, settings: SolverSettings) -> None:
+        even = replace(settings, diffraction=False, samples_per_src=settings.samples_diffuse)
+        super().__init__(scene, RayLauncher(spec, even), even)
+
+
+def check_room(source_indices: Int[np.ndarray, " candidates"], settings: SolverSettings) -> None:
+    """Raises a `UserError` when a transmitter has filled its part of the buffer, for what came later was dropped."""
+    limit = settings.max_paths_per_src
+    full = np.flatnonzero(np.bincount(source_indices) >= limit)
+    if len(full):
+        where = f"transmitter {full[0]} of the batch and {len(full) - 1} more"
+        raise UserError(f"more than {limit} candidate paths at {where}; raise --max-paths")
+
+
+def _keep_diffuse(paths: PathsBuffer) -> None:
+    """Marks all other paths as invalid."""
+    found = dr.zeros(mi.Bool, paths.buffer_size)
+    for depth in range(1, paths.max_depth + 1):
+        found |= paths.get_interaction_type(mi.UInt(depth), mi.Bool(True)) == rt.InteractionType.DIFFUSE
+    paths.valid &= found

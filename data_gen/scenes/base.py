@@ -92,17 +92,17 @@ class SceneSpec:
         corners = np.concatenate([p.mesh.bounds for p in self.parts])
         return np.stack([corners.min(0), corners.max(0)])
 
-    def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
         low, high = self.bounds()
         outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # askew, to meet no edge of a wall
         return crossings(self.mesh("shell"), points, outside) % 2 == 1
 
-    def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns from which points nothing, not even glass, hides the receiver."""
         return crossings(self.mesh(), points, np.asarray(self.rx_position)) == 0
 
-    def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points are inside a solid."""
         inside = np.zeros(len(points), bool)
         for p in self.solids:
@@ -110,7 +110,7 @@ class SceneSpec:
             inside[near] |= np.abs(winding_number(p.mesh, points[near])) > 0.5
         return inside
 
-    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Returns the distance (metres) of every point to the nearest surface."""
         return distance(self.mesh(), points)
 

@@ -36,7 +36,7 @@ def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
 
 
-def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Returns how often a closed mesh goes around every point: 0 outside, 1 or -1 inside (from its triangles' solid angles)."""
     step = max(1, CHUNK // max(1, len(mesh.faces)))
     each = [_solid_angles(mesh, points[i : i + step]).sum(1) for i in range(0, len(points), step)]
@@ -51,7 +51,7 @@ def _solid_angles(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Fl
     return 2 * np.arctan2(triple, below)
 
 
-def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, "n"]:
+def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, " n"]:
     """Returns how many triangles of a mesh the straight segment from every start to the one end goes through."""
     if not len(start) or not len(mesh.faces):
         return np.zeros(len(start), int)
@@ -63,7 +63,7 @@ def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float
     return np.bincount(rays[before_end], minlength=len(start))
 
 
-def distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Returns the distance of every point to the nearest place on a mesh."""
     _demand_rtree()
     return trimesh.proximity.closest_point(mesh, points)[1] if len(points) else np.zeros(0)

@@ -180,6 +180,8 @@ def test_no_path_at_all_is_told_after_the_first_batch(simulator_backend, tmp_pat
         ({"workers": 0}, "--workers"),
         ({"max_tx": 0}, "--max-tx"),
         ({"samples": 0}, "--samples"),
+        ({"scattering": (0.3, 1.2)}, "--scattering"),
+        ({"seed": -1}, "--seed"),
         ({"depth": 0}, "--depth"),
     ],
 )
@@ -200,7 +202,8 @@ def test_released_files_are_not_replaced_by_others():
     assert Options().default_out() == RELEASED / "scene1.npz"
     assert Options(scene="3", frequency_set="21").default_out().name == "scene3_21f.npz"
     assert Options(scene="rooms/office.glb", samples=7).default_out() == Path("office.npz")
-    for changes in ({"samples": 7}, {"depth": 2}, {"diffraction": False}, {"array": ArraySettings(rows=8)}, {"max_tx": 3}):
+    for changes in ({"samples": 7}, {"depth": 2}, {"diffraction": False}, {"array": ArraySettings(rows=8)}, {"max_tx": 3},
+                    {"solver": "simulator"}, {"scattering": (0.0, 0.1)}, {"seed": 1}):  # fmt: skip
         with pytest.raises(UserError, match="--out"):
             Options(**changes).default_out()
 
@@ -208,7 +211,9 @@ def test_released_files_are_not_replaced_by_others():
 def test_the_checksum_sees_everything_that_decides(monkeypatch):
     monkeypatch.setattr(jobs, "versions", lambda: {"sionna-rt": "any"})  # the simulator need not be installed
     job = make_job(Options(max_tx=5))
-    settings = [{"samples_per_src": 7}, {"max_depth": 2}, {"diffraction": False}, {"seed": 1}, {"tx_per_call": 2}]
+    settings = [{"samples_per_src": 7}, {"max_depth": 2}, {"diffraction": False}, {"seed": 1}, {"tx_per_call": 2},
+                {"solver": "simulator"}, {"scattering": (0.3, 0)}, {"scattering": (0, 0.3)},
+                {"scattering": (0.3, 0), "samples_diffuse": 7}]  # fmt: skip
     others = [dataclasses.replace(job, settings=dataclasses.replace(job.settings, **change)) for change in settings]
     others += [
         dataclasses.replace(job, tx_positions=job.tx_positions[:-1]),
@@ -218,6 +223,7 @@ def test_the_checksum_sees_everything_that_decides(monkeypatch):
         dataclasses.replace(job, spec=dataclasses.replace(job.spec, rx_orientation=(0.0, 0.0, 0.0, 1.0))),
         dataclasses.replace(job, spec=dataclasses.replace(job.spec, parts=job.spec.parts[:-1])),
     ]
+    assert job.digest("llvm") == "d97c520e9aab8af6"  # unfinished work of before is found, and what it was is not changed
     digests = {job.digest("llvm"), job.digest("cuda"), *(other.digest("llvm") for other in others)}
     assert len(digests) == len(others) + 2
     assert job.digest("llvm") == make_job(Options(max_tx=5, workers=3, threads=1)).digest("llvm")

@@ -20,7 +20,7 @@ def load(settings):
     simulator = Simulator(get_scene(1), settings)
     for i, position in enumerate(get_scene(1).accessible_tx()[[40, 333, 666]].tolist()):
         simulator._scene.add(rt.Transmitter(f"tx{i}", position=position))
-    return simulator._scene, simulator._tracer
+    return simulator._scene, simulator._tracers[0]
 
 
 def tune(scene, frequency):

@@ -34,7 +34,7 @@ class SceneFile:
 
     name: str
     tx_positions: Float[np.ndarray, "tx 3"]
-    frequencies_hz: Float[np.ndarray, "freq"]
+    frequencies_hz: Float[np.ndarray, " freq"]
     rx_position: Float[np.ndarray, "rx 3"]
     rx_orientation: Float[np.ndarray, "rx 4"]
     """Unit quaternions, wxyz, local to world."""
@@ -44,9 +44,9 @@ class SceneFile:
     """float32."""
     faces: Int[np.ndarray, "faces 3"]
     """int32."""
-    face_part: Int[np.ndarray, "faces"]
+    face_part: Int[np.ndarray, " faces"]
     """int32 index into meta["parts"], a list of {"name", "material", "thickness"}."""
-    split: Int[np.ndarray, "tx"]
+    split: Int[np.ndarray, " tx"]
     """int8: 0 train, 1 test, 2 validation; one value a TX, shared by all receivers and frequencies."""
     snapshots: Complex[np.ndarray, "tx rx freq elements"] | None = None
     """complex64, carrier phase included."""

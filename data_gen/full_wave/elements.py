@@ -1,0 +1,92 @@
+"""The long part: one run an element of the array, each kept as soon as it is done.
+
+By reciprocity the voltage at an element of a current at a transmitter is that at the transmitter of the same current at the
+element: 16 runs serve all transmitters. An element's result is a file, written whole or not at all, in a folder whose name
+contains a checksum of everything that decides it; a run finds what an earlier one with the same settings left.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex
+
+from data_gen.full_wave.cabin import FREQUENCIES_HZ, RX_POSITION, cabin_blocks, cabin_bounds, cabin_spec, element_positions
+from data_gen.full_wave.calibration import CALIBRATION_DURATION, Scale, Solver, calibrate
+from data_gen.full_wave.model import MARGIN, MEDIA, PML_CELLS, REFERENCE_HZ, Model
+from data_gen.scenes.geometry import Vec3
+from wbgs_jax._util.command import say
+from wbgs_jax._util.files import atomic_write
+
+
+class ElementResult(NamedTuple):
+    """What one element sees of all transmitters."""
+
+    values: Complex[np.ndarray, "tx freq"]
+    decay_db: float
+    seconds: float
+
+
+def cabin_model(cell: float, duration: float) -> Model:
+    """Returns the cabin for the solver, a point at every transmitter."""
+    low, high = cabin_bounds()
+    return Model(
+        blocks=tuple(cabin_blocks()), low=_out(low, -MARGIN), high=_out(high, MARGIN), cell=cell,
+        points=cabin_spec().tx_grid, frequencies_hz=FREQUENCIES_HZ, duration=duration,
+    )  # fmt: skip
+
+
+def sources(rx_position: Vec3 = RX_POSITION) -> list[Vec3]:
+    """Returns the places of the elements in the world frame, metres; the array is not turned."""
+    places = np.round(element_positions() + np.asarray(rx_position), 6)
+    return [(x, y, z) for x, y, z in places.tolist()]
+
+
+def digest(model: Model, solver: str) -> str:
+    """Returns a checksum of the model, of how it is discretised and of the solver's version."""
+    decides = {
+        "blocks": model.blocks, "low": model.low, "high": model.high, "cell": model.cell, "points": model.points.tolist(),
+        "frequencies": model.frequencies_hz, "duration": model.duration, "media": MEDIA, "reference": REFERENCE_HZ,
+        "pml": PML_CELLS, "calibration": CALIBRATION_DURATION, "solver": solver,
+    }  # fmt: skip
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def get_scale(solve: Solver, model: Model, folder: Path) -> Scale:
+    """Returns the scale of the source, from its file or from a run in free space."""
+    file = folder / "scale.npz"
+    if not file.exists():
+        scale = calibrate(solve, model.cell, model.frequencies_hz)
+        with atomic_write(file) as stream:
+            np.savez(stream, **scale._asdict())
+    with np.load(file) as archive:
+        return Scale(archive["factor"], archive["error"])
+
+
+def get_element(solve: Solver, model: Model, scale: Scale, source: Vec3, file: Path) -> ElementResult:
+    """Returns what an element at `source` (metres) sees, from its file or from a run."""
+    if not file.exists():
+        solution = solve(model, source)
+        say(f"{file.stem}: decayed to {solution.decay_db:.1f} dB, {solution.seconds:.0f} s")
+        with atomic_write(file) as stream:
+            np.savez(stream, values=solution.field * scale.factor, decay_db=solution.decay_db, seconds=solution.seconds)
+    with np.load(file) as archive:
+        return ElementResult(archive["values"], float(archive["decay_db"]), float(archive["seconds"]))
+
+
+def element_file(folder: Path, element: int) -> Path:
+    """Returns where the result of an element lies."""
+    return folder / f"element{element:02d}.npz"
+
+
+def snapshots_of(results: Sequence[ElementResult]) -> Complex[np.ndarray, "tx 1 freq elements"]:
+    """Returns the array's snapshots of all transmitters (complex64) of the results of its elements, in their order."""
+    return np.stack([result.values for result in results], -1)[:, None].astype(np.complex64)
+
+
+def _out(corner: Vec3, by: float) -> Vec3:
+    x, y, z = (round(value + by, 6) for value in corner)
+    return x, y, z
