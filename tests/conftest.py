@@ -1,9 +1,10 @@
 """Fixtures shared by all tests: a fresh, printed random seed and the optional folder of published data."""
 
+import gc
 import os
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,9 +18,11 @@ if not os.environ.get("WBGS_TEST_OPTIMISED"):
         FAST_TO_COMPILE.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FAST_TO_COMPILE]).strip()
 
+import jax
 import numpy as np
 import pytest
 
+MOST_MAPS = 25_000
 SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
 
 
@@ -41,6 +44,17 @@ def pytest_report_header(config: pytest.Config) -> str:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if config.option.verbose < 0:  # pytest -q prints no header
         terminalreporter.write_line(pytest_report_header(config))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs_in_memory() -> Iterator[None]:
+    """Forgets compiled programs when there are many: each takes memory maps, of which Linux gives a process 65,530, and where
+    they end XLA ends the process."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from .fields.losses import image_loss as image_loss
 from .fields.losses import ssim as ssim
 from .fields.wave import WaveConfig as WaveConfig
 from .fields.wideband import WidebandConfig as WidebandConfig
+from .inference.confidence import expected_power as expected_power
 from .inference.confidence import expected_ssim as expected_ssim
 from .inference.export import export_field as export_field
 from .inference.export import load_exported as load_exported
@@ -29,6 +30,7 @@ from .inference.maps import map_queries as map_queries
 from .inference.maps import predict_blocks as predict_blocks
 from .inference.maps import predict_many as predict_many
 from .inference.maps import predict_map as predict_map
+from .inference.predictor import at_receiver as at_receiver
 from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
 from .radio.array import cbf as cbf

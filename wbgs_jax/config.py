@@ -66,6 +66,8 @@ class SearchConfig:
     """Times all materials are gone through, at most; 0: no search for materials."""
     spectra: int = 384
     """Training spectra that are looked at."""
+    glance: int = 24
+    """The first of them, by which the materials of the list are narrowed down to a few."""
     sure: float = 2.0
     """Standard errors by which what has been learned must fit better than every known material to be kept."""
     antenna_rounds: int = 2
@@ -74,12 +76,18 @@ class SearchConfig:
     """Training spectra that are looked at for them."""
     antenna_sure: float = 3.0
     """Standard errors by which another antenna must fit better than the one that is there."""
-    geometry_steps: int = 360
+    ideal_spectra: int = 96
+    """Training spectra that are looked at for what ray tracers leave out."""
+    geometry_steps: int = 240
     """Steps at every frequency in which surfaces of a doubtful mesh are moved; 0: the mesh stays as it is."""
+    geometry_doubt: float = 5e-4
+    """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
     geometry_tx: int = 160
     """Transmitters that are looked at for that."""
     geometry_width: float = 0.02
     """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""
+    geometry_spectra: int = 64
+    """Training spectra that are looked at to name materials on the way."""
     placement_spectra: int = 96
     """Training spectra that are looked at for how far they may still be off."""
 

@@ -66,6 +66,8 @@ def main(arguments: list[str] | None = None) -> None:
         folder = command.run / with_part("pictures", command.part)
         for path in pictures.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
+        if (displaced := trained.field.displaced_surfaces()) is not None:
+            console.print(f"picture: {pictures.draw_motion(folder, *displaced)}")
     if command.json:
         print(json.dumps(report, allow_nan=False))
         return

@@ -2,6 +2,7 @@
 
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
 wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
+wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --out elsewhere.npz
 wbgs-jax predict --run RUN --export field.zip
 """
 
@@ -9,13 +10,12 @@ import wbgs_jax._util.quiet
 
 # isort: split
 
+import dataclasses
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -29,20 +29,18 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.fields import Field, Observation, field_names, get_field
-from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import check_power, observe_queries, trained_band
-from wbgs_jax.propagation.transport import snapshots_from_paths
-from wbgs_jax.radio import channel
-from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
+from wbgs_jax.inference.predictor import at_receiver, observe_queries, trained_band
+from wbgs_jax.inference.quantities import ask_channel
 from wbgs_jax.training.run_folder import TrainedField, load_trained
-from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Query, Receiver, make_query
+from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver, make_query
 
 SHOWN = 12
 """Spectra in a picture."""
+SHORTEST = 1e-3
+"""Of quaternions that are taken."""
 SUFFIXES = {"out": ".npz", "picture": ".png", "export": ".zip"}
 
 
@@ -56,6 +54,9 @@ class Command:
     """Transmitters, each as x,y,z in metres (world frame)."""
     ghz: tuple[float, ...] = ()
     """Frequencies, 1 to 100; every transmitter is asked at every one of them."""
+    rx: str = ""
+    """Another receiver than the trained one: x,y,z in metres, or x,y,z,w,i,j,k with the quaternion that turns its array into
+    the world frame. Array and pattern stay. Only fields with paths know others."""
     what: Literal["spectra", "snapshot", "power", "beamforming-gain", "k-factor", "delay-spread"] = "spectra"
     """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
     out: Path | None = None
@@ -73,7 +74,7 @@ class Spectra:
     pas: Float[np.ndarray, "tx freq 90 360"]
     """float32."""
     tx_positions: Float[np.ndarray, "tx 3"]
-    frequencies_hz: Float[np.ndarray, "freq"]
+    frequencies_hz: Float[np.ndarray, " freq"]
     expected: Float[np.ndarray, "tx freq 3"] | None = None
     """Expected SSIM of every answer, and the ends of its interval; None where a run does not know how sure it is."""
 
@@ -93,7 +94,22 @@ def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
     return np.array([parse(word) for word in words]).reshape(-1, 3)
 
 
-def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, "freq"]:
+def receiver_at(word: str, like: Receiver) -> Receiver:
+    """Returns a receiver from "x,y,z" or "x,y,z,w,i,j,k", otherwise like another; anything else is a `UserError`."""
+    if not word:
+        return like
+    try:
+        values = np.array([float(part) for part in word.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
+    if len(values) not in (3, 7) or not np.isfinite(values).all() or not SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST:
+        raise UserError(f"--rx {word} is no receiver; give x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
+    unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
+    return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
+
+
+def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, " freq"]:
     """Returns hertz; outside the band of the model is a `UserError`."""
     low, high = MIN_FREQUENCY_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
     if wrong := [f for f in ghz if not low <= f <= high]:
@@ -116,11 +132,17 @@ def check(command: Command) -> None:
         raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
 
 
-def doubts(dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]) -> list[str]:
+def doubts(
+    dataset: Dataset,
+    rx: Float[np.ndarray, "3"],
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+) -> list[str]:
     """Returns why some of the answers should not be trusted: one line each."""
     (low, high), band = DatasetScene(dataset).box, trained_band(dataset)
     box = f"the box of {dataset.name}, {_point(low)} to {_point(high)}"
-    lines = [f"TX {_point(tx)} lies outside {box}" for tx in tx_positions if ((tx < low) | (tx > high)).any()]
+    places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
+    lines = [f"{end} {_point(place)} lies outside {box}" for end, place in places if ((place < low) | (place > high)).any()]
     trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
     lines += [f"{f / 1e9:g} GHz lies outside {trained}" for f in frequencies_hz if not band[0] <= f <= band[1]]
     return lines
@@ -130,15 +152,22 @@ def _point(position: Float[np.ndarray, "3"]) -> str:
     return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
 
 
+def _link(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
+    return f"TX {_point(tx_position)} at {frequency_hz / 1e9:g} GHz"
+
+
 def ask(
-    trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, "freq"]
+    trained: TrainedField,
+    receiver: Receiver,
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
 ) -> Spectra:
     """Returns the spectra of every transmitter at every frequency."""
     shape = len(tx_positions), len(frequencies_hz)
     tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
-    seen = observe_queries(trained, dataset.receiver(), make_query(tx, frequency))
+    seen = observe_queries(trained, receiver, make_query(tx, frequency))
     pas, power = np.asarray(seen.pas), None if seen.power_db is None else np.asarray(seen.power_db)
-    confidence = for_receiver(trained.confidence, dataset.receiver())
+    confidence = for_receiver(trained.confidence, receiver)
     expected = None
     if confidence is not None:
         expected = np.stack(expect_many(confidence, pas, tx, frequency, power), -1).reshape(*shape, 3)
@@ -153,93 +182,43 @@ def sureness(spectra: Spectra) -> list[str]:
     for (tx, frequency), (ssim, low, high) in zip(
         np.ndindex(spectra.expected.shape[:2]), spectra.expected.reshape(-1, 3), strict=True
     ):
-        where = f"TX {_point(spectra.tx_positions[tx])} at {spectra.frequencies_hz[frequency] / 1e9:g} GHz"
+        where = _link(spectra.tx_positions[tx], spectra.frequencies_hz[frequency])
         lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
     return lines[:SHOWN]
 
 
-def ask_channel(
-    what: str, trained: TrainedField, dataset: Dataset, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Returns {name with unit: values (tx, freq) or (tx, freq, elements)} of every transmitter at every frequency.
-
-    Raises:
-        UserError: the field knows nothing of it.
-    """
-    enough = {"paths", OBSERVED.get(what, "paths")}
-    if not enough & set(trained.field.known()):
-        able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
-        raise UserError(f"the {trained.config.field} field has no {what}, only spectra; train --field {able}")
-    if what == "power":
-        check_power(trained.field, dataset)
-    plan = trained.field.plan(trained.params, dataset.receiver())
-    name, function = CHANNEL[what]
-
-    measure = jax.jit(function)
-
-    def one(tx: Any, frequency: Any) -> np.ndarray:
-        query = Query(tx[None], frequency[None])
-        if what in OBSERVED:
-            return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name)[0])
-        found = _arrivals(trained.field, trained.params, plan, query)
-        return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), dataset.receiver(), frequency))
-
-    positions, frequencies = (jnp.asarray(a, jnp.float32) for a in (tx_positions, frequencies_hz))
-    rows = [[one(tx, f) for f in frequencies] for tx in positions]
-    return {name: np.array(rows), "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
+def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
+    """Returns the first `SHOWN` received powers, and how sure they are: one line each; nothing of other quantities."""
+    if "within_db" not in answer:
+        return []
+    lines = []
+    for place, power in np.ndenumerate(answer["power_db"]):
+        where = _link(answer["tx_positions"][place[0]], answer["frequencies_hz"][place[1]])
+        expected, within = (answer[name][place] for name in ("expected_error_db", "within_db"))
+        sure = f"expected {expected:.1f} dB off, {100 * LEVEL:.0f} % within {within:.1f} dB"
+        lines.append(f"{where}: {power:.1f} dB of the transmitted power; {sure}")
+    return lines[:SHOWN]
 
 
-@jax.jit
-def _observe(field: Field, params: Any, plan: Any, query: Query) -> Observation:
-    return field.render(params, plan, query)
-
-
-@jax.jit
-def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> channel.Arrivals:
-    return field.arrivals(params, plan, query)
-
-
-def _power(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    return channel.received_power_db(snapshots_from_paths(arrivals, receiver, frequency_hz))
-
-
-def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    y = snapshots_from_paths(arrivals, receiver, frequency_hz)
-    directions = jnp.asarray(pas_directions(), jnp.float32)
-    return channel.beamforming_gain_db(
-        y, jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
-    )
-
-
-CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]] = {
-    "snapshot": ("snapshots", snapshots_from_paths),
-    "power": ("power_db", _power),
-    "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
-    "k-factor": ("k_factor_db", lambda arrivals, *_: channel.k_factor_db(arrivals)),
-    "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
-}
-"""Name in the file, and how it follows from what arrives."""
-OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
-"""What a field says of itself, without a look at its paths."""
-
-
-def write_channel(path: Path, answer: dict[str, np.ndarray], trained: TrainedField, dataset: Dataset) -> None:
+def write_channel(path: Path, answer: dict[str, np.ndarray], source: dict[str, Any]) -> None:
     """Writes the answer's arrays, and where they come from as JSON text in `meta`."""
     arrays: dict[str, Any] = answer
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(_source(trained, dataset))))
+        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(source)))
 
 
-def _source(trained: TrainedField, dataset: Dataset) -> dict[str, Any]:
-    return {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
+def _source(trained: TrainedField, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
+    asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
+    origin = {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
+    return origin | {"receiver": asked}
 
 
-def write_spectra(path: Path, spectra: Spectra, trained: TrainedField, dataset: Dataset) -> None:
+def write_spectra(path: Path, spectra: Spectra, source: dict[str, Any]) -> None:
     """Writes `pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, `expected` (tx, freq, 3) if it is known, and where
     they come from as JSON text in `meta`."""
     arrays = {name: value for name, value in vars(spectra).items() if value is not None}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(_source(trained, dataset))))
+        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(source)))
 
 
 def draw(spectra: Spectra) -> Figure:
@@ -276,18 +255,23 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
     if not (command.out or command.picture):
         return
-    for line in doubts(dataset, tx_positions, frequencies_hz):
+    receiver = receiver_at(command.rx, dataset.receiver())
+    trained = at_receiver(trained, receiver, dataset)
+    for line in doubts(dataset, np.asarray(receiver.position), tx_positions, frequencies_hz):
         say(f"warning: {line}; the field was not trained there")
     if command.what != "spectra":
         assert command.out is not None, "checked"
-        write_channel(command.out, ask_channel(command.what, trained, dataset, tx_positions, frequencies_hz), trained, dataset)
+        answer = ask_channel(command.what, trained, dataset, receiver, tx_positions, frequencies_hz)
+        for line in power_lines(answer):
+            say(line)
+        write_channel(command.out, answer, _source(trained, dataset, receiver))
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
         return
-    spectra = ask(trained, dataset, tx_positions, frequencies_hz)
+    spectra = ask(trained, receiver, tx_positions, frequencies_hz)
     for line in sureness(spectra):
         say(line)
     if command.out:
-        write_spectra(command.out, spectra, trained, dataset)
+        write_spectra(command.out, spectra, _source(trained, dataset, receiver))
         say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
     if command.picture:
         with atomic_write(command.picture) as stream:

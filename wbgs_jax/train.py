@@ -163,7 +163,7 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
     write_neighbours(folder, learned.neighbours)
     if learned.line:
         say(learned.line)
-    write_confidence(folder, learn_confidence(*trained, learned.of_training))
+    write_confidence(folder, *learn_confidence(*trained, learned.of_training))
 
 
 def summary(result: TrainResult, folder: Path) -> str:

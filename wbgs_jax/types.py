@@ -42,13 +42,13 @@ class Gaussians:
     """Natural logarithm of the standard deviations along the own axes, metres."""
     quats: Float[Array, "n 4"]
     """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
-    opacity_logits: Float[Array, "n"]
+    opacity_logits: Float[Array, " n"]
     """delta_o of the paper (section 4.5), before the sigmoid."""
     features: Float[Array, "n k"] | None = None
     """What networks know of a Gaussian beside its place; splatting takes no notice."""
 
     @property
-    def alive(self) -> Bool[Array, "n"]:
+    def alive(self) -> Bool[Array, " n"]:
         """Which slots hold a Gaussian."""
         return jnp.greater(self.opacity_logits, -jnp.inf)
 
@@ -105,13 +105,13 @@ class Batch:
     """Normalised power angular spectra."""
     snapshots: Complex[Array, "b elements"] | None
     """Complex array snapshots."""
-    power_db: Float[Array, "b"] | None
+    power_db: Float[Array, " b"] | None
     """Received power relative to the transmitted power, dB."""
     key: Key[Array, ""]
     """Randomness of this training step."""
 
     @property
-    def received_db(self) -> Float[Array, "b"] | None:
+    def received_db(self) -> Float[Array, " b"] | None:
         """The received power (dB), observed or of the snapshots; None where spectra alone are known."""
         return self.power_db if self.snapshots is None else received_power_db(self.snapshots)
 
@@ -122,7 +122,7 @@ class Surface:
 
     points: Float[Array, "n 3"]
     """World frame, metres."""
-    spacing: Float[Array, "n"]
+    spacing: Float[Array, " n"]
     """Mean distance to the 3 nearest other points, metres."""
 
 
@@ -133,11 +133,11 @@ class Mesh:
     vertices: Float[Array, "v 3"]
     """World frame, metres."""
     faces: Int[Array, "t 3"]
-    part: Int[Array, "t"]
+    part: Int[Array, " t"]
     """Object of the scene that a triangle belongs to."""
-    material: Int[Array, "t"]
+    material: Int[Array, " t"]
     """Material of every triangle: what shares a material shares its properties."""
-    thickness: Float[Array, "m"]
+    thickness: Float[Array, " m"]
     """Thickness of every material, metres; 0 where it is not known."""
 
 

@@ -17,6 +17,7 @@ from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
+from wbgs_jax.inference.confidence import PowerConfidence, write_confidence
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.run_folder import RunConfig, write_config
@@ -82,6 +83,10 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         ([*ASK, "--out", "OUT/a.csv"], ["--out", ".npz"]),
         ([*ASK, "--picture", "OUT/a.jpg"], ["--picture", ".png"]),
         (["--export", "OUT/a.bin"], ["--export", ".zip"]),
+        ([*ASK, "--rx", "1,2", "--out", "OUT/a.npz"], ["--rx 1,2 "]),
+        ([*ASK, "--rx", "1,2,nan", "--out", "OUT/a.npz"], ["1,2,nan"]),
+        ([*ASK, "--rx", "1,2,1,0,0,0,0", "--out", "OUT/a.npz"], ["quaternion"]),
+        ([*ASK, "--rx", "1,1,1", "--out", "OUT/a.npz"], ["the wideband field knows no receivers but", "wave or hybrid"]),
         (["--export", "RUN/config.json/a.zip"], ["cannot write"]),
     ],
 )
@@ -148,6 +153,22 @@ def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
         assert refused.code == 2 and "the ripple field has no power, only spectra" in refused.err
         assert "hearing" in refused.err  # among those that have it
         assert not (tmp_path / "k.npz").exists() and not (tmp_path / "none.npz").exists()
+
+
+def test_powers_come_with_how_sure_they_are(tmp_path):
+    sure = PowerConfidence(jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5), jnp.log(4.0), jnp.asarray(2.0))
+    with registered(HearingField):
+        run = make_toy_run(tmp_path / "hearing", HearingField(RippleConfig()))
+        write_confidence(run, None, sure)
+        ask = ["--run", run, "--tx", "1,2,1", "-1,0,2", "--ghz", 2, 5, "--what", "power"]
+        result = predict(*ask, "--out", tmp_path / "power.npz")
+    assert result.code == 0, result.err
+    lines = [line for line in result.err.splitlines() if "within" in line]
+    assert len(lines) == 4
+    assert lines[1] == "TX (1, 2, 1) m at 5 GHz: -54.0 dB of the transmitted power; expected 1.9 dB off, 90 % within 3.9 dB"
+    with np.load(tmp_path / "power.npz") as answer:
+        np.testing.assert_allclose(answer["within_db"], np.full((2, 2), 3.9), rtol=1e-5)
+        np.testing.assert_allclose(answer["expected_error_db"], np.full((2, 2), 1.9), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, select_frequencies
 from wbgs_jax.evaluation.metrics import score
-from wbgs_jax.evaluation.pictures import draw_all, draw_curves, draw_frequencies, draw_spectra, spread
+from wbgs_jax.evaluation.pictures import draw_all, draw_curves, draw_frequencies, draw_motion, draw_spectra, spread
 
 CURVE = [
     {"step": 2, "loss": 0.3, "batch_ssim": 0.2, "gaussians": 60, "seconds": 1.0},
@@ -105,3 +105,10 @@ def test_the_chosen_spectra_are_of_the_part_that_is_shown():
     chosen = split.validation[spread(split, split.validation)]
     assert len(chosen) == 6 and set(chosen) <= set(split.validation.tolist())
     assert set(split.frequencies_hz[chosen]) == set(split.frequencies_hz)
+
+
+def test_surfaces_that_were_moved(tmp_path, rng):
+    corners = rng.uniform(0, 5, (12, 4, 3))
+    still = draw_motion(tmp_path, corners, np.zeros((12, 3))).read_bytes()
+    moved = draw_motion(tmp_path, corners, rng.normal(0, 0.02, (12, 3))).read_bytes()
+    assert still[:8] == moved[:8] == b"\x89PNG\r\n\x1a\n" and still != moved

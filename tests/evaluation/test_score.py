@@ -43,6 +43,7 @@ class Toy(NamedTuple):
     params: Any
     neighbours: None = None
     confidence: None = None
+    power_confidence: None = None
 
     def origin(self):
         return {"field": self.field.name, "preset": "none", "seed": 0, "step": 3}
@@ -77,7 +78,8 @@ def test_links_are_observed_in_their_order_whichever_receiver_they_are_of(knowin
         of = np.flatnonzero(dataset.receiver_index[index] == number)
         plan = knowing.field.plan(knowing.params, dataset.receiver(number))
         alone = knowing.field.render(knowing.params, plan, dataset.query(index[of]))
-        for own, expected in zip(seen, alone, strict=True):
+        assert seen.covariance is None is alone.covariance
+        for own, expected in zip(seen[:3], alone[:3], strict=True):
             np.testing.assert_allclose(own[of], expected, rtol=1e-5, atol=1e-6)
     empty = observe_links(knowing.field, knowing.params, dataset, index[:0])
     assert empty.pas.shape == (0, 90, 360)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.catalogue import SERIES, unique_jobs
-from experiments.jobs import Job
+from experiments.jobs import BASELINES, Job
 from experiments.results import FOLDER, Results
 from experiments.series import choices, tuning, wave_choices
 from experiments.settings import settings
@@ -16,7 +16,7 @@ from wbgs_jax.config import check
 from wbgs_jax.fields import get_field
 
 JOBS = unique_jobs(tuple(SERIES))
-KINDS = {(job.field, job.variant, job.profile): job for job in JOBS}
+KINDS = {(job.field, job.variant, job.profile): job for job in JOBS if job.field != BASELINES}
 
 
 @pytest.mark.parametrize("job", KINDS.values(), ids=lambda job: f"{job.profile}-{job.name}")

@@ -91,6 +91,11 @@ def test_its_loss_is_the_sum_and_no_field_knows_of_the_other(run):
     assert float(both) == pytest.approx(float(total), rel=1e-6)
 
 
+def test_elsewhere_it_is_the_coherent_field(run):
+    field, params = run.field.anywhere(run.state.params)
+    assert field.name == "wave" and params is run.state.params.wave
+
+
 @pytest.mark.parametrize("reason", ["no mesh", "several receivers"])
 def test_without_a_coherent_field_it_is_the_splatting_one(reason, tmp_path):
     dataset = tiny_dataset(12, n_rx=2 if reason == "several receivers" else 1)
@@ -105,6 +110,8 @@ def test_without_a_coherent_field_it_is_the_splatting_one(reason, tmp_path):
     plan = result.field.plan(result.params, dataset.receiver())
     with pytest.raises(UserError, match="no paths"):
         result.field.arrivals(result.params, plan, dataset.query(dataset.test))
+    with pytest.raises(UserError, match="no receivers but those"):
+        result.field.anywhere(result.params)
 
 
 def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):

@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from skimage.metrics import structural_similarity
 
 from wbgs_jax.fields import losses
-from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation, pixel_loss, snapshot_losses
+from wbgs_jax.fields.losses import GOOD_MATCH, UNEXPLAINED, log_decorrelation, pixel_loss, snapshot_losses, surprise
 
 ssim, image_loss = jax.jit(losses.ssim, static_argnums=2), jax.jit(losses.image_loss, static_argnums=(2, 3))
 
@@ -126,6 +127,40 @@ def test_log_decorrelation_equals_its_formula_and_no_match_is_perfect(snapshots,
     found = decorrelation(jnp.asarray(predicted), jnp.asarray(truth))
     np.testing.assert_allclose(found, np.log(1 - squared_correlation(predicted, truth) + GOOD_MATCH), rtol=1e-9)
     np.testing.assert_allclose(decorrelation(jnp.asarray(3j * truth), jnp.asarray(truth)), np.log(GOOD_MATCH), rtol=1e-9)
+
+
+def covariances(rng, paths, n=3, elements=16):
+    voltages = rng.normal(size=(n, elements, paths)) + 1j * rng.normal(size=(n, elements, paths))
+    product = voltages @ voltages.conj().swapaxes(-1, -2)
+    return product / np.trace(product, axis1=-2, axis2=-1)[:, None, None]
+
+
+def test_surprise_is_the_normal_density_of_the_most_likely_scale(snapshots, rng, x64):
+    truth, model = snapshots[1], covariances(rng, 5, len(snapshots[1]))
+    count = truth.shape[-1]
+    noisy = (model + UNEXPLAINED / count * np.eye(count)) / (1 + UNEXPLAINED)
+
+    def minus_log_density(log_scale, y, covariance):
+        scaled = np.exp(log_scale) * covariance
+        return np.linalg.slogdet(scaled)[1] + (y.conj() @ np.linalg.solve(scaled, y)).real
+
+    def least(y, covariance):
+        return minimize_scalar(minus_log_density, (-3, 3), args=(y / np.linalg.norm(y), covariance)).fun
+
+    expected = np.array([least(y, covariance) for y, covariance in zip(truth, noisy, strict=True)])
+    constant = 1 - np.log(count)  # of the profile over scales
+    np.testing.assert_allclose(jax.jit(surprise)(model, truth), expected / count - constant, rtol=1e-6)
+
+
+def test_surprise_of_one_sum_of_paths_is_its_log_decorrelation(snapshots, rng, x64):
+    predicted, truth = snapshots
+    unit = predicted / np.linalg.norm(predicted, axis=-1, keepdims=True)
+    found = np.asarray(jax.jit(surprise)(unit[:, :, None] * unit[:, None].conj(), truth))
+    share = truth.shape[-1] / (truth.shape[-1] + UNEXPLAINED)
+    rest = found - np.log(1 - share * squared_correlation(predicted, truth))
+    assert np.ptp(rest) < 1e-9
+    grey = np.asarray(jax.jit(surprise)(np.broadcast_to(np.eye(16) / 16 + 0j, (len(truth), 16, 16)), truth))
+    np.testing.assert_allclose(grey, 0, atol=1e-9)  # of nothing that is known nothing is surprising
 
 
 def test_gradients_of_a_prediction_of_nothing_are_finite(snapshots):

@@ -19,7 +19,7 @@ from wbgs_jax.data.surface import DatasetScene, make_mesh
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import wave
 from wbgs_jax.fields.wave import WaveConfig, WaveField
-from wbgs_jax.inference.predictor import observe_links, predictor
+from wbgs_jax.inference.predictor import at_receiver, observe_links, predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.run_folder import load_trained
@@ -135,6 +135,29 @@ def test_the_commands_answer(folder, trained, tmp_path):
         found, expected = archive["snapshots"][0], seen.snapshots[index]
         np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max())
         np.testing.assert_allclose(seen.power_db[index], 10 * np.log10(np.mean(np.abs(found) ** 2, -1)), atol=0.01)
+
+
+def test_another_receiver_is_asked_as_if_it_were_the_only_one(folder, trained, tmp_path):
+    """By the command: another place and another turn of the array, traced anew; what training found out about where the trained
+    receiver stands goes with that one. At its own place the field is what it was."""
+    receiver = trained.dataset().receiver()
+    assert at_receiver(trained, receiver) is trained
+    shifted = dataclasses.replace(trained.field.motion, receiver=jnp.full(3, 0.05), receiver_turn=jnp.full(3, 0.1))
+    moved = dataclasses.replace(trained, field=dataclasses.replace(trained.field, motion=shifted))
+    rx, turn, tx = [1.5, 2.0, 1.0], [0.6, 0.0, 0.0, 0.8], [4.0, 1.2, 1.4]
+    elsewhere = dataclasses.replace(receiver, position=jnp.array(rx), orientation=jnp.array(turn))
+    there = at_receiver(moved, elsewhere)
+    assert not np.any(there.field.motion.receiver) and not np.any(there.field.motion.receiver_turn)
+    assert there.confidence is None and there.power_confidence is None and there.neighbours is None
+    plan = trained.field.plan(trained.params, elsewhere)
+    expected = np.asarray(jax.jit(wave.snapshots)(trained.params, plan, make_query([tx], [3e9])))
+    out, words = tmp_path / "snapshot.npz", [",".join(map(str, place)) for place in ([*rx, *turn], tx)]
+    asked = ["--run", str(folder / "run"), "--rx", words[0], "--tx", words[1], "--ghz", "3", "--what", "snapshot"]
+    predict.main([*asked, "--out", str(out)])
+    with np.load(out) as archive:
+        found = archive["snapshots"][0]
+        assert json.loads(str(archive["meta"]))["receiver"]["position"] == rx
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
 def test_prepared_links_are_rendered_as_others_are(rng):

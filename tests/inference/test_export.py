@@ -114,7 +114,7 @@ def blocks(text):
 def test_the_guide_runs(tmp_path, monkeypatch):
     """Block after block, and the one that loads a field elsewhere in a process that can import nothing of the library."""
     run = make_run(tmp_path / "runs" / "scene1-hybrid-cpu-seed0")
-    write_confidence(run, learn_confidence(make_field(), make_params(), hold_out_validation(tiny_dataset(30)), None))
+    write_confidence(run, *learn_confidence(make_field(), make_params(), hold_out_validation(tiny_dataset(30)), None))
     monkeypatch.chdir(tmp_path)
     here, elsewhere = GUIDE.split("## Loading elsewhere")
     names: dict = {}

@@ -1,5 +1,8 @@
 """First-order changes of path lengths against paths that are traced where the surfaces have gone."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from rooms import box, facets_of, room, search_of, trace
 from wbgs_jax.propagation.edges import edges_of_facets
 from wbgs_jax.propagation.facets import moved
 from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.motion import coherence, length_changes, length_gradient
+from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient, still
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
@@ -34,15 +37,23 @@ def test_closed_bodies_and_separate_walls_move_by_themselves():
     assert sizes == [1] * 6 + [6]
 
 
+def drawn(rng, shift=1e-3, turn=0.0) -> Motion:
+    """Everything stands elsewhere."""
+    size = still(len(PARTS))
+    size = dataclasses.replace(size, shift=size.shift + shift, turn=size.turn + turn)
+    size = dataclasses.replace(size, receiver=size.receiver + shift)
+    return jax.tree.map(lambda leaf: (rng.normal(size=leaf.shape) * leaf).astype(np.float32), size)
+
+
 @pytest.mark.parametrize("kind", ["specular", "diffracted"])
-def test_lengths_follow_the_surfaces(kind, rng):
+def test_lengths_follow_surfaces_and_ends(kind, rng):
     facets = facets_of(*PARTS)
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
-    motion = rng.normal(0, 1e-3, (len(PARTS), 3))
-    there = moved(facets, motion)
-    moved_search = make_search(there, edges_of_facets(there), np.asarray(RX), (0.0, 0.0), 0.5, 3.0)
+    motion = drawn(rng, turn=3e-4)
+    there = moved(facets, motion.shift, motion.turn)
+    moved_search = make_search(there, edges_of_facets(there), np.add(RX, motion.receiver), (0.0, 0.0), 0.5, 3.0)
     before, after = (getattr(trace(s, TX), kind) for s in (search, moved_search))
-    expected = np.asarray(length_changes(before, search, jnp.asarray(motion, jnp.float32)))
+    expected = np.asarray(length_changes(before, search, motion))
     first, second = lengths(before), lengths(after)
     wanted = REFLECTED if kind == "specular" else DIFFRACTED
     both = [name for name in first if name in second and wanted in name[::2]]
@@ -56,9 +67,10 @@ def test_lengths_follow_the_surfaces(kind, rng):
 def test_nothing_changes_where_nothing_moves():
     search = search_of(PARTS, RX, mirror_areas=(0.0,))
     paths = trace(search, TX).specular
-    np.testing.assert_array_equal(length_changes(paths, search, jnp.zeros((len(PARTS), 3))), 0)
+    nothing = still(len(PARTS))
+    np.testing.assert_array_equal(length_changes(paths, search, nothing), 0)
     facets = facets_of(*PARTS)
-    same = moved(facets, np.zeros((len(PARTS), 3)))
+    same = moved(facets, nothing.shift, nothing.turn)
     for name in ("corners", "normal", "offset"):
         np.testing.assert_allclose(getattr(same, name), getattr(facets, name), atol=1e-12)
 
@@ -67,9 +79,9 @@ def test_nothing_changes_where_nothing_moves():
 def test_the_gradient_says_what_the_changes_say(kind, rng):
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
     paths = getattr(trace(search, TX), kind)
-    motion = jnp.asarray(rng.normal(size=(len(PARTS), 3)), jnp.float32)
+    motion = dataclasses.replace(drawn(rng, 1.0), receiver=np.zeros(3, np.float32))
     alive = np.asarray(paths.alive)
-    by_gradient = jnp.sum(length_gradient(paths, search, len(PARTS))[:, :-1] * motion, (-2, -1))
+    by_gradient = jnp.sum(length_gradient(paths, search, len(PARTS))[:, :-1] * motion.shift, (-2, -1))
     np.testing.assert_allclose(by_gradient[alive], length_changes(paths, search, motion)[alive], atol=1e-5)
 
 

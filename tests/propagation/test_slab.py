@@ -53,6 +53,18 @@ def test_nothing_and_metal():
     np.testing.assert_allclose([mirror.reflect_te, mirror.reflect_tm, mirror.transmit_te], [-1, 1, 0], atol=2e-3)
 
 
+def test_in_nature_a_slab_of_air_is_nothing_and_tracers_count_it_twice(rng):
+    cosine, thickness, frequency = rng.uniform(0.1, 1, 20), rng.uniform(0.001, 0.3, 20), rng.uniform(1e9, 1e10, 20)
+    given = [jnp.asarray(x, jnp.float32) for x in (cosine, np.ones(20), thickness, frequency)]
+    given[1] = given[1].astype(jnp.complex64)
+    nature, tracer = (slab_coefficients(*given, air) for air in (1.0, 0.0))
+    for name in ("transmit_te", "transmit_tm"):
+        np.testing.assert_allclose(getattr(nature, name), 1, atol=2e-3)
+        extra = np.exp(-2j * np.pi * frequency / SPEED_OF_LIGHT * thickness * cosine)
+        np.testing.assert_allclose(getattr(tracer, name), extra, atol=2e-3)
+    np.testing.assert_array_equal(nature.reflect_te, tracer.reflect_te)
+
+
 @pytest.mark.parametrize("cosine", [1e-4, 0.02, 0.5, 1.0])
 def test_gradients_are_finite_over_the_band(cosine):
     def total(log_susceptibility, log_conductivity, log_thickness, frequency):

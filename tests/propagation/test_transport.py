@@ -23,7 +23,7 @@ from rooms import (
 )
 
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity, slab_coefficients
-from wbgs_jax.propagation.transport import snapshots_from_paths
+from wbgs_jax.propagation.transport import element_voltages, snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import planar_array, snapshot_to_pas
 from wbgs_jax.radio.patterns import Antenna, antenna_field, element_gain
@@ -245,3 +245,21 @@ def test_free_space_between_turned_antennas(frequency, rng):
     sent, taken = (antenna_field(a, jnp.asarray(k, jnp.float32)) for a, k in zip(antennas, (-towards, towards), strict=True))
     isotropic = free_space(tx, rx, frequency)
     np.testing.assert_allclose(found, isotropic * float(jnp.dot(sent, taken)), atol=0.02 * np.abs(isotropic).max())
+
+
+def test_curved_waves_are_those_of_a_point_source_and_plane_ones_their_limit(rng, x64):
+    """Against exp(-jkr) / r at every element of an array half a metre wide."""
+    frequency, elements = 1.3e9, rng.uniform(-0.25, 0.25, (16, 3))
+    receiver = make_receiver((0.0, 0.0, 0.0), element_positions=elements, unit="metres")
+    for far in (1.0, 3000.0):
+        direction = rng.normal(size=(5, 3))
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        k = 2 * np.pi * frequency / SPEED_OF_LIGHT
+        arrived = channel.Arrivals(*map(jnp.asarray, (np.exp(-1j * k * far) / far * np.ones(5), direction, np.full(5, far))))
+        distance = np.linalg.norm(far * direction[:, None] - elements, axis=-1)
+        exact = np.exp(-1j * k * distance) / distance
+        curved = element_voltages(arrived, receiver, jnp.asarray(frequency), 1.0)
+        plane = np.asarray(element_voltages(arrived, receiver, jnp.asarray(frequency)))
+        np.testing.assert_allclose(curved, exact, atol=1e-5 * np.abs(exact).max())
+        error = np.abs(plane - exact).max() / np.abs(exact).max()
+        assert error > 0.2 if far < 10 else error < 2e-3

@@ -13,19 +13,24 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.evaluation.power import calibrate_power
 from wbgs_jax.inference.confidence import (
     FILE,
     MARGIN,
+    POWER_MARGIN_DB,
     Confidence,
     Expected,
+    PowerConfidence,
     expect_many,
+    expected_power,
     expected_ssim,
     features,
     read_confidence,
+    read_power_confidence,
     write_confidence,
 )
-from wbgs_jax.inference.predictor import predict_spectra
-from wbgs_jax.training.confidence import SETS, fit, interval, learn_confidence, left_out, regress
+from wbgs_jax.inference.predictor import observe_links, predict_spectra
+from wbgs_jax.training.confidence import POWER_SETS, SETS, fit, interval, learn_confidence, left_out, regress, upper_end
 from wbgs_jax.types import Query
 
 
@@ -40,7 +45,8 @@ def drawn(rng, n_tx, per_tx=5, slope=0.5, noise=0.3):
 def test_intervals_hold_nine_of_ten_new_scores(rng):
     inside, ratios = [], []
     for _ in range(10):  # one draw of the 300 that are learned from moves the share by 0.02
-        mean, scale, weights, quantiles, surplus = fit(*drawn(rng, 60))
+        mean, scale, weights, rest = fit(*drawn(rng, 60), SETS)
+        quantiles, surplus = interval(rest), np.exp(rest).mean()
         again, truth, _ = drawn(rng, 400)
         predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
         inside.append(np.mean((predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])))
@@ -50,9 +56,9 @@ def test_intervals_hold_nine_of_ten_new_scores(rng):
 
 
 def test_what_says_nothing_is_left_out(rng):
-    taken = [np.any(fit(*drawn(rng, 40, slope=0.0))[2][:-1] != 0) for _ in range(100)]
+    taken = [np.any(fit(*drawn(rng, 40, slope=0.0), SETS)[2][:-1] != 0) for _ in range(100)]
     assert sum(taken) <= 12  # by chance 3
-    weights = fit(*drawn(rng, 40, slope=1.0))[2]
+    weights = fit(*drawn(rng, 40, slope=1.0), SETS)[2]
     assert weights[0] == pytest.approx(1.0, abs=0.25)
 
 
@@ -99,11 +105,11 @@ def dataset():
 
 def test_it_is_learned_from_the_validation_part_alone(dataset):
     field, params = make_field(), make_params()
-    learned = learn_confidence(field, params, dataset, None)
+    learned, _ = learn_confidence(field, params, dataset, None)
     heard = dataset.snapshots.copy()
     heard[dataset.test] = 1
     poisoned = dataclasses.replace(dataset, snapshots=heard)
-    again = learn_confidence(field, params, poisoned, None)
+    again, _ = learn_confidence(field, params, poisoned, None)
     for a, b in zip(jax.tree.leaves(learned), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     index = dataset.test
@@ -116,9 +122,9 @@ def test_it_is_learned_from_the_validation_part_alone(dataset):
 
 def test_several_receivers_or_a_handful_of_spectra_say_nothing(dataset):
     field, params = make_field(), make_params()
-    assert learn_confidence(field, params, hold_out_validation(tiny_dataset(12, n_rx=2)), None) is None
+    assert learn_confidence(field, params, hold_out_validation(tiny_dataset(12, n_rx=2)), None)[0] is None
     few = dataclasses.replace(dataset, validation=dataset.validation[:3])
-    assert learn_confidence(field, params, few, None) is None
+    assert learn_confidence(field, params, few, None) == (None, None)
 
 
 def confidence():
@@ -168,10 +174,61 @@ def test_deep_shadows_are_doubted_and_a_power_that_is_not_given_is_the_usual_one
         np.testing.assert_allclose(given, none, rtol=1e-3)
 
 
+def test_powers_stay_as_near_as_they_should_nine_times_of_ten(rng):
+    held, ratios = [], []
+    for _ in range(10):
+        mean, scale, weights, rest = fit(*drawn(rng, 60), POWER_SETS)
+        again, truth, _ = drawn(rng, 400)
+        predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
+        held.append(np.mean(truth <= predicted + upper_end(rest)))
+        ratios.append(np.mean(np.exp(predicted)) * np.exp(rest).mean() / np.exp(truth).mean())
+    assert 0.85 < np.mean(held) < 0.95
+    assert np.mean(ratios) == pytest.approx(1, rel=0.1)
+    assert upper_end(np.array([0.3, -1.0, 2.0])) > 2 and upper_end(np.arange(199.0)) == 179
+
+
+def test_expected_errors_of_powers_follow_their_formula(rng):
+    weights = np.array([0.0, -0.5, 0.0, 0.0, np.log(2.1)])
+    learned = power_confidence(weights)
+    query = Query(jnp.ones((2, 3)), jnp.full(2, 1e10))
+    friis = 20 * np.log10(299_792_458 / (4 * np.pi * np.sqrt(3 + 1e-4) * 1e10))
+    found = expected_power(learned, jnp.asarray([friis, friis - 2], jnp.float32), query, jnp.zeros(3))
+    error = 2.1 * np.exp([0.0, 1.0])
+    np.testing.assert_allclose(found.error_db, 1.5 * error - POWER_MARGIN_DB, rtol=1e-3)
+    np.testing.assert_allclose(found.within_db, np.e * error - POWER_MARGIN_DB, rtol=1e-3)
+    everyone = expected_power(learned, jnp.full(2, friis), query, jnp.asarray([[0.0, 0, 0], [0.5, 0, 0]]))
+    assert everyone.within_db[0] != everyone.within_db[1]  # receivers of their own
+
+
+def test_confidence_of_powers_is_learned_over_all_receivers(rng):
+    dataset = hold_out_validation(tiny_dataset(40, n_rx=2))
+    field, params = make_field(), make_params()
+    spectra, learned = learn_confidence(field, params, dataset, None)
+    assert spectra is None and learned.mean.shape == (POWER_SETS[-1],)
+    heard = dataset.snapshots.copy()
+    heard[dataset.test] = 1
+    poisoned = dataclasses.replace(dataset, snapshots=heard)
+    for a, b in zip(jax.tree.leaves(learned), jax.tree.leaves(learn_confidence(field, params, poisoned, None)[1]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    said = np.asarray(observe_links(field, params, dataset, dataset.test).power_db)
+    report = calibrate_power(learned, said, dataset, dataset.test)
+    assert report["coverage"] > 0.6 and report["expected"] == pytest.approx(report["scored"], rel=0.6)
+    assert report["risk_coverage"]["1"] == pytest.approx(np.abs(said - dataset.received_db(dataset.test)).mean(), rel=1e-4)
+    pictures = dataclasses.replace(dataset, snapshots=None, images=np.zeros((len(dataset), 90, 360), np.uint8))
+    assert learn_confidence(field, params, pictures, None)[1] is None
+
+
+def power_confidence(weights):
+    k = POWER_SETS[-1]
+    arrays = np.eye(3), np.zeros(k), np.ones(k), weights, 1.0, 1.5
+    return PowerConfidence(*(jnp.asarray(a, jnp.float32) for a in arrays))
+
+
 def test_it_comes_back_from_a_run_folder(tmp_path):
-    write_confidence(tmp_path, confidence())
-    again = read_confidence(tmp_path)
-    for a, b in zip(jax.tree.leaves(confidence()), jax.tree.leaves(again), strict=True):
+    written = confidence(), power_confidence(np.zeros(POWER_SETS[-1] + 1))
+    write_confidence(tmp_path, *written)
+    again = read_confidence(tmp_path), read_power_confidence(tmp_path)
+    for a, b in zip(jax.tree.leaves(written), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     (tmp_path / FILE).write_bytes(b"no archive")
     with pytest.raises(UserError, match="remove it"):

@@ -40,9 +40,10 @@ def untrained(tmp_path_factory):
 
 @pytest.fixture
 def run_on(untrained, tmp_path):
-    """Gives a run, before its first step, on snapshots that these materials (eps_r, c, d) made."""
+    """Gives a run, before its first step, on snapshots that these materials (eps_r, c, d) made, as ray tracers have them or
+    in some ways as nature has them."""
 
-    def make(materials, search=SETTINGS.search, **start):
+    def make(materials, search=SETTINGS.search, natural=(), **start):
         run = object.__new__(Run)
         run.__dict__.update(untrained.__dict__)
         run.folder = tmp_path
@@ -55,7 +56,8 @@ def run_on(untrained, tmp_path):
             params.materials, log_susceptibility=jnp.log(columns[0] - 1), log_conductivity=jnp.log(columns[1]), slope=columns[2]
         )
         plan = run.field.plan(params, run.dataset.receiver(), cache=run.cache)
-        y = snapshots(dataclasses.replace(params, materials=made_of), plan, run.cache, run.data.links)
+        truth = dataclasses.replace(params, materials=made_of, **{name: jnp.asarray(1.0) for name in natural})
+        y = snapshots(truth, plan, run.cache, run.data.links)
         run.data = dataclasses.replace(run.data, snapshots=y)
         run.state = dataclasses.replace(run.state, params=params)
         return run
@@ -91,21 +93,33 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
     run = run_on([ITU_MATERIALS["wood"]] * len(PARTS))
     looked_at = []
 
-    def scores(*_, phases=True):
-        def score(candidates):
-            if not phases:  # where surfaces may stand is another question
+    def scores(*_):
+        def score(candidates, first=None):
+            if np.ptp([params.placement[0] for params in candidates]):  # where surfaces may stand is another question
                 return np.zeros((len(candidates), 48))
             susceptibility = np.array([params.materials.log_susceptibility for params in candidates])
-            looked_at.append(int(np.argmax(np.ptp(susceptibility, 0))))
+            if first:  # the first glance; a closer look follows
+                looked_at.append(int(np.argmax(np.ptp(susceptibility, 0))))
             wanted = np.log(5.24 - 1 if looked_at[-1] == 2 else 4.0 - 1)  # concrete, or what is there
-            return np.abs(susceptibility[:, looked_at[-1], None] - wanted) + np.zeros(48)
+            return np.abs(susceptibility[:, looked_at[-1], None] - wanted) + np.zeros(first or 48)
 
         return score
 
     monkeypatch.setattr(search_module, "make_scores", scores)
+    monkeypatch.setattr(search_module, "search_idealisations", lambda params, *_: (params, {}))
     run.control()
     count = len(PARTS)
     assert looked_at == [*range(count), 0, 1]
+
+
+@pytest.mark.parametrize("natural", [(), ("thick",), ("curved", "thick")])
+def test_it_finds_out_what_ray_tracers_leave_out(natural, run_on, tmp_path, rng):
+    names = rng.choice(["concrete", "wood", "plasterboard", "glass"], len(PARTS))
+    run = run_on([ITU_MATERIALS[name] for name in names], natural=natural)
+    run.control()
+    report = json.loads((tmp_path / "metrics.jsonl").read_text())["idealisations"]
+    for name in ("curved", "thick"):
+        assert report[name]["dropped"] == (name in natural) == float(getattr(run.state.params, name)), report
 
 
 @pytest.mark.parametrize("steps, rounds", [(5, 3), (0, 0)])

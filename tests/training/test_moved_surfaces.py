@@ -13,7 +13,7 @@ from wave_runs import PARTS, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
-from wbgs_jax.training.geometry import GeometryReport, Place, is_doubtful, learn_geometry
+from wbgs_jax.training.geometry import GeometryReport, Place, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
 from wbgs_jax.training.scores import make_scores
@@ -24,7 +24,7 @@ PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "geometry_steps": 80, "geometry_tx": 40},
+    search={"spectra": 80, "rounds": 2, "antenna_rounds": 0, "geometry_steps": 120, "geometry_tx": 40},
 )
 
 
@@ -61,11 +61,34 @@ def test_walls_come_back(truth, tmp_path):
     normal, mover = np.asarray(run.field.facets.normal), np.asarray(run.field.facets.mover)
     own = {int(m): shifts[p] for m, p in zip(mover, part_of(run, wrong), strict=True)}
     along = np.array([abs(normal[i] @ own[int(m)]) for i, m in enumerate(mover)])
-    steps = np.asarray(place.field.facets.offset) - np.asarray(run.field.facets.offset)
+    went = (np.asarray(place.field.facets.corners) - np.asarray(run.field.facets.corners)).mean(1)
+    steps = np.sum(normal * went, -1)
     left = np.array([abs(steps[i] + normal[i] @ own[int(m)]) for i, m in enumerate(mover)])
     walls = np.bincount(mover)[mover] == 1
     print(np.round(1e3 * along[walls], 2), np.round(1e3 * left[walls], 2))
     assert np.median(left[walls]) < 5e-4 < np.median(along[walls])
+
+
+def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_path, rng):
+    """To first order: surfaces, both ends and the receiver's turn, at a frequency at which that is enough."""
+    heard, params = truth
+    run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, heard)
+    sizes = jax.tree.map(lambda leaf: leaf + 3e-4, run.field.motion)
+    motion = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32) * leaf, sizes)
+    motion = dataclasses.replace(motion, receiver_turn=30 * motion.receiver_turn)
+    query, receiver = make_query(PLACES, np.full(N_TX, 4e9)), run.dataset.receiver()
+    plan = run.field.plan(params, receiver)
+    there = run.field.moved(motion)
+
+    def heard_by(plan, paths):
+        return wave.path_snapshots(params, plan, paths, query.frequency_hz)
+
+    paths = wave.trace(plan, query.tx_position)
+    elsewhere = there.plan(params, receiver)
+    still, first_order = (np.asarray(jax.jit(heard_by)(p, paths)) for p in (plan, run.field.displaced(plan, motion)))
+    exact = np.asarray(jax.jit(heard_by)(elsewhere, wave.trace(elsewhere, query.tx_position)))
+    error, change = (np.linalg.norm(x - exact, axis=-1) / np.linalg.norm(exact, axis=-1) for x in (first_order, still))
+    assert np.median(error) < 0.2 * np.median(change) and np.median(change) > 0.02, (np.median(error), np.median(change))
 
 
 def part_of(run, parts):
@@ -85,21 +108,14 @@ def test_right_surfaces_stay(truth, tmp_path):
 
 def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0])
-    moved = run.field.moved(np.full((len(PARTS), 3), 1e-3))
-    report = GeometryReport(-1.0, -2.0, True, 1.0, 1.0)
-    monkeypatch.setattr(search, "is_doubtful", lambda *_: True)
+    still = run.field.motion
+    moved = run.field.moved(dataclasses.replace(still, shift=still.shift + 1e-3))
+    report = GeometryReport(-1.0, -2.0, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(search, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
-    run.controls = (search.Search(SETTINGS.search),)
+    run.controls = (search.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
     run.control()
     assert run.field is moved
     assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
-
-
-def test_only_phases_that_get_worse_with_the_frequency_make_a_mesh_doubtful(rng):
-    frequency = np.repeat([1e9, 5e9, 28e9, 94e9], 20)
-    worse = np.repeat([-3.0, -2.0, -0.5, -0.3], 20)
-    assert is_doubtful(worse, frequency) and not is_doubtful(worse[::-1], frequency)
-    assert not is_doubtful(np.full(80, -1.0), frequency) and not is_doubtful(worse[:40], frequency[:40])
 
 
 def shifted(parts, metres, rng):
@@ -110,11 +126,22 @@ def shifted(parts, metres, rng):
 def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, highest, tmp_path, rng):
     heard, params = truth
     run = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, heard)
-    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train[:60]), phases=False)
+    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train[:60]), "spectra")
     found, report = search_placement(params, score)
     assert lowest * 0.99 < float(jnp.exp(found.placement[0])) < highest * 1.01 and np.ptp(found.placement) == 0
     if metres:
         assert report.uncertain < report.certain
+
+
+@pytest.mark.parametrize("metres", [0.0, 0.01])
+def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_it(truth, metres, tmp_path, rng, monkeypatch):
+    run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []
+    report = GeometryReport(-1.0, -1.0, False, 1.0, 1.0, 0.0, 0.0, 0.0)
+    monkeypatch.setattr(search, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
+    run.controls = (search.Search(SETTINGS.search),)
+    run.control()
+    found = json.loads((tmp_path / "metrics.jsonl").read_text())["doubt"]
+    assert (len(asked) == 1) == (metres > 0) == (found["spread_mm"] > 0.5), found
 
 
 @pytest.mark.slow

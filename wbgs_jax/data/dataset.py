@@ -21,11 +21,11 @@ Kind = Literal["snapshot", "pas", "power"]
 class Materials:
     """Which triangles share a material. Not its electrical properties: those are for a field to find out."""
 
-    material: Int[np.ndarray, "faces"]
+    material: Int[np.ndarray, " faces"]
     """int32: the material of every triangle."""
     names: tuple[str, ...]
     """A label of every material."""
-    thickness: Float[np.ndarray, "materials"]
+    thickness: Float[np.ndarray, " materials"]
     """Metres; 0 where it is not known."""
 
 
@@ -38,27 +38,27 @@ class Dataset:
     """All receivers: every array has a leading axis R."""
     tx_positions: Float[np.ndarray, "n 3"]
     """World frame, metres, float64."""
-    frequencies_hz: Float[np.ndarray, "n"]
-    receiver_index: Int[np.ndarray, "n"]
+    frequencies_hz: Float[np.ndarray, " n"]
+    receiver_index: Int[np.ndarray, " n"]
     """Which of the receivers."""
-    tx_index: Int[np.ndarray, "n"]
+    tx_index: Int[np.ndarray, " n"]
     """Which transmitter: links of one TX position share it; 0, 1, ... without gaps. Splits never cut through it."""
-    train: Int[np.ndarray, "n_train"]
+    train: Int[np.ndarray, " n_train"]
     """Indices of the training links."""
-    validation: Int[np.ndarray, "n_validation"]
+    validation: Int[np.ndarray, " n_validation"]
     """Indices of the links that decide between settings; may be empty."""
-    test: Int[np.ndarray, "n_test"]
+    test: Int[np.ndarray, " n_test"]
     snapshots: Complex[np.ndarray, "n elements"] | None = None
     """Complex array snapshots, or ..."""
     images: UInt8[np.ndarray, "n 90 360"] | None = None
     """... 8-bit images of the power angular spectrum, or ..."""
-    power_db: Float[np.ndarray, "n"] | None = None
+    power_db: Float[np.ndarray, " n"] | None = None
     """... received power relative to the transmitted power, dB. Exactly one of the three is not None."""
     vertices: Float[np.ndarray, "vertices 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """The scene's surfaces in the world frame, metres, float32; empty where no mesh is known."""
     faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     """int32 triangles; empty where only points are known."""
-    face_part: Int[np.ndarray, "faces"] | None = None
+    face_part: Int[np.ndarray, " faces"] | None = None
     """int32: the part, an object of the scene, that every triangle belongs to; None where parts are not known."""
     materials: Materials | None = None
     """What the triangles are made of; None where it is not known. Parts of one material share it."""
@@ -98,16 +98,16 @@ class Dataset:
             raise UserError(f"{self.name} has no receiver {i}; choose 0 to {self.n_receivers - 1}")
         return jax.tree.map(lambda leaf: leaf[i], self.receivers)
 
-    def query(self, index: Int[np.ndarray, "b"]) -> Query:
+    def query(self, index: Int[np.ndarray, " b"]) -> Query:
         """Returns the float32 queries of some links."""
         return Query(jnp.asarray(self.tx_positions[index], jnp.float32), jnp.asarray(self.frequencies_hz[index], jnp.float32))
 
-    def links(self, index: Int[np.ndarray, "b"]) -> Links:
+    def links(self, index: Int[np.ndarray, " b"]) -> Links:
         """Returns some links as float32 and int32 arrays on the device."""
         receiver, tx = (jnp.asarray(which[index], jnp.int32) for which in (self.receiver_index, self.tx_index))
         return Links(self.query(index), receiver, tx)
 
-    def pas(self, index: Int[np.ndarray, "b"]) -> Float[Array, "b 90 360"]:
+    def pas(self, index: Int[np.ndarray, " b"]) -> Float[Array, "b 90 360"]:
         """Returns the observed power angular spectra (float32, maximum 1) of some links.
 
         Raises:
@@ -127,14 +127,18 @@ class Dataset:
             spectra[chosen] = snapshot_to_pas(jnp.asarray(snapshots[chosen]), element_positions)
         return jnp.asarray(spectra)
 
-    def received_db(self, index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b"] | None:
+    def rx_positions(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 3"]:
+        """Returns where the receivers of some links stand (float64, world frame, metres)."""
+        return np.asarray(self.receivers.position, np.float64)[self.receiver_index[index]]
+
+    def received_db(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, " b"] | None:
         """Returns the received power of some links (dB, relative to the transmitted power), observed or of the snapshots; None
         where spectra alone are known, which have no scale."""
         if self.power_db is not None:
             return self.power_db[index]
         return None if self.snapshots is None else np.asarray(received_power_db(jnp.asarray(self.snapshots[index])))
 
-    def _arrays(self, index: Int[np.ndarray, "b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, "b"]]:
+    def _arrays(self, index: Int[np.ndarray, " b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, " b"]]:
         """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""
         own = jax.tree.map(lambda leaf: leaf[self.receiver_index[index]], self.receivers)
         positions = own.element_wavelengths(jnp.asarray(self.frequencies_hz[index], jnp.float32))

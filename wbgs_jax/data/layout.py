@@ -162,7 +162,7 @@ def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
     return np.array([_vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
 
 
-def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None) -> Float[np.ndarray, "n"]:
+def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None) -> Float[np.ndarray, " n"]:
     if not path.exists():
         single = next(f for f in (wanted_hz, gateway_hz, NOMINAL_FREQUENCY_HZ) if f is not None)
         if not (np.isfinite(single) and single > 0):

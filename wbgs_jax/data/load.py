@@ -70,8 +70,8 @@ def scene_dataset(scene: SceneFile) -> Dataset:
 
 
 def released_scenes() -> dict[str, Path]:
-    """Returns scene numbers ("1", "2", ...) and the scene files that hold them."""
-    files = {path.stem.removeprefix("scene"): path for path in _scene_folder().glob("scene*.npz")}
+    """Returns scene numbers ("1", "2", ...) or names ("cabin") and the scene files that hold them."""
+    files = {path.stem.removeprefix("scene"): path for path in _scene_folder().glob("*.npz")}
     return dict(sorted(files.items(), key=lambda item: (len(item[0]), item[0])))
 
 

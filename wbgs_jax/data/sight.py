@@ -10,11 +10,11 @@ CLEARANCE = 1e-3
 """Metres at both ends of a line in which a surface does not count: antennas may be mounted on it."""
 
 
-def in_sight(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Bool[np.ndarray, "n"] | None:
+def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
     """Returns whether the receivers of some links see their transmitters; None where no mesh says so."""
     if not len(dataset.faces):
         return None
-    receivers = np.asarray(dataset.receivers.position, np.float64)[dataset.receiver_index[index]]
+    receivers = dataset.rx_positions(index)
     lines, which = np.unique(np.stack([receivers, dataset.tx_positions[index]], 1), axis=0, return_inverse=True)
     triangles = dataset.vertices[dataset.faces].astype(np.float64)
     normals = trimesh.unitize(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))

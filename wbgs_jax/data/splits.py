@@ -18,15 +18,15 @@ FEW_TX, LARGEST_SHARE = 8, 0.25
 """Fewer validation transmitters decide little; but no more than this share for the sake of that number."""
 
 
-def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Returns the transmitter (0, 1, ... by first appearance) of every link; positions (metres) agree to a micrometre."""
     _, first, group = np.unique(np.round(positions, 6), axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[group.reshape(-1)]
 
 
 def tx_disjoint_split(
-    tx_index: Int[np.ndarray, "n"], test_fraction: float = 0.2, seed: int = 0
-) -> tuple[Int[np.ndarray, "n_train"], Int[np.ndarray, "n_test"]]:
+    tx_index: Int[np.ndarray, " n"], test_fraction: float = 0.2, seed: int = 0
+) -> tuple[Int[np.ndarray, " n_train"], Int[np.ndarray, " n_test"]]:
     """Returns ascending indices of training and test links with `test_fraction` of the transmitters, drawn by `seed`, in the
     test.
 
@@ -141,7 +141,7 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
     )
 
 
-def training_links(dataset: Dataset) -> Int[np.ndarray, "n"]:
+def training_links(dataset: Dataset) -> Int[np.ndarray, " n"]:
     """Returns the indices of all links that a training may look at, ascending."""
     return np.sort(np.concatenate([dataset.train, dataset.validation]))
 
@@ -151,7 +151,7 @@ def without_test(dataset: Dataset) -> Dataset:
     return _keep_links(dataset, training_links(dataset))
 
 
-def _keep_links(dataset: Dataset, kept: Int[np.ndarray, "n"]) -> Dataset:
+def _keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
     """Returns a data set of some links alone, in their order; the remaining transmitters are numbered anew."""
     place = np.full(len(dataset), -1)  # of every link among those that stay
     place[kept] = np.arange(len(kept))
@@ -177,7 +177,7 @@ def _keep_links(dataset: Dataset, kept: Int[np.ndarray, "n"]) -> Dataset:
     )
 
 
-def _draw(tx_index: Int[np.ndarray, "n"], fraction: float, rng: np.random.Generator, role: str) -> Bool[np.ndarray, "n"]:
+def _draw(tx_index: Int[np.ndarray, " n"], fraction: float, rng: np.random.Generator, role: str) -> Bool[np.ndarray, " n"]:
     """Returns which links belong to a random part of the transmitters: at least one of them, and never all."""
     if not 0 < fraction < 1:
         raise UserError(f"the {role} fraction is {fraction}; choose a number between 0 and 1, 0.2 for example")

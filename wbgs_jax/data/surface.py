@@ -121,7 +121,7 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
 
 def _solid_angle(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], receiver: Receiver
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Returns the solid angle at a receiver of unit pieces of surface, 0 below its horizon."""
     offset = points - np.asarray(receiver.position)
     distance = np.maximum(np.linalg.norm(offset, axis=1), MIN_DISTANCE)

@@ -17,7 +17,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas, steering_vector
 from wbgs_jax.radio.geometry import to_local
 
-Baseline = Callable[[Int[np.ndarray, "b"]], Float[np.ndarray, "b 90 360"]]
+Baseline = Callable[[Int[np.ndarray, " b"]], Float[np.ndarray, "b 90 360"]]
 
 BLOCK = 256
 """Spectra held at a time: a scene has thousands, of 32,400 pixels each."""
@@ -55,7 +55,7 @@ def mean_image(dataset: Dataset) -> Baseline:
 def nearest_tx(dataset: Dataset) -> Baseline:
     """Returns the training spectrum of the nearest transmitter at the same frequency and receiver."""
 
-    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+    def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
         nearest = nearest_links(dataset, index, dataset.train)
         for part in _blocks(np.arange(len(index))):
@@ -65,7 +65,7 @@ def nearest_tx(dataset: Dataset) -> Baseline:
     return predict
 
 
-def nearest_links(dataset: Dataset, index: Int[np.ndarray, "b"], known: Int[np.ndarray, "m"]) -> Int[np.ndarray, "b"]:
+def nearest_links(dataset: Dataset, index: Int[np.ndarray, " b"], known: Int[np.ndarray, " m"]) -> Int[np.ndarray, " b"]:
     """Returns for every link the one among `known` of the nearest transmitter, at the same frequency and receiver."""
     nearest = np.zeros(len(index), int)
     for chosen, neighbours in _by_frequency(dataset, index, known):
@@ -76,7 +76,7 @@ def nearest_links(dataset: Dataset, index: Int[np.ndarray, "b"], known: Int[np.n
 def inverse_distance(dataset: Dataset) -> Baseline:
     """Returns the mean of all training spectra at the same frequency and receiver, weighted by 1/d^2 of their transmitters."""
 
-    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+    def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
         for chosen, neighbours in _by_frequency(dataset, index, dataset.train):
             # A square micrometre keeps a transmitter that itself trained (at another frequency) from dividing by zero.
@@ -95,7 +95,7 @@ def line_of_sight(dataset: Dataset) -> Baseline:
     """Returns the PAS of one plane wave from the transmitter's direction: geometry alone, also for directions below the
     horizon."""
 
-    def predict(index: Int[np.ndarray, "b"]) -> Float[np.ndarray, "b 90 360"]:
+    def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
         for number in np.unique(dataset.receiver_index[index]):
             receiver = dataset.receiver(int(number))

@@ -19,7 +19,7 @@ def angle_error_deg(
     predicted: Float[np.ndarray, "n 90 360"],
     truth: Float[np.ndarray, "n 90 360"],
     array_normal: Float[np.ndarray, "3"] | None = None,
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
 
     A planar array cannot tell its front from its back: with its normal, either will do.
@@ -43,7 +43,7 @@ def plane_normal(element_positions: Float[np.ndarray, "elements 3"]) -> Float[np
 
 def beam_loss_db(
     predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], tried: int = 1
-) -> Float[np.ndarray, "n"]:
+) -> Float[np.ndarray, " n"]:
     """Returns the power (dB, at least 0) that is lost against the codebook's best beam.
 
     The `tried` beams that a predicted spectrum ranks highest are measured, and the best of them is used. A beam is a pixel of
@@ -58,7 +58,7 @@ def beam_loss_db(
 
 
 @functools.cache
-def codebook() -> Int[np.ndarray, "beams"]:
+def codebook() -> Int[np.ndarray, " beams"]:
     """Returns the pixels, in row-major order, that the codebook's beams point at."""
     rows = (np.arange(RINGS) + 0.5) * (PAS_HEIGHT - 1) / RINGS
     columns = np.arange(SECTORS) * (PAS_WIDTH - 1) / SECTORS

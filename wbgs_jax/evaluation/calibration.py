@@ -4,32 +4,52 @@ left out."""
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from wbgs_jax.inference.confidence import LEVEL, Expected
+from wbgs_jax.inference.confidence import LEVEL, Expected, ExpectedPower
 
 COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
 """Shares of the answers, the surest ones, whose mean score is reported."""
 
 
-def calibration(expected: Expected, scores: Float[np.ndarray, "n"]) -> dict[str, Any]:
+def calibration(expected: Expected, scores: Float[np.ndarray, " n"]) -> dict[str, Any]:
     """Returns how the expected SSIM of answers compares with what they scored: `coverage` of the intervals and their mean
     `width`, the mean `expected` and true `scored` SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the
     mean SSIM of the surest share."""
     expectation, low, high = (np.asarray(values, np.float64) for values in expected)
-    order = np.argsort(-expectation, kind="stable")
-    curve = {f"{share:g}": float(scores[order[: max(1, round(share * len(scores)))]].mean()) for share in COVERAGES}
+    surest = np.argsort(-expectation, kind="stable")
+    held = (low <= scores) & (scores <= high)
+    return _figures(expectation, scores, surest, held) | {"width": float(np.mean(np.minimum(high, 1) - low))}
+
+
+def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"]) -> dict[str, Any]:
+    """Returns how the expected errors of received powers compare with the true absolute ones (dB): `coverage` of what they were
+    to stay within, its mean `within_db`, the mean `expected` and true `scored` error, their rank `correlation`, and the
+    `risk_coverage` curve: the mean error of the surest share."""
+    expectation, within = (np.asarray(values, np.float64) for values in expected)
+    surest = np.argsort(expectation, kind="stable")
+    return _figures(expectation, errors_db, surest, errors_db <= within) | {"within_db": float(within.mean())}
+
+
+def _figures(
+    expectation: Float[np.ndarray, " n"],
+    truth: Float[np.ndarray, " n"],
+    surest: Int[np.ndarray, " n"],
+    held: Bool[np.ndarray, " n"],
+) -> dict[str, Any]:
+    """Returns what both have in common; `surest` is the order of the answers, the surest first."""
     return {
         "level": LEVEL,
-        "coverage": float(np.mean((low <= scores) & (scores <= high))),
-        "width": float(np.mean(np.minimum(high, 1) - low)),
+        "coverage": float(held.mean()),
         "expected": float(expectation.mean()),
-        "scored": float(scores.mean()),
-        "correlation": _rank_correlation(expectation, scores),
-        "risk_coverage": curve,
+        "scored": float(truth.mean()),
+        "correlation": _rank_correlation(expectation, truth),
+        "risk_coverage": {
+            f"{share:g}": float(truth[surest[: max(1, round(share * len(truth)))]].mean()) for share in COVERAGES
+        },
     }
 
 
-def _rank_correlation(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
+def _rank_correlation(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
     ranks = [np.argsort(np.argsort(values, kind="stable")).astype(float) for values in (a, b)]
     return float(np.corrcoef(ranks[0], ranks[1])[0, 1]) if len(a) > 1 else 0.0

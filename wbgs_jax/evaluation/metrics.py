@@ -13,19 +13,19 @@ PSNR_LIMIT_DB = 100.0
 """PSNR of a perfect prediction, which would be infinite and fit no report."""
 
 
-def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
     """Returns the structural similarity of every spectrum, float64: scikit-image, data_range 1, its default 7 x 7 window."""
     pairs = zip(predicted, truth, strict=True)
     return np.array([structural_similarity(p.astype(np.float64), t.astype(np.float64), data_range=1.0) for p, t in pairs])
 
 
-def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
     """Returns the mean absolute error of every spectrum, float64."""
     pairs = zip(predicted, truth, strict=True)  # one by one: float64 copies of a whole scene are gigabytes
     return np.array([np.mean(np.abs(p.astype(np.float64) - t)) for p, t in pairs])
 
 
-def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n"]:
+def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
     """Returns the peak signal-to-noise ratio (dB, peak 1) of every spectrum, float64, at most `PSNR_LIMIT_DB`."""
     pairs = zip(predicted, truth, strict=True)
     error = np.array([np.mean((p.astype(np.float64) - t) ** 2) for p, t in pairs])
@@ -35,8 +35,8 @@ def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "
 def score(
     predicted: Float[np.ndarray, "n 90 360"],
     truth: Float[np.ndarray, "n 90 360"],
-    frequencies_hz: Float[np.ndarray, "n"],
-    sight: Bool[np.ndarray, "n"] | None = None,
+    frequencies_hz: Float[np.ndarray, " n"],
+    sight: Bool[np.ndarray, " n"] | None = None,
     array_normal: Float[np.ndarray, "3"] | None = None,
 ) -> dict[str, Any]:
     """Returns a report of predicted spectra, ready for JSON.
@@ -64,7 +64,7 @@ def figures(
     predicted: Float[np.ndarray, "n 90 360"],
     truth: Float[np.ndarray, "n 90 360"],
     array_normal: Float[np.ndarray, "3"] | None = None,
-) -> dict[str, Float[np.ndarray, "n"]]:
+) -> dict[str, Float[np.ndarray, " n"]]:
     """Returns what `score` reports of every spectrum by itself; raises what it raises."""
     if len(predicted) == 0:
         raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
@@ -81,13 +81,13 @@ def figures(
 
 
 def summarise(
-    values: dict[str, Float[np.ndarray, "n"]],
-    frequencies_hz: Float[np.ndarray, "n"],
-    sight: Bool[np.ndarray, "n"] | None = None,
+    values: dict[str, Float[np.ndarray, " n"]],
+    frequencies_hz: Float[np.ndarray, " n"],
+    sight: Bool[np.ndarray, " n"] | None = None,
 ) -> dict[str, Any]:
     """Returns the report of `score` from the figures of all spectra."""
 
-    def part(chosen: Bool[np.ndarray, "n"]) -> dict[str, Any]:
+    def part(chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]:
         return _summary({name: value[chosen] for name, value in values.items()})
 
     report = _summary(values)

@@ -5,6 +5,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from wbgs_jax._util.files import atomic_write
@@ -13,6 +17,8 @@ from wbgs_jax.evaluation import metrics
 
 SHOWN = 6
 """Spectra in a picture."""
+LONGEST_ARROW = 0.1
+"""Of the scene's size."""
 SIZES = ("gaussians",)
 """Sizes of a field that change during training."""
 
@@ -20,7 +26,7 @@ SIZES = ("gaussians",)
 def draw_all(
     folder: Path,
     dataset: Dataset,
-    index: Int[np.ndarray, "n"],
+    index: Int[np.ndarray, " n"],
     predicted: Float[np.ndarray, "n 90 360"],
     report: dict[str, Any],
     curves: list[dict[str, Any]],
@@ -39,7 +45,7 @@ def draw_all(
     return [_save(figure, folder / name) for name, figure in figures.items()]
 
 
-def spread(dataset: Dataset, index: Int[np.ndarray, "n"], count: int = SHOWN) -> Int[np.ndarray, "count"]:
+def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
     """Returns places in `index` of a spread of frequencies, at different transmitters where there are enough."""
     frequencies = np.unique(dataset.frequencies_hz[index])
     rng = np.random.default_rng(0)
@@ -119,6 +125,28 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
     for axis in axes:
         axis.grid(alpha=0.3)
     return figure
+
+
+def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[np.ndarray, "f 3"]) -> Path:
+    """Draws how far a training has moved the surfaces of a mesh, seen from above and from the side; returns the file."""
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    axes, size = figure.subplots(2, 1), 1e3 * np.linalg.norm(shift, axis=-1)
+    colours = colormaps["viridis"](size / max(size.max(), 1e-9))
+    different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # what moves alike is one thing
+    centre = np.array([corners[body.reshape(-1) == k].mean((0, 1)) for k in range(len(different))])
+    longest = LONGEST_ARROW * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
+    for axis, (i, j), name in zip(axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+        outlines = np.concatenate([corners, corners[:, :1]], 1)[..., [i, j]]
+        axis.add_collection(LineCollection(list(outlines), colors=colours, linewidths=0.8))
+        arrows = *centre[:, [i, j]].T, *(longest * different[:, [i, j]].T)
+        axis.quiver(*arrows, color=colours[first], angles="xy", scale_units="xy", scale=1)
+        axis.set(
+            title=f"{name} (arrows {longest:.0f} times too long)", xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal"
+        )
+        axis.autoscale_view()
+    shown = ScalarMappable(Normalize(0, size.max()), "viridis")
+    figure.colorbar(shown, ax=axes, label="moved by [mm]", shrink=0.8)
+    return _save(figure, folder / "surfaces_moved.png")
 
 
 def draw_frequencies(report: dict[str, Any]) -> Figure:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,11 +10,13 @@ from jaxtyping import Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.baselines import nearest_links
+from wbgs_jax.evaluation.calibration import power_calibration
+from wbgs_jax.inference.confidence import PowerConfidence, expected_power
 from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
 
 
 def score_power(
-    predicted: Float[np.ndarray, "n"], truth: Float[np.ndarray, "n"], frequencies_hz: Float[np.ndarray, "n"]
+    predicted: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"], frequencies_hz: Float[np.ndarray, " n"]
 ) -> dict[str, Any]:
     """Returns a report of received powers (dB), ready for JSON: n, power_error_db (median absolute error), power_mae_db (mean),
     and the same in per_frequency, a list by ascending frequency_ghz.
@@ -32,7 +35,7 @@ def score_power(
     return _summary(error) | {"per_frequency": rows}
 
 
-def power_figures(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
+def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
     line) and nearest_tx (the power of the nearest training transmitter at the same frequency). None where the data know no
     power.
@@ -47,7 +50,7 @@ def power_figures(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: In
     return report | {"baselines": {name: score_heard(values, dataset, index) for name, values in others.items()}}
 
 
-def score_heard(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, Any] | None:
+def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers of some links, those without any power left out; None where the data know none."""
     truth = dataset.received_db(index)
     if truth is None:
@@ -56,14 +59,30 @@ def score_heard(predicted: Float[np.ndarray, "n"], dataset: Dataset, index: Int[
     return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
 
 
-def free_space(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def calibrate_power(
+    confidence: PowerConfidence, predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]
+) -> dict[str, Any] | None:
+    """Returns how sure predicted powers of some links were, and should have been (`calibration.power_calibration`); None where
+    the data know no power."""
+    truth = dataset.received_db(index)
+    if truth is None:
+        return None
+    heard = truth > NOT_HEARD_DB
+    receivers = jnp.asarray(dataset.rx_positions(index[heard]), jnp.float32)
+    expected = _expected_power(confidence, jnp.asarray(predicted[heard], jnp.float32), dataset.query(index[heard]), receivers)
+    return power_calibration(expected, np.abs(predicted[heard].astype(np.float64) - truth[heard]))
+
+
+_expected_power = jax.jit(expected_power)
+
+
+def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Returns the power (dB) over the straight line, whatever stands in its way."""
-    receivers = np.asarray(dataset.receivers.position, np.float64)[dataset.receiver_index[index]]
-    distance = np.linalg.norm(dataset.tx_positions[index] - receivers, axis=-1)
+    distance = np.linalg.norm(dataset.tx_positions[index] - dataset.rx_positions(index), axis=-1)
     return np.asarray(free_space_db(jnp.asarray(np.maximum(distance, 1e-3)), jnp.asarray(dataset.frequencies_hz[index])))
 
 
-def nearest_power(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver."""
     everything = dataset.received_db(np.arange(len(dataset)))
     assert everything is not None
@@ -71,5 +90,5 @@ def nearest_power(dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.nda
     return everything[nearest_links(dataset, index, heard)]
 
 
-def _summary(error: Float[np.ndarray, "n"]) -> dict[str, Any]:
+def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
     return {"n": len(error), "power_error_db": float(np.median(error)), "power_mae_db": float(error.mean())}

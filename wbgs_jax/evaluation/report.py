@@ -134,6 +134,12 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
     if power := report.get("power"):
         others = ", ".join(f"{name.replace('_', ' ')} {own['power_mae_db']:.2f} dB" for name, own in power["baselines"].items())
         lines.append(f"received power: {power['power_mae_db']:.2f} dB off ({others}; means)")
+    if sure := (report.get("power") or report).get("confidence_db"):
+        lines.append(
+            f"expected error of powers {sure['expected']:.2f} dB (mean; scored {sure['scored']:.2f}); "
+            f"{100 * sure['coverage']:.0f} % are as near as {100 * sure['level']:.0f} % should be; "
+            f"the surer half is {sure['risk_coverage']['0.5']:.2f} dB off"
+        )
     if sure := report.get("confidence"):
         lines.append(
             f"expected SSIM {sure['expected']:.3f} (mean; scored {sure['scored']:.3f}); {100 * sure['level']:.0f} % intervals "

@@ -16,7 +16,7 @@ from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.calibration import calibration
-from wbgs_jax.evaluation.power import power_figures, score_heard
+from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.confidence import expect_many
 from wbgs_jax.inference.neighbours import for_receiver
@@ -38,6 +38,9 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     said = power_of(seen, dataset)
     power = None if said is None else power_figures(said, dataset, index)
+    tested = part == "test"  # how sure a field is has been learned from the validation part
+    if said is not None and power and trained.power_confidence and tested:
+        power |= {"confidence_db": calibrate_power(trained.power_confidence, said, dataset, index)}
     if dataset.kind == "power":
         return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
     truth, known = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
@@ -50,7 +53,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
     confidence = for_receiver(trained.confidence, dataset.receiver())
-    if confidence and part == "test":  # it has been learned from the validation part
+    if confidence and tested:
         asked = dataset.tx_positions[index], dataset.frequencies_hz[index]
         expected = expect_many(confidence, np.asarray(seen.pas), *asked, said)
         report["confidence"] = calibration(expected, figures["ssim"])
@@ -61,7 +64,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     return report, np.asarray(seen.pas)
 
 
-def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
+def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, " n"]:
     """Returns the indices of the held-out links; none at all is a `UserError`."""
     index = getattr(dataset, part)
     if not len(index):
@@ -69,7 +72,7 @@ def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, "n"]:
     return index
 
 
-def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, "n"] | None:
+def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | None:
     """Returns the received powers that a field says; None where it knows none.
 
     Raises:
@@ -90,7 +93,7 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
     }
 
 
-def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> dict[str, float]:
+def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     said = power_of(seen, dataset)

@@ -34,8 +34,10 @@ class Observation(NamedTuple):
     """Normalised power angular spectra."""
     snapshots: Complex[Array, "b elements"] | None = None
     """Complex array snapshots, of a field that knows phases."""
-    power_db: Float[Array, "b"] | None = None
+    power_db: Float[Array, " b"] | None = None
     """Received power relative to the transmitted power (dB), of a field that knows it."""
+    covariance: Complex[Array, "b elements elements"] | None = None
+    """Mean product y y^H of the snapshots, scaled to a trace of 1, of a field that knows how far to trust its phases."""
 
 
 class Aux(NamedTuple):
@@ -43,7 +45,7 @@ class Aux(NamedTuple):
 
     metrics: dict[str, Float[Array, ""]]
     """Figures for the curves; NaN where a figure means nothing."""
-    required: Int[Array, "k"] | None = None
+    required: Int[Array, " k"] | None = None
     """What the limits should have been; None for a field without limits."""
     overflow: Bool[Array, ""] | None = None
     """The limits were too small: the step must not be used."""
@@ -132,7 +134,7 @@ class Field(ABC):
         in checkpoints; None if it needs none."""
         return None
 
-    def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:
+    def grow(self, limits: Any, required: Int[np.ndarray, " k"]) -> Any:
         """Returns limits that hold what an overflowed step required (host)."""
         raise NotImplementedError("a field without limits does not overflow")
 
@@ -152,6 +154,22 @@ class Field(ABC):
     def known(self) -> tuple[Quantity, ...]:
         """Returns what it knows of a link: what its class `gives`, unless the scene lacks what that takes."""
         return self.gives
+
+    def anywhere(self, params: Any) -> tuple["Field", Any]:
+        """Returns the part of a trained field that holds for receivers that it was not trained for, and its parameters.
+
+        Raises:
+            UserError: there is none.
+        """
+        raise UserError(
+            f"the {self.name} field knows no receivers but those that it was trained for; "
+            "train --field wave or hybrid, on data with a mesh"
+        )
+
+    def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns the corners (f, k, 3) of the surfaces that it knows and by how much each was moved (f, 3), metres, where a
+        training has moved any (host); None otherwise."""
+        return None
 
     def sizes(self, params: Any) -> dict[str, int]:
         """Returns the numbers that tell how large a trained field is, for reports (host)."""

@@ -114,7 +114,7 @@ def query_features(
 
 def received_power_db(
     summary: Float[Array, "b width"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig, query: Query
-) -> Float[Array, "b"]:
+) -> Float[Array, " b"]:
     """Returns the power that an element receives, relative to the transmitted power (dB): free space, and what the network adds
     to it."""
     distance = smooth_length(query.tx_position - receiver.position)[:, 0]
@@ -145,7 +145,7 @@ def _query_inputs(
     return both, [encoded] if config.radiance_frequency else []
 
 
-def encoded_frequency(frequency_hz: Float[Array, "b"], config: WidebandConfig) -> Float[Array, "b d"]:
+def encoded_frequency(frequency_hz: Float[Array, " b"], config: WidebandConfig) -> Float[Array, "b d"]:
     """Returns what the networks see of the frequency."""
     encoded = frequency_encoding(frequency_hz, config.frequency_octaves, config.frequency_scale)
     return jnp.concatenate([encoded, legendre(scale_frequency(frequency_hz), config.frequency_degree)[:, 1:]], -1)

@@ -188,13 +188,21 @@ class HybridField(Field):
         """Returns those of the splatting field."""
         return self.wideband.limits(params.wideband, receivers)
 
-    def grow(self, limits: Any, required: Int[np.ndarray, "k"]) -> Any:
+    def grow(self, limits: Any, required: Int[np.ndarray, " k"]) -> Any:
         """Returns larger limits of the splatting field."""
         return self.wideband.grow(limits, required)
 
     def portable(self, plan: HybridPlan) -> HybridPlan:
         """Returns the plan without what is cheaply computed again."""
         return dataclasses.replace(plan, wideband=self.wideband.portable(plan.wideband))
+
+    def anywhere(self, params: HybridParams) -> tuple[Field, Any]:
+        """Returns the coherent field: what the splatting one has learned is what its receiver sees."""
+        return super().anywhere(params) if self.wave is None else self.wave.anywhere(params.wave)
+
+    def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns those of the coherent field."""
+        return None if self.wave is None else self.wave.displaced_surfaces()
 
     def sizes(self, params: HybridParams) -> dict[str, int]:
         """Returns the sizes of both fields."""

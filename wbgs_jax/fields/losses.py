@@ -5,6 +5,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Complex, Float
 
 from wbgs_jax.radio.array import EXACT, squared_magnitude
@@ -15,6 +16,8 @@ FAINTEST = 1e-12
 gradient that leads anywhere."""
 GOOD_MATCH = 2e-3
 """One minus the squared correlation below which two snapshots are the same to a search."""
+UNEXPLAINED = 0.1
+"""Power of noise relative to what a model explains, in `surprise`: of paths that nobody has thought of."""
 _C1, _C2 = 0.01**2, 0.03**2
 
 
@@ -70,6 +73,23 @@ def log_decorrelation(predicted: Complex[Array, "*n elements"], truth: Complex[A
     level. No match is perfect (`GOOD_MATCH`)."""
     squared_correlation, _ = _correlation_and_power(predicted, truth)
     return jnp.log(1 - squared_correlation + GOOD_MATCH)
+
+
+def surprise(covariance: Complex[Array, "*n k k"], truth: Complex[Array, "*n k"]) -> Float[Array, "*n"]:
+    """Returns how unlikely snapshots are if they are complex normal with these covariances, each of a scale of its own: minus
+    the log-likelihood of the most likely scale, divided by the number of elements, constants left out.
+
+    Covariances have a trace of 1, and `UNEXPLAINED` of it is added as noise. Where one sum of paths is all that there is, this
+    is `log_decorrelation`, but for a constant and the noise; where paths are partially coherent it knows which part of a
+    snapshot says nothing.
+    """
+    count = truth.shape[-1]
+    noise = UNEXPLAINED / count * jnp.eye(count)
+    lower = jnp.linalg.cholesky((covariance + noise) / (1 + UNEXPLAINED))
+    unit = truth / jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
+    whitened = solve_triangular(lower, unit[..., None], lower=True)[..., 0]
+    volume = 2 * jnp.sum(jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1).real), -1)
+    return volume / count + jnp.log(jnp.sum(squared_magnitude(whitened), -1))
 
 
 def _correlation_and_power(

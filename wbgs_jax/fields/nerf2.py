@@ -84,7 +84,7 @@ class Rays:
     """Unit directions in the receiver's frame ..."""
     world: Float[Array, "r 3"]
     """... and in the world's."""
-    length: Float[Array, "r"]
+    length: Float[Array, " r"]
     """Metres."""
 
 
@@ -195,7 +195,7 @@ def render(params: Weights, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90
     return jnp.moveaxis(image, -1, 0).reshape(-1, *PAS_SHAPE)
 
 
-def choose_pixels(key: Key[Array, ""], count: int) -> Int[Array, "r"]:
+def choose_pixels(key: Key[Array, ""], count: int) -> Int[Array, " r"]:
     """Returns flat indices of random pixels, one out of each of `count` equal stretches of the image, row by row."""
     places = (jnp.arange(count) + jax.random.uniform(key, (count,))) * (PIXELS / count)
     return jnp.minimum(places.astype(jnp.int32), PIXELS - 1)

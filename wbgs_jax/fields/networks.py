@@ -142,7 +142,7 @@ def signal_activation(logits: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jax.nn.softplus(logits - 1.0)
 
 
-def attenuation_activation(delta_o: Float[Array, "n"], delta_f: Float[Array, "n b"], maximum: float) -> Float[Array, "n b"]:
+def attenuation_activation(delta_o: Float[Array, " n"], delta_f: Float[Array, "n b"], maximum: float) -> Float[Array, "n b"]:
     """Returns delta = delta_o + delta_f, the sum taken before the squash so that it lies in (0, maximum) for any network
     output."""
     return maximum * jax.nn.sigmoid(delta_o[:, None] + delta_f)

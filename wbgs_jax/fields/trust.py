@@ -37,10 +37,10 @@ class Share:
     """The logit of a share: linear in the features."""
 
     bias: Float[Array, ""]
-    weights: Float[Array, "features"]
-    mean: Float[Array, "features"]
+    weights: Float[Array, " features"]
+    mean: Float[Array, " features"]
     """Of the features over the links that it was learned from ..."""
-    scale: Float[Array, "features"]
+    scale: Float[Array, " features"]
     """... and their standard deviation."""
 
 
@@ -50,7 +50,7 @@ class Scored(NamedTuple):
     features: Float[np.ndarray, "n features"]
     scores: Float[np.ndarray, "n shares"]
     """What every share of `SHARES` is worth on each link: the larger, the better."""
-    tx_index: Int[np.ndarray, "n"]
+    tx_index: Int[np.ndarray, " n"]
 
 
 def constant(share: float) -> Share:
@@ -60,7 +60,7 @@ def constant(share: float) -> Share:
     return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
 
 
-def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, "b"]:
+def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
     """Returns the coherent field's share, 0 to 1, of B queries."""
     return jax.nn.sigmoid(share.bias + (features - share.mean) / share.scale @ share.weights)
 
@@ -102,11 +102,11 @@ def _best(scores: Float[np.ndarray, "n shares"]) -> float:
     return float(SHARES[np.argmax(scores.mean(0))])
 
 
-def _worth(share: Share, known: Scored) -> Float[np.ndarray, "n"]:
+def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
     return np.asarray(_between(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
 
 
-def _between(scores: Float[Array, "n shares"], share: Float[Array, "n"]) -> Float[Array, "n"]:
+def _between(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
     """Returns the score at a share between those that were tried."""
     place = share * (len(SHARES) - 1)
     low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
@@ -127,7 +127,7 @@ def _fit(known: Scored) -> Share:
 
 @jax.jit
 def _ascend(
-    start: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"], used: Bool[Array, "features"]
+    start: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"], used: Bool[Array, " features"]
 ) -> Share:
     """Maximises the mean score by Adam: a smooth function of eight numbers."""
 

@@ -38,9 +38,11 @@ from wbgs_jax.propagation.edges import Edges, edges_of_facets
 from wbgs_jax.propagation.facets import Facets, facets_from_mesh
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.motion import Motion, still
 from wbgs_jax.propagation.paths import MAX_FACETS, TracedPaths, trace_paths
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.geometry import turned
 from wbgs_jax.radio.patterns import upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
 
@@ -77,7 +79,7 @@ class PreparedPaths:
     """Of its array; None where they differ from frequency to frequency."""
     paths: TracedPaths
     """Leading axis: transmitters."""
-    tx_index: Int[Array, "tx"]
+    tx_index: Int[Array, " tx"]
     """Numbers of the transmitters, ascending."""
 
 
@@ -88,10 +90,12 @@ class WaveField(Field):
 
     facets: Facets
     edges: Edges
-    known_thickness: Float[Array, "m"]
+    known_thickness: Float[Array, " m"]
     """Thickness of every material, metres; 0 where it is not known, and learned."""
-    first_placement: Float[Array, "places"]
+    first_placement: Float[Array, " places"]
     """`WaveParams.placement` before training."""
+    motion: Motion
+    """How far things stand from where the data say, as far as that has been found out; the facets are there already."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -123,13 +127,20 @@ class WaveField(Field):
         amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
         corrections = jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(())
         transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
-        return WaveParams(materials, *corrections, transmitter, element, jnp.array(self.first_placement))
+        return WaveParams(
+            materials, *corrections, transmitter, element, jnp.array(self.first_placement), jnp.zeros(()), jnp.zeros(())
+        )
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host, unless they are prepared)."""
         check_receiver(receiver)
         search, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.search, cache.beams)
-        return WavePlan(search, receiver, self.known_thickness, None, beams, self.config)
+        return WavePlan(search, _stands(receiver, self.motion), self.known_thickness, None, beams, self.config)
+
+    def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
+        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found."""
+        orientation = turned(plan.receiver.orientation, jnp.asarray(motion.receiver_turn))
+        return dataclasses.replace(plan, motion=motion, receiver=dataclasses.replace(plan.receiver, orientation=orientation))
 
     def _search(self, receiver: Receiver) -> Search:
         config = self.config
@@ -139,7 +150,7 @@ class WaveField(Field):
                 "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
-        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
+        return make_search(self.facets, self.edges, np.asarray(receiver.position) + np.asarray(self.motion.receiver), *areas)
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
         """Returns the paths of all transmitters of some links (host): geometry is not trained."""
@@ -169,23 +180,37 @@ class WaveField(Field):
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
         facet corrections."""
-        return self.planned_loss(params, self.plan(params, batch.receiver, cache=cache), cache, batch)
-
-    def planned_loss(
-        self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, batch: Batch
-    ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the loss of a batch by a plan that is known."""
-        config, seen = self.config, self.render_links(params, plan, cache, batch.links)
+        config, plan = self.config, self.plan(params, batch.receiver, cache=cache)
+        seen = self.render_links(params, plan, cache, batch.links)
         loss, aux = compare(seen, batch, config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
-        return loss + config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0)), aux
+        return loss + self.penalty(params), aux
 
-    def moved(self, motion: Float[np.ndarray, "movers 3"]) -> "WaveField":
-        """Returns the field of a scene whose surfaces stand elsewhere (host)."""
-        facets = move_facets(self.facets, np.asarray(motion, np.float64))
-        return dataclasses.replace(self, facets=_to_device(facets), edges=_to_device(edges_of_facets(facets)))
+    def penalty(self, params: WaveParams) -> Float[Array, ""]:
+        """Returns what corrections of facets cost."""
+        return self.config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0))
+
+    def moved(self, motion: Motion) -> "WaveField":
+        """Returns the field of a scene in which things stand elsewhere (host)."""
+        facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
+        total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
+        places = {"facets": facets, "edges": edges_of_facets(facets), "motion": total}
+        return dataclasses.replace(self, **{name: _to_device(place) for name, place in places.items()})
+
+    def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
+        """Returns the field without what was found out about where its receiver stands."""
+        nothing = jnp.zeros(3)
+        return dataclasses.replace(
+            self, motion=dataclasses.replace(self.motion, receiver=nothing, receiver_turn=nothing)
+        ), params
+
+    def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns the corners of the facets where they stand now, and how far their movers were shifted."""
+        if not np.any(self.motion.shift):
+            return None
+        return np.asarray(self.facets.corners), np.asarray(self.motion.shift)[np.asarray(self.facets.mover)]
 
     def arrivals(self, params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
         """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
@@ -198,19 +223,23 @@ class WaveField(Field):
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns groups for materials, thicknesses, corrections, antennas and placement."""
+        """Returns groups for materials, thicknesses, corrections, antennas and placement; idealisations are searched, and
+        not trained."""
         return {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
             "corrections": Group(config.corrections_lr),
             "antennas": Group(config.antennas_lr),
             "placement": Group(config.placement_lr),
+            "ideal": Group(0.0),
         }
 
     @classmethod
     def labels(cls, params: WaveParams) -> Any:
         """Returns the group of every parameter."""
-        return with_leaves(params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4, "placement")
+        return with_leaves(
+            params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
+        )
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
@@ -218,8 +247,16 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
     config = config or WaveConfig()
     facets = facets_from_mesh(mesh, config.max_facets)
     edges = edges_of_facets(facets)
-    placement = jnp.full(int(facets.mover.max()) + 2, np.log(config.placement), jnp.float32)
-    return WaveField(_to_device(facets), _to_device(edges), jnp.asarray(mesh.thickness, jnp.float32), placement, config)
+    movers = int(facets.mover.max()) + 1
+    placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
+    thickness, motion = jnp.asarray(mesh.thickness, jnp.float32), _to_device(still(movers))
+    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, motion, config)
+
+
+def _stands(receiver: Receiver, motion: Motion) -> Receiver:
+    """Returns the receiver where it has been found to stand."""
+    position, orientation = receiver.position + motion.receiver, turned(receiver.orientation, jnp.asarray(motion.receiver_turn))
+    return dataclasses.replace(receiver, position=position, orientation=orientation)
 
 
 def _beams(receiver: Receiver) -> Beams | None:

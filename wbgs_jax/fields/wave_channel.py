@@ -19,7 +19,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.wave_settings import WaveConfig
 from wbgs_jax.propagation.image_method import Search
-from wbgs_jax.propagation.motion import coherence, length_changes, length_gradient
+from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
@@ -27,11 +27,9 @@ from wbgs_jax.radio.array import (
     SPEED_OF_LIGHT,
     Beams,
     covariance_to_pas,
-    snapshot_to_pas,
-    squared_magnitude,
     wide_covariance_to_pas,
 )
-from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels, received_power_db
+from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
 from wbgs_jax.radio.patterns import Antenna
 from wbgs_jax.types import Receiver
 
@@ -43,13 +41,13 @@ LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 class Materials:
     """Stored (unconstrained) properties of M materials, those of ITU-R P.2040: eps_r, and sigma = c f^d with f in GHz."""
 
-    log_susceptibility: Float[Array, "m"]
+    log_susceptibility: Float[Array, " m"]
     """log(eps_r - 1)."""
-    log_conductivity: Float[Array, "m"]
+    log_conductivity: Float[Array, " m"]
     """log c, c in S/m."""
-    slope: Float[Array, "m"]
+    slope: Float[Array, " m"]
     """d."""
-    log_thickness: Float[Array, "m"]
+    log_thickness: Float[Array, " m"]
     """log of metres, where the scene does not say."""
 
 
@@ -69,9 +67,14 @@ class WaveParams:
     """Of all transmitters, in the world frame."""
     element: Antenna
     """What every element of the array is besides its known pattern, in the receiver's frame."""
-    placement: Float[Array, "places"]
+    placement: Float[Array, " places"]
     """Logarithm of how far (metres, standard deviation along each axis) the movers of the facets and, last, the transmitters
     stand from where they are said to be."""
+    thick: Float[Array, ""]
+    """1 where waves behind slabs lack the phase of the air that stood there, as in nature, 0 where not, as in ray tracers
+    (`slab.slab_coefficients`)."""
+    curved: Float[Array, ""]
+    """1 where waves reach the array as spheres, as in nature, 0 where they are plane (`transport.element_voltages`)."""
 
 
 @pytree
@@ -80,51 +83,50 @@ class WavePlan:
 
     search: Search
     receiver: Receiver
-    known_thickness: Float[Array, "m"]
-    motion: Float[Array, "movers 3"] | None
-    """How far the movers of the facets stand from where paths were found (metres), while that is being learned."""
+    known_thickness: Float[Array, " m"]
+    motion: Motion | None
+    """How far things stand from where paths were found, while that is being learned."""
     beams: Beams | None
     """Of the array; None where they differ from frequency to frequency, or are traced."""
     config: WaveConfig = static()
 
 
 def path_snapshots(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Complex[Array, "b elements"]:
     """Returns the snapshots of B transmitters whose paths are known."""
-    return _snapshots(plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
+    return _snapshots(params, plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
 
 
-def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Arrivals:
+def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Arrivals:
     """Returns every path of B transmitters whose paths are known, leading axis B."""
     found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, frequency_hz)
     return found
 
 
-def _snapshots(plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, "b"]) -> Complex[Array, "b elements"]:
-    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
+def _snapshots(
+    params: WaveParams, plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]
+) -> Complex[Array, "b elements"]:
+    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f, params.curved))(arrived, frequency_hz)
 
 
-def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]) -> Observation:
+def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
     """Returns spectra, snapshots and received power of B transmitters whose paths are known."""
     if not plan.config.coherent:
         return Observation(phase_blind_pas(params, plan, paths, frequency_hz))
     arrived = path_arrivals(params, plan, paths, frequency_hz)
-    y, elements = _snapshots(plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
-    if plan.motion is not None:  # places that are being learned need no allowance for being unknown
-        unit = y / jnp.sqrt(jnp.sum(squared_magnitude(y), -1, keepdims=True) + FAINTEST)
-        return Observation(snapshot_to_pas(unit, elements), y, received_power_db(y))
+    y, elements = _snapshots(params, plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
     if plan.beams is not None:
         pas = covariance_to_pas(covariance, plan.beams)
     else:
         pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (len(y), *elements.shape[-2:])))
-    return Observation(pas, y, decibels(power))
+    return Observation(pas, y, decibels(power), covariance)
 
 
 def path_covariances(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, "b"]
-) -> tuple[Complex[Array, "b elements elements"], Float[Array, "b"]]:
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, " b"]
+) -> tuple[Complex[Array, "b elements elements"], Float[Array, " b"]]:
     """Returns the mean products y y^H of the snapshots of B transmitters over the places where surfaces may stand
     (`WaveParams.placement`), scaled to a trace of 1; and the mean power that an element receives."""
     movers, spread = params.placement.shape[0] - 1, jnp.exp(params.placement)
@@ -134,7 +136,7 @@ def path_covariances(
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
         gradient = jnp.concatenate([length_gradient(some, plan.search, movers) for some in (paths.specular, paths.diffracted)])
         left = coherence(gradient, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
-        covariance = covariance_from_paths(arrived, plan.receiver, f, left)
+        covariance = covariance_from_paths(arrived, plan.receiver, f, left, params.curved)
         trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
         return covariance / trace, trace / len(covariance) * strongest**2
 
@@ -143,7 +145,7 @@ def path_covariances(
 
 
 def phase_blind_pas(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, "b"]
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Float[Array, "b 90 360"]:
     """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
     return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
@@ -157,7 +159,7 @@ def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""])
     sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
     thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
-    return Slabs(permittivity[material], thickness[material])
+    return Slabs(permittivity[material], thickness[material], params.thick)
 
 
 def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
@@ -174,7 +176,7 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 
 
-def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "k"]:
+def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:
     """Returns the factor by which paths differ from their slabs and wedges."""
     kind = paths.interaction_type
     counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)

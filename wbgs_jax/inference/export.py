@@ -95,7 +95,7 @@ def _serialize(trained: Trained, receiver: Receiver, platforms: Sequence[str]) -
     plan = trained.field.portable(trained.field.plan(trained.params, receiver))
     neighbours = for_receiver(trained.neighbours, receiver)
 
-    def predict(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, "n"]) -> Float[Array, "n 90 360"]:
+    def predict(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> Float[Array, "n 90 360"]:
         query = Query(tx_position, frequency_hz)
         return correct(neighbours, trained.field.render(trained.params, plan, query).pas, query)
 

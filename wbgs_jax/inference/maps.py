@@ -11,7 +11,7 @@ from wbgs_jax.inference.predictor import BLOCK, Predictor
 
 def predict_blocks(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
-) -> Iterator[Float[np.ndarray, "k *answer"]]:
+) -> Iterator[Float[np.ndarray, " k *answer"]]:
     """Returns spectra or powers (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
 
     Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation.
@@ -20,7 +20,7 @@ def predict_blocks(
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
     n = len(positions)
 
-    def part(start: int) -> Float[np.ndarray, "k *answer"]:
+    def part(start: int) -> Float[np.ndarray, " k *answer"]:
         index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up
         return np.asarray(predict(positions[index], frequencies[index]))[: n - start]
 
@@ -29,7 +29,7 @@ def predict_blocks(
 
 def predict_many(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
-) -> Float[np.ndarray, "n *answer"]:
+) -> Float[np.ndarray, " n *answer"]:
     """Returns all blocks of `predict_blocks` in one array."""
     n, done = len(np.atleast_2d(tx_positions)), 0
     answers = None
@@ -42,7 +42,7 @@ def predict_many(
 
 def map_queries(
     xs: Any, ys: Any, height: float, frequencies_hz: Any
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Returns positions and frequencies of a map at one height: the x of the grid runs fastest, then y, then the frequency.
 
     Metres and hertz; results of n = frequencies * ys * xs queries reshape to (frequencies, ys, xs, ...).
@@ -53,6 +53,6 @@ def map_queries(
 
 def predict_map(
     predict: Predictor, xs: Any, ys: Any, height: float, frequencies_hz: Any, block: int = BLOCK
-) -> Float[np.ndarray, "n *answer"]:
+) -> Float[np.ndarray, " n *answer"]:
     """Returns the spectra (float32, 130 kB each) or powers of a map of transmitters, in the order of `map_queries`."""
     return predict_many(predict, *map_queries(xs, ys, height, frequencies_hz), block)

@@ -36,7 +36,7 @@ class Neighbours:
     rx_position: Float[Array, "3"]
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
-    frequency_hz: Float[Array, "m"]
+    frequency_hz: Float[Array, " m"]
     images: Float[Array, "m 90 360"]
     """y - f, or y."""
     weights: Float[Array, "m m"]
@@ -49,9 +49,9 @@ class Neighbours:
 
 def nearness(
     tx_position: Float[Array, "b 3"],
-    frequency_hz: Float[Array, "b"],
+    frequency_hz: Float[Array, " b"],
     known_position: Float[Array, "m 3"],
-    known_frequency: Float[Array, "m"],
+    known_frequency: Float[Array, " m"],
     length: Any,
 ) -> Float[Array, "b m"]:
     """Returns the kernel: exp(-distance / length) at equal frequencies, else 0."""

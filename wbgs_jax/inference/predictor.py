@@ -1,7 +1,8 @@
 """Asking a trained field: as a pure function of (transmitter, frequency), or about the links of a dataset."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,8 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.confidence import Confidence
-from wbgs_jax.inference.neighbours import Neighbours, correct, for_receiver
+from wbgs_jax.inference.confidence import Confidence, PowerConfidence
+from wbgs_jax.inference.neighbours import SAME_PLACE_M, Neighbours, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
@@ -47,6 +48,11 @@ class Trained(Protocol):
         """How sure its answers are."""
         ...
 
+    @property
+    def power_confidence(self) -> PowerConfidence | None:
+        """How sure the received powers are that it says."""
+        ...
+
     def dataset(self) -> Dataset:
         """Returns the data."""
         ...
@@ -56,12 +62,38 @@ class Trained(Protocol):
         ...
 
 
+T = TypeVar("T", bound=Trained)
+
+
+def at_receiver(trained: T, receiver: Receiver, dataset: Dataset | None = None) -> T:
+    """Returns a trained field for another receiver than those of its data: another place, orientation or array. At one of its
+    own receivers it is what it was; elsewhere it is the part that holds anywhere (the coherent field), without neighbours and
+    without a word on how sure it is, which nobody has measured there. `dataset` is what it was trained on, where it is read
+    already.
+
+    Raises:
+        UserError: nothing of the field holds elsewhere.
+    """
+    dataset = trained.dataset() if dataset is None else dataset
+    if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
+        return trained
+    field, params = trained.field.anywhere(trained.params)
+    nothing = dict.fromkeys(("neighbours", "confidence", "power_confidence"))
+    return dataclasses.replace(trained, field=field, params=params, **nothing)  # type: ignore[type-var]
+
+
+def _same(a: Receiver, b: Receiver) -> bool:
+    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)
+
+
 def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, for `jit`, `vmap` and one reverse-mode
     `grad`.
 
     What does not depend on the query is planned here, once, for the receiver (default: the first of the data the field was
-    trained on, which are read for it). Compiles for every new number of queries; `maps.predict_many` keeps that number fixed.
+    trained on, which are read for it; for one that it was not trained on, `at_receiver` comes first). Compiles for every new
+    number of queries; `maps.predict_many` keeps that number fixed.
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
@@ -92,7 +124,7 @@ def check_power(field: Field, dataset: Dataset) -> None:
 
 
 @jax.jit
-def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, "b"]:
+def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, " b"]:
     power = field.render(params, plan, query).power_db
     assert power is not None  # `check_power`
     return power
@@ -136,7 +168,7 @@ def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_S
     return predict
 
 
-def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
+def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
     """Returns what a field says of some of a dataset's links, as NumPy arrays in their order.
 
     What it can know of links beforehand is prepared once; links are rendered in blocks of one shape, receiver by receiver.
@@ -168,14 +200,14 @@ def observe_queries(trained: Trained, receiver: Receiver, query: Query) -> Obser
     return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
 
 
-def _blocks(numbers: Int[np.ndarray, "n"], size: int) -> Iterator[tuple[Int[np.ndarray, "k"], Int[np.ndarray, "size"]]]:
+def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " size"]]]:
     """Gives numbers block by block, and each filled up to one size with its last one: one compilation."""
     for start in range(0, len(numbers), max(size, 1)):
         block = numbers[start : start + size]
         yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
-def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Observation:
+def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
     """Returns what `observe_links` does, the spectra with what the neighbours say."""
     seen = observe_links(trained.field, trained.params, dataset, index)
     if dataset.n_receivers > 1:
@@ -185,7 +217,7 @@ def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, "n"]) -> 
 
 
 def corrected(
-    neighbours: Neighbours | None, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, "n"]
+    neighbours: Neighbours | None, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 90 360"]:
     """Returns predicted spectra of some of a dataset's links with what the neighbours say."""
     if neighbours is None:
@@ -197,7 +229,7 @@ def corrected(
 _correct = jax.jit(correct)
 
 
-def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 90 360"]:
+def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns the predicted spectra (float32) of some of a dataset's links."""
     return np.asarray(observe_links(field, params, dataset, index).pas)
 
@@ -206,7 +238,7 @@ def _like(seen: Observation, n: int) -> Observation:
     return jax.tree.map(lambda leaf: np.empty((n, *leaf.shape[1:]), leaf.dtype), seen)
 
 
-def _put(total: Observation, place: Int[np.ndarray, "k"], seen: Observation) -> None:
+def _put(total: Observation, place: Int[np.ndarray, " k"], seen: Observation) -> None:
     for own, new in zip(jax.tree.leaves(total), jax.tree.leaves(seen), strict=True):
         own[place] = np.asarray(new)[: len(place)]
 

@@ -29,13 +29,13 @@ class Edges:
     """World frame, metres."""
     direction: Float[AnyArray, "e 3"]
     """Unit vector; with the 0-face's normal it gives the tangent (normal x direction) that points into that face."""
-    length: Float[AnyArray, "e"]
+    length: Float[AnyArray, " e"]
     """Metres."""
     normal_0: Float[AnyArray, "e 3"]
     """Outward normal of the 0-face."""
     normal_n: Float[AnyArray, "e 3"]
     """Outward normal of the n-face."""
-    facet: Int[AnyArray, "e"]
+    facet: Int[AnyArray, " e"]
     """The 0-face; both faces are of one body, so of one material."""
 
 
@@ -104,10 +104,12 @@ def _wedge(
     return [(start, sign * along, high - low, normal[i], normal[j], i)]
 
 
-def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, "e"]:
+def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
     """Returns whether another surface closes the gap in front of an edge: where two bodies are joined nothing is diffracted."""
     out = edges.normal_0 + edges.normal_n
-    out = out / np.linalg.norm(out, axis=-1, keepdims=True)
+    out = out / np.maximum(
+        np.linalg.norm(out, axis=-1, keepdims=True), WELD
+    )  # a sheet's two faces have no way out between them
     middle = edges.start + edges.direction * edges.length[:, None] / 2
     normal, outline = np.asarray(facets.normal), outline_of(facets)
     covered = np.zeros(len(middle), bool)

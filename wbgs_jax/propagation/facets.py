@@ -7,11 +7,13 @@ material that meet, such as the walls of a room. Objects that are closed stay ap
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.types import Mesh
@@ -36,13 +38,13 @@ class Facets:
     """World frame, metres, counter-clockwise around the normal."""
     normal: Float[AnyArray, "f 3"]
     """Unit vectors, world frame."""
-    offset: Float[AnyArray, "f"]
+    offset: Float[AnyArray, " f"]
     """Distance of the plane from the origin along the normal, metres."""
-    body: Int[AnyArray, "f"]
+    body: Int[AnyArray, " f"]
     """What a facet may have edges with: the object that it belongs to, or the open sheets of its material that meet."""
-    material: Int[AnyArray, "f"]
+    material: Int[AnyArray, " f"]
     """Index of the mesh's material."""
-    mover: Int[AnyArray, "f"]
+    mover: Int[AnyArray, " f"]
     """What a facet moves with, if it stands elsewhere than the mesh says: the corners of a body that hang together."""
 
 
@@ -82,11 +84,22 @@ def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
     return Facets(corners[order], normals[order], offset, *numbers)
 
 
-def moved(facets: Facets, motion: Float[np.ndarray, "m 3"]) -> Facets:
-    """Returns the facets with their movers shifted (metres)."""
-    corners = np.asarray(facets.corners, np.float64) + motion[np.asarray(facets.mover)][:, None]
-    offset = np.sum(np.asarray(facets.normal, np.float64) * corners.mean(1), -1)
-    return dataclasses.replace(facets, corners=corners, offset=offset)
+def centres(facets: Facets, movers: int) -> Float[Array, "m 3"]:
+    """Returns the centres that the movers of the facets turn about: the means of their facets' corners."""
+    start = jnp.zeros((movers, 3)), jnp.zeros((movers, 1))
+    total = start[0].at[facets.mover].add(jnp.mean(jnp.asarray(facets.corners, jnp.float32), 1))
+    return total / jnp.maximum(start[1].at[facets.mover].add(1), 1)
+
+
+def moved(facets: Facets, shift: Float[np.ndarray, "m 3"], turn: Float[np.ndarray, "m 3"]) -> Facets:
+    """Returns the facets with their movers turned about their centres (rotation vectors, radians) and shifted (metres)."""
+    mover, corners = np.asarray(facets.mover), np.asarray(facets.corners, np.float64)
+    centre, rotation = np.asarray(centres(facets, len(shift)), np.float64)[mover], Rotation.from_rotvec(turn[mover])
+    arms = corners - centre[:, None]
+    turned = np.stack([rotation.apply(arms[:, k]) for k in range(CORNERS)], 1)
+    corners = centre[:, None] + turned + np.asarray(shift, np.float64)[mover][:, None]
+    normal = rotation.apply(np.asarray(facets.normal, np.float64))
+    return dataclasses.replace(facets, corners=corners, normal=normal, offset=np.sum(normal * corners.mean(1), -1))
 
 
 def outline_of(facets: Facets) -> Outline:
@@ -99,12 +112,12 @@ def outline_of(facets: Facets) -> Outline:
     return Outline(inward, np.sum(inward * corners, -1))
 
 
-def areas(facets: Facets) -> Float[np.ndarray, "f"]:
+def areas(facets: Facets) -> Float[np.ndarray, " f"]:
     """Returns the areas of all facets in square metres."""
     return _polygon_normals(np.asarray(facets.corners))[1]
 
 
-def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "v"]]:
+def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, " v"]]:
     """Returns the corners without duplicates, and the new index of every vertex."""
     different, which = np.unique(vertices, axis=0, return_inverse=True)  # at once: pairs of equal ones may be many
     pairs = cKDTree(different).query_pairs(WELD, output_type="ndarray")
@@ -113,7 +126,7 @@ def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"],
     return vertices[first], index
 
 
-def _components(count: int, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"]) -> Int[np.ndarray, "nodes"]:
+def _components(count: int, first: Int[np.ndarray, " n"], second: Int[np.ndarray, " n"]) -> Int[np.ndarray, " nodes"]:
     """Returns which connected component each of `count` nodes is in; components are numbered by their first nodes."""
     ends = first.astype(np.int32), second.astype(np.int32)  # wider indices are not for every SciPy's graphs
     joined = coo_array((np.ones(len(first), bool), ends), shape=(count, count))
@@ -125,15 +138,15 @@ def _sides(triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "sides 2"]:
     return np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
 
 
-def _names(owner: Int[np.ndarray, "n"], sides: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+def _names(owner: Int[np.ndarray, " n"], sides: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
     """Returns one integer for every side of an owner: equal for equal ones."""
     corners = int(sides.max(initial=0)) + 1
     return (owner.astype(np.int64) * corners + sides[:, 0]) * corners + sides[:, 1]
 
 
 def _bodies(
-    triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, "t"], material: Int[np.ndarray, "t"]
-) -> Int[np.ndarray, "t"]:
+    triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"], material: Int[np.ndarray, " t"]
+) -> Int[np.ndarray, " t"]:
     """Returns the body of every triangle: its part, or all open parts of its material that meet in corners of their borders.
 
     A part is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
@@ -151,7 +164,7 @@ def _bodies(
     return label[piece]
 
 
-def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]) -> Int[np.ndarray, "t"]:
+def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
     """Returns the mover of every triangle: those of one body that are joined by common corners share it."""
     _, node = np.unique(np.column_stack([np.repeat(body, 3), triangles.reshape(-1)]), axis=0, return_inverse=True)
     node = node.reshape(-1, 3)
@@ -161,7 +174,7 @@ def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]) -> In
 
 def _normals(
     points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"]
-) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]]:
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
     """Returns unit normals and areas (square metres) of triangles."""
     a, b, c = points[triangles].swapaxes(0, 1)
     cross = np.cross(b - a, c - a)
@@ -169,7 +182,7 @@ def _normals(
     return cross / np.maximum(length, 1e-30)[:, None], length / 2
 
 
-def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, "f"]]:
+def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
     """Returns unit normals and areas (square metres) of polygons."""
     cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     cross = np.where(
@@ -182,8 +195,8 @@ def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndar
 
 
 def _coplanar(
-    triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, "t"]
-) -> list[Int[np.ndarray, "k"]]:
+    triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]
+) -> list[Int[np.ndarray, " k"]]:
     """Returns the triangles of one body that share sides and a plane, as groups of indices."""
     _, first, which = np.unique(_names(np.repeat(body, 3), _sides(triangles)), return_index=True, return_inverse=True)
     owner = np.repeat(np.arange(len(triangles)), 3)
@@ -194,7 +207,7 @@ def _coplanar(
     return np.split(by_group, np.flatnonzero(np.diff(label[by_group])) + 1)
 
 
-def _parallel(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+def _parallel(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Returns whether unit normals agree."""
     return (np.linalg.norm(np.cross(a, b), axis=-1) < FLAT) & (np.sum(a * b, -1) > 0)
 

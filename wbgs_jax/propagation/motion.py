@@ -1,39 +1,73 @@
-"""How the lengths of paths change where surfaces stand elsewhere than the mesh says, to first order, and what is left of
+"""How the lengths of paths change where things stand elsewhere than they are said to, to first order, and what is left of
 interference where nobody knows by how much.
 
-By Fermat's principle the points of a path need not follow: if mirrors and edges move by m, a path grows by
+By Fermat's principle the points of a path need not follow: if mirrors and edges move by m where the path meets them and the
+receiver by r, it grows by
 
-    dL = sum over reflections and diffractions of (u - v) . m
+    dL = sum over reflections and diffractions of (u - v) . m  +  u_last . r
 
-with u and v the unit directions of the wave before and after. What it passes through changes nothing. Where the m of all
-movers are unknown, independent and normal with standard deviations s, dL is normal too, and the mean product of two
-amplitudes loses exp(-k^2 Var(dL_i - dL_j) / 2): the spectrum is that of partially coherent waves.
+with u and v the unit directions of the wave before and after. What it passes through changes nothing. A rigid motion of a
+surface is a shift and a rotation about its centre. Transmitters stay: they are what all else is measured from, and if all of
+them were off alike, everything else would be off the other way.
+
+Where the shifts of all movers are unknown, independent and normal with standard deviations s, dL is normal too, and the mean
+product of two amplitudes loses exp(-k^2 Var(dL_i - dL_j) / 2): the spectrum is that of partially coherent waves.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.propagation.facets import AnyArray, centres
 from wbgs_jax.propagation.image_method import Search
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, Paths
-from wbgs_jax.propagation.transport import legs_of
+from wbgs_jax.propagation.transport import last_leg, legs_of
 from wbgs_jax.radio.array import EXACT
 
 
-def length_changes(paths: Paths, search: Search, motion: Float[Array, "m 3"]) -> Float[Array, "k"]:
-    """Returns by how much the K paths of one transmitter grow (metres) if every mover of the facets moves by so much."""
+@pytree
+class Motion:
+    """How far things stand from where they are said to stand, seen from the transmitters: small rigid motions, world frame."""
+
+    shift: Float[AnyArray, "m 3"]
+    """Of every mover of the facets, metres, ..."""
+    turn: Float[AnyArray, "m 3"]
+    """... and its rotation vector about its centre (`facets.centres`), radians."""
+    receiver: Float[AnyArray, "3"]
+    """Of the receiver, metres, ..."""
+    receiver_turn: Float[AnyArray, "3"]
+    """... and its rotation vector, radians."""
+
+
+def still(movers: int) -> Motion:
+    """Returns the motion of what stands where it is said to (float32)."""
+    none, nothing = np.zeros(3, np.float32), np.zeros((movers, 3), np.float32)
+    return Motion(nothing, nothing, none, none)
+
+
+def length_changes(paths: Paths, search: Search, motion: Motion) -> Float[Array, " k"]:
+    """Returns by how much the K paths of one transmitter grow (metres) if things move by so much; turning the receiver changes
+    no length."""
     turn, mover = _turns(paths, search)
-    return jnp.sum(turn * motion[mover], (-2, -1))
+    leg = jnp.minimum(paths.interaction_leg, paths.points.shape[1] - 2)
+    point = jnp.take_along_axis(paths.points, leg[..., None] + 1, 1)
+    arm = point - centres(search.facets, len(motion.shift))[mover]
+    own = jnp.asarray(motion.shift)[mover] + jnp.cross(jnp.asarray(motion.turn)[mover], arm)
+    direction = legs_of(paths).direction
+    arriving = jnp.take_along_axis(direction, last_leg(paths)[:, None, None], 1)[:, 0]
+    return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(arriving, motion.receiver, precision=EXACT)
 
 
 def length_gradient(paths: Paths, search: Search, movers: int) -> Float[Array, "k places 3"]:
-    """Returns the derivative of the K path lengths of one transmitter with respect to the places of all movers of the facets
+    """Returns the derivative of the K path lengths of one transmitter with respect to the shifts of all movers of the facets
     and, last, of the transmitter."""
     turn, mover = _turns(paths, search)
     start = jnp.zeros((len(turn), movers + 1, 3)).at[:, movers].set(-legs_of(paths).direction[:, 0])
     return start.at[jnp.arange(len(turn))[:, None], mover].add(turn)
 
 
-def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, "m"], wavenumber: Float[Array, ""]) -> Float[Array, "k k"]:
+def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], wavenumber: Float[Array, ""]) -> Float[Array, "k k"]:
     """Returns what is left, 0 to 1, of the mean product of two paths' amplitudes where the places that their lengths depend on
     are unknown.
 

@@ -69,7 +69,7 @@ class Candidates(NamedTuple):
     points: Float[Array, "c 5 3"]
     interaction_facet: Int[Array, "c 3"]
     interaction_type: Int[Array, "c 3"]
-    score: Float[Array, "c"]
+    score: Float[Array, " c"]
     """Guess of the amplitude; 0 for no path."""
 
 
@@ -183,7 +183,7 @@ def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, 
     return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
 
 
-def _diffracted(source, goal, edge: Int[Array, "c"], edges: Edges):
+def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     """Returns where the shortest way over an edge touches it (Keller's cone), and a guess of the amplitude, 0 if not."""
     start, along = edges.start[edge], edges.direction[edge]
 
@@ -241,7 +241,7 @@ def _cut(candidate: Candidates, search: Search, legs: int):
     return jnp.where(there, facet, 0), jnp.where(there, types, NONE), jnp.where(there, leg, 0), crossed
 
 
-def _key(place: Float[Array, "*n"], index: Int[Array, "_"]) -> UInt32[Array, "*n"]:
+def _key(place: Float[Array, "*n"], index: Int[Array, " _"]) -> UInt32[Array, "*n"]:
     """Returns place and index of an interaction as one integer that sorts by place; `NO_KEY` where the place is infinite."""
     key = (place * PLACES).astype(jnp.uint32) * INDICES + index.astype(jnp.uint32)
     return jnp.where(jnp.isfinite(place), key, NO_KEY)

@@ -18,10 +18,12 @@ DAMPING = 1 - 1e-4
 class Slabs:
     """What every facet is made of at one frequency."""
 
-    permittivity: Complex[Array, "f"]
+    permittivity: Complex[Array, " f"]
     """Relative and complex (`complex_permittivity`)."""
-    thickness: Float[Array, "f"]
+    thickness: Float[Array, " f"]
     """Metres."""
+    air: Float[Array, ""] | float = 0.0
+    """Share of the phase of the air in their place that is taken out of what passes them (`slab_coefficients`)."""
 
 
 class SlabCoefficients(NamedTuple):
@@ -45,16 +47,19 @@ def slab_coefficients(
     permittivity: Complex[Array, "*#n"],
     thickness: Float[Array, "*#n"],
     frequency_hz: Float[Array, "*#n"],
+    air: Float[Array, ""] | float = 0.0,
 ) -> SlabCoefficients:
     """Returns the coefficients of a slab in air (ITU-R P.2040-3, section 2.2.2.2).
 
-    A transmitted wave keeps its direction and is not shifted; the phase of the free space it replaces is not taken out.
+    A transmitted wave keeps its direction and is not shifted. Its path runs through the slab, too, where there is no air: the
+    phase k t cos(theta) is counted twice unless it is taken out here. Ray tracers whose walls have no thickness count it twice.
 
     Args:
         cosine: of the angle of incidence (0..1).
         permittivity: relative and complex, imaginary part at most 0.
         thickness: metres.
         frequency_hz: of the wave.
+        air: share of that phase which is taken out: 0 as ray tracers have it, 1 as nature has it.
     """
     inner = jnp.sqrt(permittivity - (1 - cosine**2))
     # Twice the one-way phase; clipped where nothing is left, so that gradients stay finite.
@@ -68,4 +73,5 @@ def slab_coefficients(
 
     te = both((cosine - inner) / (cosine + inner))
     tm = both((permittivity * cosine - inner) / (permittivity * cosine + inner))
-    return SlabCoefficients(te[0], tm[0], te[1], tm[1])
+    replaced = jnp.exp(2j * jnp.pi * air * frequency_hz / SPEED_OF_LIGHT * thickness * cosine)
+    return SlabCoefficients(te[0], tm[0], te[1] * replaced, tm[1] * replaced)

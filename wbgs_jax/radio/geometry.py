@@ -37,6 +37,14 @@ def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) ->
     return jnp.matmul(vectors, rotation_matrix(orientation), precision=EXACT)
 
 
+def turned(orientation: Float[Array, "4"], rotation: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Returns a quaternion (wxyz, of any length) after a small rotation of the world, a vector in radians: right to its third
+    power."""
+    w, v = orientation[0], orientation[1:]
+    half = rotation / 2
+    return jnp.concatenate([(w - jnp.sum(half * v))[None], v + w * half + jnp.cross(half, v)])
+
+
 def covariance_factor(log_scales: Float[Array, "*n 3"], quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     """Returns M with covariance M M^T: the own axes as columns, scaled by the standard deviations (metres)."""
     return rotation_matrix(quats) * jnp.exp(log_scales)[..., None, :]

@@ -54,7 +54,7 @@ def composite(
     return grid.transpose(2, 0, 3, 1, 4).reshape(-1, PAS_HEIGHT, PAS_WIDTH)
 
 
-def _tile_offsets(dtype) -> tuple[Float[np.ndarray, "pixels"], Float[np.ndarray, "pixels"], Float[np.ndarray, "pixels 6"]]:
+def _tile_offsets(dtype) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"], Float[np.ndarray, "pixels 6"]]:
     """Pixel offsets (x, y) from a tile's centre, and the monomials 1, x, y, x^2, xy, y^2 of them."""
     y, x = np.meshgrid(
         np.arange(TILE_HEIGHT) - (TILE_HEIGHT - 1) / 2, np.arange(TILE_WIDTH) - (TILE_WIDTH - 1) / 2, indexing="ij"
@@ -64,7 +64,7 @@ def _tile_offsets(dtype) -> tuple[Float[np.ndarray, "pixels"], Float[np.ndarray,
     return x.astype(dtype), y.astype(dtype), monomials.astype(dtype)
 
 
-def _gather(geometry, attenuation, signal, gaussian: Int[Array, "jobs chunk"], tile: Int[Array, "jobs"]):
+def _gather(geometry, attenuation, signal, gaussian: Int[Array, "jobs chunk"], tile: Int[Array, " jobs"]):
     """Per slot and job: geometry (u, v, conic) relative to the tile's centre, attenuation and signal of every query."""
     gaussian = gaussian.T
     index = jnp.maximum(gaussian, 0)
@@ -78,7 +78,7 @@ def _gather(geometry, attenuation, signal, gaussian: Int[Array, "jobs chunk"], t
 
 
 def _q(
-    geometry: Float[Array, "*n 5"], x: Float[np.ndarray, "pixels"], y: Float[np.ndarray, "pixels"]
+    geometry: Float[Array, "*n 5"], x: Float[np.ndarray, " pixels"], y: Float[np.ndarray, " pixels"]
 ) -> Float[Array, "*n pixels"]:
     return mahalanobis2(geometry[..., 0:1] - x, geometry[..., 1:2] - y, geometry[..., None, 2:])
 
@@ -166,7 +166,7 @@ def _tile_groups(jobs: TileJobs) -> Int[Array, "groups tiles"]:
     return jnp.argsort(-jobs.count).reshape(-1, TILE_GROUP)
 
 
-def _next_jobs(jobs: TileJobs, tiles: Int[Array, "tiles"], level: Int[Array, ""]) -> Int[Array, "tiles chunk"]:
+def _next_jobs(jobs: TileJobs, tiles: Int[Array, " tiles"], level: Int[Array, ""]) -> Int[Array, "tiles chunk"]:
     """The Gaussians of the tiles' jobs of a level; -1 where a tile has no such job."""
     live = level < jobs.count[tiles]
     gaussian = jobs.gaussian[jnp.where(live, jobs.first[tiles] + level, 0)]
@@ -236,7 +236,7 @@ def _blend_jobs(geometry, attenuation, signal, jobs: TileJobs):
 
 
 def _put(
-    values: Float[Array, "jobs ..."], job: Int[Array, "tiles"], new: Float[Array, "tiles ..."]
+    values: Float[Array, "jobs ..."], job: Int[Array, " tiles"], new: Float[Array, "tiles ..."]
 ) -> Float[Array, "jobs ..."]:
     """Store a value for every tile's job; tiles without one point past the end."""
     return values.at[job].set(new, mode="drop", unique_indices=True)

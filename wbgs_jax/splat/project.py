@@ -46,7 +46,7 @@ class Splats:
     """Pixel coordinates (x: column in 0..359, y: row; y > 89 lies below the horizon)."""
     conics: Float[Array, "n 3"]
     """Inverse 2D covariance (xx, xy, yy), 1 / px^2. An empty slot has zeros."""
-    depths: Float[Array, "n"]
+    depths: Float[Array, " n"]
     """Distance to the receiver, metres; infinite for an empty slot."""
     radii: Float[Array, "n 2"]
     """Half extents (x, y) of the footprint's bounding box, pixels, without gradient; negative for an empty slot."""
@@ -120,7 +120,7 @@ def _cap_azimuth(spread: Float[Array, "n 2 3"]) -> Float[Array, "n 2 3"]:
 
 def _covariance2d(
     spread: Float[Array, "n 2 3"],
-) -> tuple[Float[Array, "n"], Float[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
     """Returns the low-passed 2D covariance (xx, xy, yy) and its determinant.
 
     xx yy - xy^2 cancels for thin splats; the cross product of the two rows (Lagrange's identity) does not.

@@ -43,11 +43,11 @@ class TileJobs:
 
     gaussian: Int[Array, "jobs chunk"]
     """Gaussian index; -1 in empty slots."""
-    tile: Int[Array, "jobs"]
+    tile: Int[Array, " jobs"]
     """Tile index, row-major."""
-    first: Int[Array, "tiles"]
+    first: Int[Array, " tiles"]
     """First job of a tile; its jobs are consecutive."""
-    count: Int[Array, "tiles"]
+    count: Int[Array, " tiles"]
     """Number of jobs of a tile."""
     required_entries: Int[Array, ""]
     required_jobs: Int[Array, ""]
@@ -59,14 +59,14 @@ class TileJobs:
 class _Boxes:
     """Tile rectangles of depth-sorted splats. Columns come in two runs: the splat's own and that of its azimuth alias."""
 
-    row0: Int[Array, "n"]
-    rows: Int[Array, "n"]
-    column0: Int[Array, "n"]
-    columns: Int[Array, "n"]
-    alias: Float[Array, "n"]
+    row0: Int[Array, " n"]
+    rows: Int[Array, " n"]
+    column0: Int[Array, " n"]
+    columns: Int[Array, " n"]
+    alias: Float[Array, " n"]
     """Shift of the alias in pixels: + or - one period."""
-    alias_column0: Int[Array, "n"]
-    alias_columns: Int[Array, "n"]
+    alias_column0: Int[Array, " n"]
+    alias_columns: Int[Array, " n"]
 
 
 @partial(jax.jit, static_argnames="limits")
@@ -86,8 +86,8 @@ def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
 
 
 def _tile_range(
-    low: Float[Array, "n"], high: Float[Array, "n"], size: int, tiles: int
-) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    low: Float[Array, " n"], high: Float[Array, " n"], size: int, tiles: int
+) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
     """Returns the first tile and number of tiles that hold pixels in low..high."""
     first = jnp.clip(jnp.floor(jnp.ceil(low) / size), 0, tiles)
     last = jnp.clip(jnp.floor(jnp.floor(high) / size), -1, tiles - 1)
@@ -106,7 +106,7 @@ def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"]) -> _Boxe
 
 def _sorted_keys(
     means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, entries: int
-) -> tuple[UInt32[Array, "entries"], Int[Array, ""]]:
+) -> tuple[UInt32[Array, " entries"], Int[Array, ""]]:
     """Returns sorted keys tile * n + depth rank of all (splat, tile) pairs whose footprints overlap; `NO_ENTRY` in the rest."""
     n = means.shape[0]
     width = boxes.columns + boxes.alias_columns
@@ -127,7 +127,7 @@ def _sorted_keys(
     return jnp.sort(jnp.where(keep, tile * jnp.uint32(n) + rank.astype(jnp.uint32), NO_ENTRY)), end[-1]
 
 
-def _nearest_mahalanobis2(left: Float[Array, "e"], top: Float[Array, "e"], conic: Float[Array, "e 3"]) -> Float[Array, "e"]:
+def _nearest_mahalanobis2(left: Float[Array, " e"], top: Float[Array, " e"], conic: Float[Array, "e 3"]) -> Float[Array, " e"]:
     """Returns the smallest q over a tile's pixels (a continuous rectangle), given the offset of the first from the centre."""
     right, bottom = left + TILE_WIDTH - 1, top + TILE_HEIGHT - 1
     a, b, c = jnp.moveaxis(jnp.where(conic[:, :1] > 0, conic, jnp.array([1, 0, 1], conic.dtype)), -1, 0)
@@ -146,7 +146,7 @@ def _nearest_mahalanobis2(left: Float[Array, "e"], top: Float[Array, "e"], conic
 
 
 def _cut_into_jobs(
-    ranked: Int[Array, "entries"], starts: Int[Array, "tiles_1"], required_entries: Int[Array, ""], limits: TileLimits
+    ranked: Int[Array, " entries"], starts: Int[Array, " tiles_1"], required_entries: Int[Array, ""], limits: TileLimits
 ) -> TileJobs:
     count = -(-(starts[1:] - starts[:-1]) // CHUNK)
     end = jnp.cumsum(count)

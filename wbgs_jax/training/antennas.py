@@ -6,18 +6,17 @@ down the scene's -z axis, and a field that takes them for isotropic says of half
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.radio.patterns import PATTERN_EXPONENTS, Antenna
-from wbgs_jax.training.scores import surely_better
+from wbgs_jax.training.scores import Scores, surely_better
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 UP = ("+x", "+y", "+z")
@@ -59,8 +58,8 @@ def _antenna(pattern: str, forward: str, up: str) -> Antenna:
 
 def search_antennas(
     params: Any,
-    score: Callable[[Sequence[Any]], Float[np.ndarray, "k n"]],
-    tx_index: Int[np.ndarray, "n"],
+    score: Scores,
+    tx_index: Int[np.ndarray, " n"],
     config: SearchConfig,
     known_elements: bool,
 ) -> tuple[Any, AntennaReport]:

@@ -9,15 +9,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.stats import t as student_t
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.fields import Field
-from wbgs_jax.inference.confidence import FEATURES, LEVEL, MARGIN, Confidence, features
+from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.confidence import (
+    FEATURES,
+    LEVEL,
+    MARGIN,
+    POWER_FEATURES,
+    POWER_MARGIN_DB,
+    Confidence,
+    PowerConfidence,
+    features,
+    power_features,
+)
 from wbgs_jax.inference.neighbours import Neighbours, correct
 from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 FEWEST, MOST = 8, 300
 """Validation spectra below which nothing is said; those that are looked at, at most."""
@@ -25,51 +36,86 @@ FEW = 20
 """Rests below which their own quantiles do not reach `LEVEL`."""
 SETS = (0, 1, 3, 5, FEATURES)
 """Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
+POWER_SETS = (0, 1, 2, POWER_FEATURES)
+"""The same of received powers: none, the distance, and the power itself, and the frequency."""
 RIDGE = 1.0
 """Of the scaled features: that of one spectrum."""
-_features = jax.jit(features)
+_features, _power_features = jax.jit(features), jax.jit(power_features)
 
 
-def learn_confidence(field: Field, params: Any, dataset: Dataset, neighbours: Neighbours | None) -> Confidence | None:
-    """Returns how sure answers are; None for data of several receivers or received powers, or with too few validation spectra.
+def learn_confidence(
+    field: Field, params: Any, dataset: Dataset, neighbours: Neighbours | None
+) -> tuple[Confidence | None, PowerConfidence | None]:
+    """Returns how sure spectra and received powers are; None where field or data know nothing of them, or for too few
+    validation links. Of spectra, there is none for data of several receivers either.
 
     `neighbours` are those of the training part alone, if neighbours are asked.
     """
-    if dataset.kind == "power" or dataset.n_receivers > 1 or len(dataset.validation) < FEWEST:
-        return None
+    if len(dataset.validation) < FEWEST:
+        return None, None
     index = np.random.default_rng(1).permutation(dataset.validation)[:MOST]
-    query, trained = dataset.query(index), np.unique(dataset.tx_positions[dataset.train], axis=0)
-    seen, rx = observe_links(field, params, dataset, index), np.asarray(dataset.receiver().position)
+    seen = observe_links(field, params, dataset, index)
+    return _of_spectra(seen, dataset, index, neighbours), _of_powers(seen, dataset, index)
+
+
+def _of_spectra(
+    seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
+) -> Confidence | None:
+    if dataset.kind == "power" or dataset.n_receivers > 1:
+        return None
+    query = dataset.query(index)
     pas = np.asarray(correct(neighbours, jnp.asarray(seen.pas), query))
-    places = jnp.asarray(rx, jnp.float32), jnp.asarray(trained, jnp.float32)
+    places = jnp.asarray(np.asarray(dataset.receiver().position), jnp.float32), _trained(dataset)
     power = None if seen.power_db is None else jnp.asarray(seen.power_db)
     known = np.asarray(_features(jnp.asarray(pas), query, *places, power), np.float64)
     error = np.log(1 + MARGIN - np.minimum(ssim(pas, np.asarray(dataset.pas(index))), 1))
-    learned = fit(known, error, dataset.tx_index[index])
-    return Confidence(*places, *(jnp.asarray(array, jnp.float32) for array in learned))
+    *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
+    arrays = *learned, interval(rest), np.exp(rest).mean()
+    return Confidence(*places, *(jnp.asarray(array, jnp.float32) for array in arrays))
+
+
+def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]) -> PowerConfidence | None:
+    truth = dataset.received_db(index)
+    if truth is None or seen.power_db is None:
+        return None
+    heard = np.flatnonzero(truth > NOT_HEARD_DB)
+    if len(heard) < FEWEST:
+        return None
+    index, said = index[heard], np.asarray(seen.power_db)[heard]
+    receivers = jnp.asarray(dataset.rx_positions(index), jnp.float32)
+    trained = _trained(dataset)
+    known = np.asarray(_power_features(jnp.asarray(said), dataset.query(index), receivers, trained), np.float64)
+    error = np.log(POWER_MARGIN_DB + np.abs(said.astype(np.float64) - truth[heard]))
+    *learned, rest = fit(known, error, dataset.tx_index[index], POWER_SETS)
+    arrays = *learned, upper_end(rest), np.exp(rest).mean()
+    return PowerConfidence(trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
+
+
+def _trained(dataset: Dataset) -> Float[Array, "m 3"]:
+    """Returns where transmitters stood that were trained."""
+    return jnp.asarray(np.unique(dataset.tx_positions[dataset.train], axis=0), jnp.float32)
 
 
 def fit(
-    known: Float[np.ndarray, "n k"], error: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]
-) -> tuple[np.ndarray | float, ...]:
-    """Returns mean and scale of the features, weights, quantiles and surplus of a `Confidence`, from features and log errors of
-    some answers."""
+    known: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], sets: tuple[int, ...]
+) -> tuple[np.ndarray, ...]:
+    """Returns mean and scale of the features, and the weights, of a `Confidence`, from features and log errors of some answers,
+    and what is left of these errors; `sets` are the numbers of features that are tried."""
     mean, scale = known.mean(0), known.std(0) + 1e-6
     scaled = (known - mean) / scale
-    rests = {size: left_out(scaled[:, :size], error, tx_index) for size in SETS}
-    chosen = SETS[0]
-    for size in SETS[1:]:
+    rests = {size: left_out(scaled[:, :size], error, tx_index) for size in sets}
+    chosen = sets[0]
+    for size in sets[1:]:
         gain = rests[chosen] ** 2 - rests[size] ** 2
         by_tx = np.array([gain[tx_index == tx].mean() for tx in np.unique(tx_index)])
         if by_tx.mean() > by_tx.std() / np.sqrt(len(by_tx)):
             chosen = size
     weights = np.zeros(known.shape[1] + 1)
     weights[[*range(chosen), -1]] = regress(scaled[:, :chosen], error)
-    rest = rests[chosen]
-    return mean, scale, weights, interval(rest), float(np.exp(rest).mean())
+    return mean, scale, weights, rests[chosen]
 
 
-def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, "n"]) -> Float[np.ndarray, "k+1"]:
+def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k+1"]:
     """Returns the weights of the features and of 1 (ridge regression; 1 is not held back)."""
     columns = np.column_stack([scaled, np.ones(len(scaled))])
     penalty = np.diag([RIDGE] * scaled.shape[1] + [0.0])
@@ -78,8 +124,8 @@ def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, "n"]) -> 
 
 
 def left_out(
-    scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]
-) -> Float[np.ndarray, "n"]:
+    scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """Returns what a regression on all other transmitters leaves of every error."""
     rest = np.zeros(len(error))
     for tx in np.unique(tx_index):
@@ -89,17 +135,18 @@ def left_out(
     return rest
 
 
-def interval(rest: Float[np.ndarray, "n"]) -> Float[np.ndarray, "2"]:
-    """Returns the ends between which `LEVEL` of further rests lie, with the correction for the number of those seen.
+def interval(rest: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
+    """Returns the ends between which `LEVEL` of further rests lie."""
+    tail = (1 - LEVEL) / 2
+    return np.array([-upper_end(-rest, tail), upper_end(rest, tail)])
 
-    A few cannot have such quantiles: there it is the interval of Student's t, no narrower than what was seen.
+
+def upper_end(rest: Float[np.ndarray, " n"], tail: float = 1 - LEVEL) -> float:
+    """Returns what all but a share `tail` of further rests lie below, with the correction for the number of those seen.
+
+    A few cannot have such a quantile: there it is that of Student's t, no lower than what was seen.
     """
-    n, tail = len(rest), round((1 - LEVEL) / 2, 9)  # binary fractions would lose a place
-    ordered = np.sort(rest)
-    low = max(int(np.floor(tail * (n + 1))) - 1, 0)
-    high = min(int(np.ceil((1 - tail) * (n + 1))) - 1, n - 1)
-    ends = ordered[[low, high]]
+    n, tail = len(rest), round(tail, 9)  # binary fractions would lose a place
     if n >= FEW:
-        return ends
-    spread = rest.std(ddof=1) * np.sqrt(1 + 1 / n) * student_t.ppf(1 - tail, n - 1)
-    return np.array([min(ends[0], rest.mean() - spread), max(ends[1], rest.mean() + spread)])
+        return float(np.sort(rest)[min(n - int(np.floor(tail * (n + 1))), n - 1)])
+    return float(max(rest.max(), rest.mean() + rest.std(ddof=1) * np.sqrt(1 + 1 / n) * student_t.ppf(1 - tail, n - 1)))

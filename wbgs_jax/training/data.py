@@ -22,16 +22,16 @@ class TrainingData:
     steering: Complex[Array, "90 360 elements"] | None
     """Of the only receiver, if its array scales with the frequency: made once."""
     images: UInt8[Array, "n 90 360"] | None
-    power_db: Float[Array, "n"] | None
+    power_db: Float[Array, " n"] | None
 
-    def receiver_of(self, index: Int[Array, "b"]) -> Receiver:
+    def receiver_of(self, index: Int[Array, " b"]) -> Receiver:
         """Returns the receiver of some links, all of which have the same."""
         if self.receivers.position.shape[0] == 1:
             return jax.tree.map(lambda leaf: leaf[0], self.receivers)
         number = self.links.receiver_index[index[0]]
         return jax.tree.map(lambda leaf: leaf[number], self.receivers)
 
-    def pas(self, index: Int[Array, "b"]) -> Float[Array, "b 90 360"] | None:
+    def pas(self, index: Int[Array, " b"]) -> Float[Array, "b 90 360"] | None:
         """Returns the observed spectra of some links of one receiver; None where only powers are known."""
         if self.images is not None:
             return self.images[index].astype(jnp.float32) / 255
@@ -42,7 +42,7 @@ class TrainingData:
         elements = self.receiver_of(index).element_wavelengths(self.links.query.frequency_hz[index])
         return snapshot_to_pas(self.snapshots[index], elements)
 
-    def batch(self, index: Int[Array, "b"], key: Key[Array, ""]) -> Batch:
+    def batch(self, index: Int[Array, " b"], key: Key[Array, ""]) -> Batch:
         """Returns some links of one receiver with everything that was observed on them."""
         return Batch(
             links=jax.tree.map(lambda leaf: leaf[index], self.links),

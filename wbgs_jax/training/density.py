@@ -35,11 +35,11 @@ CLONE_STEP = 0.5
 class DensityStatistics:
     """What density control needs to know about every Gaussian, summed since the last control."""
 
-    gradient_norm: Float[Array, "n"]
+    gradient_norm: Float[Array, " n"]
     """Norm of the positional gradient on the image, in normalised coordinates (-1..1 across the image)."""
     mean_gradient: Float[Array, "n 3"]
     """Gradient of the loss with respect to the mean (per metre)."""
-    visible: Float[Array, "n"]
+    visible: Float[Array, " n"]
     """Steps in which the Gaussian touched the image."""
 
 
@@ -141,7 +141,7 @@ def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:
 
 def choose(
     gaussians: Gaussians, statistics: DensityStatistics, config: DensityConfig
-) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Returns masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is.
 
     There are never more than the maximum.
@@ -163,7 +163,7 @@ def choose(
     return useful & ~split, wanting & ~large, split
 
 
-def _sources(keep, clone, split) -> tuple[Int[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+def _sources(keep, clone, split) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """Returns for every new slot the Gaussian it comes from, and whether it is new: kept ones, clones, then pairs of halves."""
     kept, cloned, halves = (np.flatnonzero(mask) for mask in (keep, clone, split))
     source = np.concatenate([kept, cloned, np.repeat(halves, 2)])

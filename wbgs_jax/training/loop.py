@@ -102,13 +102,13 @@ class Run:
         batch = min(self.settings.optim.batch, len(self.dataset.train))
         return np.stack([self._draw(rng, pool, batch) for _ in range(steps)]).astype(np.int32)
 
-    def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, "n"], batch: int) -> Int[np.ndarray, "b"]:
+    def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, " n"], batch: int) -> Int[np.ndarray, " b"]:
         if self.dataset.n_receivers > 1:  # a receiver as often as its share of the links
             of_receiver = self.dataset.receiver_index[pool]
             pool = pool[of_receiver == rng.choice(of_receiver)]
         return rng.choice(pool, batch, replace=len(pool) < batch)
 
-    def pool(self, progress: float) -> Int[np.ndarray, "n"]:
+    def pool(self, progress: float) -> Int[np.ndarray, " n"]:
         """Returns the training links that batches are drawn from after this share of the steps: low frequencies first, if
         asked."""
         train, curriculum = self.dataset.train, self.settings.optim.curriculum
@@ -146,7 +146,7 @@ class Run:
         self.seconds += time.perf_counter() - begin
         return {name: float(np.mean(values)) for name, values in figures.items()}
 
-    def _recover(self, report: EpochReport, batch: Int[np.ndarray, "b"]) -> None:
+    def _recover(self, report: EpochReport, batch: Int[np.ndarray, " b"]) -> None:
         """Grows the limits after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
         if report.overflow:
             self.limits = self.field.grow(self.limits, np.asarray(report.required))

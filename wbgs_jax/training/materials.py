@@ -4,11 +4,11 @@ The phase behind a slab turns by many radians at high frequencies. Its permittiv
 turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
 data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
 apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
-spectra best is taken, unless what is there fits better by more than chance. Training goes on from there.
+spectra best is taken, unless what is there fits better by more than chance; a few spectra say which entries are worth a closer
+look. Training goes on from there.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.training.scores import Scores
 
 ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
@@ -36,6 +37,10 @@ UNSEEN = 1e-6
 """A material that changes the scores by less is in no path of the spectra, and stays what it is."""
 
 
+SHORTLIST = 4
+"""Entries that are looked at closely: the best at a first glance."""
+
+
 @dataclass(frozen=True)
 class SearchReport:
     """What a search did."""
@@ -48,21 +53,21 @@ class SearchReport:
     """Materials, and the entry that each of them got."""
 
 
-def search_materials(
-    params: Any, score: Callable[[Sequence[Any]], Float[np.ndarray, "k n"]], config: SearchConfig
-) -> tuple[Any, SearchReport]:
+def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[Any, SearchReport]:
     """Returns parameters with the materials whose scores are best."""
     before, taken, settled = np.zeros(0), dict[int, str](), 0
     count = len(params.materials.slope)
     for turn in range(config.rounds * count):
         material = turn % count
-        candidates = [params, *(dataclasses.replace(params, materials=m) for m in _entries(params.materials, material))]
+        entries = [dataclasses.replace(params, materials=m) for m in _entries(params.materials, material)]
+        likely = np.argsort(score(entries, config.glance).mean(1))[:SHORTLIST]
+        candidates = [params, *(entries[i] for i in likely)]
         scores = score(candidates)
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before = before if turn else scores[0]
         settled += 1
         if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
-            if taken.get(material) != (entry := list(ITU_MATERIALS)[best - 1]):
+            if taken.get(material) != (entry := list(ITU_MATERIALS)[likely[best - 1]]):
                 taken[material], settled = entry, 1
             params, scores = candidates[best], scores[best:]
         if settled == count:  # all others are what they were when each was looked at
@@ -70,7 +75,7 @@ def search_materials(
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
-def _surely_better(new: Float[np.ndarray, "n"], old: Float[np.ndarray, "n"], errors: float) -> bool:
+def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], errors: float) -> bool:
     """Returns whether scores are lower by more than so many standard errors of the mean difference."""
     gain = old - new
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))

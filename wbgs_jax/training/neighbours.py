@@ -70,7 +70,7 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     alone = ssim(predicted[asked], truth[asked])
     query = dataset.query(links[asked])
 
-    def gains(choice: Choice) -> Float[np.ndarray, "n"]:
+    def gains(choice: Choice) -> Float[np.ndarray, " n"]:
         neighbours = make_neighbours(choice, dataset, links[known], truth[known], predicted[known])
         return ssim(np.asarray(correct(neighbours, jnp.asarray(predicted[asked]), query)), truth[asked]) - alone
 
@@ -83,7 +83,7 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     return Learned(make_neighbours(chosen, dataset, links, truth, predicted), line, of_training)
 
 
-def choices(dataset: Dataset, known: Int[np.ndarray, "n"]) -> list[Choice]:
+def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
     """Returns what is tried."""
     positions = np.unique(dataset.tx_positions[known], axis=0)
     if len(positions) < 2:
@@ -94,7 +94,7 @@ def choices(dataset: Dataset, known: Int[np.ndarray, "n"]) -> list[Choice]:
     return [Choice(kind, scale * spacing, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
 
 
-def choose(tried: dict[Choice, Float[np.ndarray, "n"]], tx_index: Int[np.ndarray, "n"]) -> tuple[Choice | None, float]:
+def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarray, " n"]) -> tuple[Choice | None, float]:
     """Returns the choice by its gains over the field alone (None: nothing sure), and its mean gain.
 
     Of two, the one with the full weight is smoother, then the one of spectra, then the longer one.
@@ -113,7 +113,7 @@ def choose(tried: dict[Choice, Float[np.ndarray, "n"]], tx_index: Int[np.ndarray
 def make_neighbours(
     choice: Choice,
     dataset: Dataset,
-    index: Int[np.ndarray, "m"],
+    index: Int[np.ndarray, " m"],
     truth: Float[np.ndarray, "m 90 360"],
     predicted: Float[np.ndarray, "m 90 360"],
 ) -> Neighbours:

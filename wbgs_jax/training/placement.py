@@ -6,13 +6,13 @@ far it is for each.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+
+from wbgs_jax.training.scores import Scores
 
 SPREADS_M = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 """Standard deviations that are tried, metres."""
@@ -30,7 +30,7 @@ class PlacementReport:
     """... and with the standard deviation that was taken."""
 
 
-def search_placement(params: Any, score: Callable[[Sequence[Any]], Float[np.ndarray, "k n"]]) -> tuple[Any, PlacementReport]:
+def search_placement(params: Any, score: Scores) -> tuple[Any, PlacementReport]:
     """Returns parameters with the uncertainty of all places by which spectra are explained best."""
     candidates = [
         dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(spread))) for spread in SPREADS_M

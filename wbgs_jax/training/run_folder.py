@@ -1,6 +1,7 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
-config.json   metrics.jsonl   checkpoints/STEP/   neighbours.npz   confidence.npz   eval.json   pictures/*.png
+config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
+neighbours.npz   confidence.npz   power_confidence.npz
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, get_field
-from wbgs_jax.inference.confidence import Confidence, read_confidence
+from wbgs_jax.inference.confidence import Confidence, PowerConfidence, read_confidence, read_power_confidence
 from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
 from wbgs_jax.training import checkpoint
 
@@ -88,6 +89,8 @@ class TrainedField:
     """Known spectra that are asked beside it."""
     confidence: Confidence | None = None
     """How sure its answers are."""
+    power_confidence: PowerConfidence | None = None
+    """How sure the received powers are that it says."""
 
     def dataset(self) -> Dataset:
         """Returns the data that it was trained on."""
@@ -159,4 +162,5 @@ def load_trained(folder: Path | str) -> TrainedField:
     field = get_field(config.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     seconds = float(saved.metadata["seconds"])
-    return TrainedField(config, field, params, steps[-1], seconds, read_neighbours(folder), read_confidence(folder))
+    beside = read_neighbours(folder), read_confidence(folder), read_power_confidence(folder)
+    return TrainedField(config, field, params, steps[-1], seconds, *beside)

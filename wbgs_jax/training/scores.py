@@ -1,9 +1,9 @@
 """How badly candidates for a field's parameters explain some training spectra, and whether one is surely better: what the
 searches before a training, and the choices after it, compare."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -12,47 +12,60 @@ from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.losses import log_decorrelation
+from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.data import TrainingData
 
-Scores = Callable[[Sequence[Any]], Float[np.ndarray, "k n"]]
-"""K candidates for all parameters -> how badly each explains N spectra: log decorrelation, or log error of spectra alone."""
+Compared = Literal["snapshots", "covariances", "spectra"]
+"""What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
+(`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known."""
 
 
-def make_scores(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, "n"], phases: bool = True) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver; without `phases` by the spectra alone,
-    where snapshots are known too."""
+@runtime_checkable
+class Scores(Protocol):
+    """How badly candidates for all parameters explain some spectra."""
 
-    def score(candidates: Sequence[Any]) -> Float[np.ndarray, "k n"]:
+    def __call__(self, candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+        """Returns the scores of K candidates on all of the spectra, or on the first so many."""
+        ...
+
+
+def make_scores(
+    field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+) -> Scores:
+    """Returns the function that scores candidates on some spectra of one receiver."""
+
+    def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
-        return np.asarray(_score(field, stacked, cache, data, spectra, phases))
+        return np.asarray(_score(field, stacked, cache, data, spectra[:first], compared))
 
     return score
 
 
-@partial(jax.jit, static_argnames=("phases",))
-def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, "n"], phases: bool):
+@partial(jax.jit, static_argnames=("compared",))
+def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared):
     batch = data.batch(spectra, jax.random.key(0))
     plan = field.plan(jax.tree.map(lambda leaf: leaf[0], candidates), batch.receiver, None, cache)
 
     def one(params):
         seen = field.render_links(params, plan, cache, batch.links)
-        if phases and seen.snapshots is not None and batch.snapshots is not None:
+        if batch.snapshots is not None and compared == "snapshots" and seen.snapshots is not None:
             return log_decorrelation(seen.snapshots, batch.snapshots)
+        if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
+            return surprise(seen.covariance, batch.snapshots)
         assert batch.pas is not None, "candidates are scored by spectra or snapshots"
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
 
     return jax.lax.map(one, candidates)
 
 
-def standard_error(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> tuple[float, float]:
+def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[float, float]:
     """Returns the mean gain and its standard error, transmitters being what was drawn."""
     by_tx = _by_transmitter(gains, tx_index)
     error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
     return float(by_tx.mean()), float(error)
 
 
-def surely_better(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"], errors: float) -> bool:
+def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:
     """Returns whether the mean gain over transmitters is positive, as surely as so many standard errors of a normal mean say.
 
     Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
@@ -64,5 +77,5 @@ def surely_better(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"],
     return bool(chance <= norm.sf(errors))
 
 
-def _by_transmitter(gains: Float[np.ndarray, "n"], tx_index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "k"]:
+def _by_transmitter(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
     return np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])

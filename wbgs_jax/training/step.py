@@ -34,15 +34,15 @@ class TrainState:
 class EpochReport:
     """What an epoch of K steps tells the host."""
 
-    loss: Float[Array, "k"]
+    loss: Float[Array, " k"]
     """NaN for steps that did not run or failed."""
-    metrics: dict[str, Float[Array, "k"]]
+    metrics: dict[str, Float[Array, " k"]]
     """Figures of the steps, such as the mean SSIM of the batch; NaN where they mean nothing."""
     good_steps: Int[Array, ""]
     """Steps committed, counted from the epoch's start."""
     overflow: Bool[Array, ""]
     """The step after the last good one did not fit its limits ..."""
-    required: Int[Array, "r"] | None
+    required: Int[Array, " r"] | None
     """... and required this much (the largest seen); None for a field without limits."""
     stopped: Bool[Array, ""]
     """The epoch ended early, by overflow or a loss or gradient that is not finite."""
@@ -55,7 +55,7 @@ def init_state(params: Any, optimizer: optax.GradientTransformation, controls: t
 
 
 def loss_and_gradients(
-    field: Field, params: Any, cache: Any, data: TrainingData, index: Int[Array, "b"], limits: Any, key: Key[Array, ""]
+    field: Field, params: Any, cache: Any, data: TrainingData, index: Int[Array, " b"], limits: Any, key: Key[Array, ""]
 ) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
     """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch."""
 
@@ -89,7 +89,7 @@ def run_epoch(
 ) -> tuple[TrainState, EpochReport]:
     """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away."""
 
-    def run(state: TrainState, index: Int[Array, "b"]):
+    def run(state: TrainState, index: Int[Array, " b"]):
         (loss, aux), (gradients, probe) = loss_and_gradients(
             field, state.params, cache, data, index, limits, jax.random.fold_in(key, state.step)
         )
