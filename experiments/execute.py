@@ -37,8 +37,8 @@ BLOCK = 256
 class Part:
     """What one trained model of a job leaves."""
 
-    tx: Int[np.ndarray, "tx"]
-    ghz: Float[np.ndarray, "ghz"]
+    tx: Int[np.ndarray, " tx"]
+    ghz: Float[np.ndarray, " ghz"]
     ssim: Float[np.ndarray, "tx ghz"]
     psnr_db: Float[np.ndarray, "tx ghz"]
     curve: Float[np.ndarray, "2 points"]
@@ -106,7 +106,7 @@ def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[st
     return {"tx": tx, "ghz": ghz, "ssim": ssim.reshape(shape), "psnr_db": psnr.reshape(shape)}
 
 
-def pictured(dataset: Dataset) -> Int[np.ndarray, "k"]:
+def pictured(dataset: Dataset) -> Int[np.ndarray, " k"]:
     """Returns the places in `dataset.test` of the spectra that figure 4 shows: another transmitter at every frequency."""
     ghz, transmitters = dataset.frequencies_hz[dataset.test] / 1e9, dataset.tx_index[dataset.test]
     shown = np.random.default_rng([0, 6]).permutation(np.unique(transmitters))[

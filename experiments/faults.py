@@ -82,7 +82,7 @@ def with_wrong_mesh(dataset: Dataset, fault: Fault, rng: np.random.Generator) ->
     return _without(dataset, np.isin(part[dataset.faces[:, 0] % len(part)], gone) & (dataset.faces[:, 0] < len(part)))
 
 
-def parts_of(dataset: Dataset) -> Int[np.ndarray, "vertices"]:
+def parts_of(dataset: Dataset) -> Int[np.ndarray, " vertices"]:
     """Returns the number of the connected part that every vertex belongs to."""
     corners = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
     return trimesh.graph.connected_component_labels(corners.edges, node_count=len(dataset.vertices))
@@ -144,14 +144,14 @@ def as_images(dataset: Dataset) -> Dataset:
     return dataclasses.replace(dataset, snapshots=None, images=images)
 
 
-def _without(dataset: Dataset, gone: Bool[np.ndarray, "faces"]) -> Dataset:
+def _without(dataset: Dataset, gone: Bool[np.ndarray, " faces"]) -> Dataset:
     """Returns it without some triangles."""
     kept = np.flatnonzero(~gone)
     return _with_triangles(dataset, dataset.faces[kept], kept)
 
 
 def _doubled(
-    dataset: Dataset, part: Int[np.ndarray, "vertices"], chosen: Int[np.ndarray, "k"], rng: np.random.Generator
+    dataset: Dataset, part: Int[np.ndarray, " vertices"], chosen: Int[np.ndarray, " k"], rng: np.random.Generator
 ) -> Dataset:
     """Returns it with copies of some parts elsewhere in the room, at their height."""
     vertices, faces, copied = [dataset.vertices], [dataset.faces], [np.arange(len(dataset.faces))]
@@ -168,7 +168,7 @@ def _doubled(
     return _with_triangles(dataset, np.concatenate(faces), np.concatenate(copied))
 
 
-def _with_triangles(dataset: Dataset, faces: Int[np.ndarray, "k 3"], like: Int[np.ndarray, "k"]) -> Dataset:
+def _with_triangles(dataset: Dataset, faces: Int[np.ndarray, "k 3"], like: Int[np.ndarray, " k"]) -> Dataset:
     """Returns it with other triangles, each of the part and material that an old one has."""
     known, part = dataset.materials, dataset.face_part
     return dataclasses.replace(

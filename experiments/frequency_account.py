@@ -26,7 +26,7 @@ from wbgs_jax.evaluation.report import environment
 
 NEIGHBOURS = 4
 Spectra = Float[np.ndarray, "f 90 360"]
-Others = Callable[[Spectra, Float[np.ndarray, "f"], float], Float[np.ndarray, "90 360"]]
+Others = Callable[[Spectra, Float[np.ndarray, " f"], float], Float[np.ndarray, "90 360"]]
 """(spectra of the other frequencies, logarithms of these, logarithm of the one asked for) -> prediction."""
 
 
@@ -50,17 +50,17 @@ def main() -> None:
     write_json(command.out / "frequency_account.json", {"scenes": scenes} | environment())
 
 
-def mean(spectra: Spectra, logs: Float[np.ndarray, "f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def mean(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of all other frequencies."""
     return spectra.mean(0)
 
 
-def nearest(spectra: Spectra, logs: Float[np.ndarray, "f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def nearest(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of the nearest frequencies."""
     return spectra[np.argsort(np.abs(logs - asked))[:NEIGHBOURS]].mean(0)
 
 
-def farthest(spectra: Spectra, logs: Float[np.ndarray, "f"], asked: float) -> Float[np.ndarray, "90 360"]:
+def farthest(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
     """Returns the mean of the farthest frequencies."""
     return spectra[np.argsort(np.abs(logs - asked))[-NEIGHBOURS:]].mean(0)
 
@@ -68,7 +68,7 @@ def farthest(spectra: Spectra, logs: Float[np.ndarray, "f"], asked: float) -> Fl
 def polynomial(degree: int, slope: float = 1) -> Others:
     """Returns the prediction by a polynomial in every pixel; the terms but the mean are multiplied by `slope`."""
 
-    def predict(spectra: Spectra, logs: Float[np.ndarray, "f"], asked: float) -> Float[np.ndarray, "90 360"]:
+    def predict(spectra: Spectra, logs: Float[np.ndarray, " f"], asked: float) -> Float[np.ndarray, "90 360"]:
         powers = np.vander(np.append(logs, asked) - logs.mean(), degree + 1, increasing=True)
         powers[:, 1:] -= powers[:-1, 1:].mean(0)  # so that the constant is the mean
         weights = (powers[-1] * np.append(1, np.full(degree, slope))) @ np.linalg.pinv(powers[:-1])

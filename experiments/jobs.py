@@ -23,7 +23,11 @@ FIXED_SCENE = "2_fixed"
 """Scene 2 seen by an array of fixed size, half a wavelength apart at 10 GHz ..."""
 GHZ_FIXED = (2.4, 3.5, 5, 7, 10, 14, 18, 22, 25, 28)
 """... at these frequencies."""
-RELEASED_GHZ = dict.fromkeys(SCENES, GHZ_10) | {DENSE_SCENE: GHZ_21, FIXED_SCENE: GHZ_FIXED}
+GHZ_CABIN = (1, 1.1, 1.2, 1.3, 1.4, 1.5)
+OUTSIDE = {"cabin": GHZ_CABIN, "2_simulator": GHZ_10, "4_simulator": GHZ_10, "2_diffuse": GHZ_10}
+"""Truths from outside (docs/dataset.md)."""
+OUTSIDE_SCENES = tuple(OUTSIDE)
+RELEASED_GHZ = dict.fromkeys(SCENES, GHZ_10) | {DENSE_SCENE: GHZ_21, FIXED_SCENE: GHZ_FIXED} | OUTSIDE
 """Released scenes and their frequencies."""
 SEEDS = (0, 1, 2)
 """Of the headline rows."""
@@ -52,7 +56,7 @@ class Job:
     """One training and its evaluation (of a model for every frequency, if the field knows one alone)."""
 
     scene: str
-    """Released scene (1, 2, ..., 1_21f, 2_fixed), or a scene file or folder of spectra by its path."""
+    """Released scene (1, 2, ..., 1_21f, 2_fixed, cabin), or a scene file or folder of spectra by its path."""
     field: str
     """A field, or `BASELINES`."""
     combination: str = ""
@@ -68,7 +72,7 @@ class Job:
     @property
     def name(self) -> str:
         """Readable and unique within a profile: scene4_wideband_C4_alltx_seed0."""
-        place = f"scene{self.scene}" if self.is_released else Path(self.scene).stem
+        place = f"scene{self.scene}" if self.scene[0].isdigit() and self.is_released else Path(self.scene).stem
         words = [place, self.field, self.variant, self.combination, "alltx" if self.all_tx else ""]
         return "_".join([word for word in words if word] + [f"seed{self.seed}"])
 

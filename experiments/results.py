@@ -33,7 +33,7 @@ class Result:
         return [float(f) for f in self.values["ssim"]]
 
     @cached_property
-    def tx(self) -> Int[np.ndarray, "tx"]:
+    def tx(self) -> Int[np.ndarray, " tx"]:
         """Transmitters that were scored."""
         return np.array(self.values["tx"])
 

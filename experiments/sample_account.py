@@ -108,7 +108,7 @@ def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tu
     return report, params
 
 
-def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, "n"]:
+def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
     """Returns the score of every spectrum."""
     found = []
     plan = field.plan(params, dataset.receiver(), cache=prepared)
@@ -128,7 +128,7 @@ def directions_to_tx(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
     return local / np.linalg.norm(local, axis=-1, keepdims=True)
 
 
-def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Returns the power of every observed spectrum at the pixel nearest to the transmitter's direction, relative to its
     largest."""
     nearest = np.argmax(np.asarray(pas_directions(), np.float32).reshape(-1, 3) @ local.T, 0)
@@ -136,7 +136,7 @@ def power_in_sight(dataset: Dataset, local: Float[np.ndarray, "n 3"]) -> Float[n
     return np.array([spectrum[pixel] ** 2 for spectrum, pixel in zip(spectra, nearest, strict=True)])
 
 
-def by_group(dataset: Dataset, sine: Float[np.ndarray, "n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+def by_group(dataset: Dataset, sine: Float[np.ndarray, " n"], scores: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Returns the median SSIM of training and test transmitters, above the horizon, and at it or below."""
     test = np.isin(np.arange(len(dataset)), dataset.test)
     groups = {}

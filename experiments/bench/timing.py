@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from wbgs_jax._util.command import say
 
-Seconds = Float[np.ndarray, "rounds"]
+Seconds = Float[np.ndarray, " rounds"]
 Name = TypeVar("Name", bound=Hashable)
 
 MIN_ROUNDS = 3

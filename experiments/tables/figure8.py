@@ -90,7 +90,7 @@ def unseen_ghz(letter: str) -> list[float]:
     return [float(f) for f in GHZ_21 if f not in COMBINATIONS[letter]]
 
 
-def by_frequency(values: Scores) -> Float[np.ndarray, "ghz"]:
+def by_frequency(values: Scores) -> Float[np.ndarray, " ghz"]:
     """Median over transmitters, then over seeds."""
     return np.median(np.median(values, 1), 0)
 
