@@ -6,7 +6,8 @@ front of it or behind it. The candidates that promise most are cut with all face
 kept. Nothing here depends on the frequency or on what the facets are made of, and nothing is differentiated.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ INDICES, PLACES = 2**12, 2**17
 MAX_FACETS = INDICES - MAX_ORDER
 """More cannot be told apart by their keys."""
 NO_KEY = jnp.uint32(0xFFFFFFFF)
-CUT_AT_ONCE = 64
+CUT_AT_ONCE = 32
 """Paths: few enough for a CPU's cache."""
 THROUGH = 0.5
 """Guess of what is left of the amplitude behind a facet or a mirror, to rank paths by."""
@@ -211,34 +212,56 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
 def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
     """Returns the best paths that are left of the best candidates when these have been cut with all facets."""
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
-    score, best = jax.lax.top_k(candidates.score, min(tried, candidates.score.size))
-    found = Candidates(*(leaf[best] for leaf in candidates))
-    facet, types, leg, crossed = jax.lax.map(lambda c: _cut(c, search, legs), found, batch_size=CUT_AT_ONCE)
+    found = _best(candidates, candidates.score, tried)
+    crossed = _of_living(lambda c: jnp.isfinite(_crossings(c.points[: legs + 1], search)).sum(), found)
     whole = crossed + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
-    score, best = jax.lax.top_k(jnp.where(whole, score * THROUGH**crossed, 0), min(kept, score.size))
-    return Paths(found.points[best], facet[best], types[best], leg[best], score > 0)
+    found = _best(found, jnp.where(whole, found.score * THROUGH**crossed, 0), kept)
+    facet, types, leg = _of_living(lambda c: _cut(c, search, legs), found)  # takes longer than to count
+    return Paths(found.points, facet, types, leg, found.score > 0)
+
+
+def _best(candidates: Candidates, score: Float[Array, " c"], most: int) -> Candidates:
+    """Returns the candidates of the highest scores, the best first, with these scores."""
+    score, best = jax.lax.top_k(score, min(most, score.size))
+    return jax.tree.map(lambda leaf: leaf[best], candidates)._replace(score=score)
+
+
+def _of_living(function: Callable[[Candidates], Any], candidates: Candidates) -> Any:
+    """Returns a function of every candidate that may be a path, zeros of the others; the best ones come first."""
+    count = candidates.score.size
+    blocks = jax.tree.map(lambda leaf: _in_blocks(leaf, -(-count // CUT_AT_ONCE)), candidates)
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), blocks)
+    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(jax.vmap(function), one))
+    of_blocks = jax.lax.map(lambda c: jax.lax.cond(c.score[0] > 0, jax.vmap(function), lambda _: nothing, c), blocks)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], of_blocks)
+
+
+def _in_blocks(leaf: Array, blocks: int) -> Array:
+    """Returns an array in blocks of `CUT_AT_ONCE` rows, filled up with zeros."""
+    rows = jnp.zeros((blocks * CUT_AT_ONCE, *leaf.shape[1:]), leaf.dtype).at[: len(leaf)].set(leaf)
+    return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
 
 
 def _cut(candidate: Candidates, search: Search, legs: int):
-    """Returns the interactions of one path in order (facet or edge, type, leg), and how many facets it crosses."""
+    """Returns the interactions of one path in order: facet or edge, type, leg."""
     # The place of an interaction is leg + share of the leg; a reflection or diffraction ends its leg. Place and index share an
     # integer, so that plain minima find both: sorting or arg-minima take ten times as long on a CPU.
     crossing = _crossings(candidate.points[: legs + 1], search) + jnp.arange(legs)[:, None]
     n = crossing.shape[1]
     vertex = jnp.where(candidate.interaction_type != NONE, jnp.arange(MAX_ORDER) + 1.0, jnp.inf)
     keys = jnp.concatenate([_key(crossing, jnp.arange(n)).reshape(-1), _key(vertex, n + jnp.arange(MAX_ORDER))])
-    last, found = jnp.zeros((), jnp.uint32), []
-    for _ in range(MAX_INTERACTIONS):
-        last = jnp.min(jnp.where(keys > last, keys, NO_KEY))
-        found.append(last)
-    key = jnp.stack(found)
+
+    def next_key(last, _):
+        following = jnp.min(jnp.where(keys > last, keys, NO_KEY))
+        return following, following
+
+    _, key = jax.lax.scan(next_key, jnp.zeros((), jnp.uint32), length=MAX_INTERACTIONS)  # unrolled, each finds all keys again
     index, there = (key % INDICES).astype(jnp.int32), key < NO_KEY
     leg = jnp.ceil((key // INDICES) / PLACES).astype(jnp.int32) - 1
     slot = index - n
     facet = jnp.where(slot < 0, index, candidate.interaction_facet[slot])
     types = jnp.where(slot < 0, TRANSMITTED, candidate.interaction_type[slot])
-    crossed = jnp.isfinite(crossing).sum()
-    return jnp.where(there, facet, 0), jnp.where(there, types, NONE), jnp.where(there, leg, 0), crossed
+    return jnp.where(there, facet, 0), jnp.where(there, types, NONE), jnp.where(there, leg, 0)
 
 
 def _key(place: Float[Array, "*n"], index: Int[Array, " _"]) -> UInt32[Array, "*n"]:
