@@ -182,7 +182,7 @@ def sureness(spectra: Spectra) -> list[str]:
     for (tx, frequency), (ssim, low, high) in zip(
         np.ndindex(spectra.expected.shape[:2]), spectra.expected.reshape(-1, 3), strict=True
     ):
-        where = _link(spectra.tx_positions[tx], spectra.frequencies_hz[frequency])
+        where = _link(spectra.tx_positions[tx], float(spectra.frequencies_hz[frequency]))
         lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
     return lines[:SHOWN]
 
@@ -193,7 +193,7 @@ def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
         return []
     lines = []
     for place, power in np.ndenumerate(answer["power_db"]):
-        where = _link(answer["tx_positions"][place[0]], answer["frequencies_hz"][place[1]])
+        where = _link(answer["tx_positions"][place[0]], float(answer["frequencies_hz"][place[1]]))
         expected, within = (answer[name][place] for name in ("expected_error_db", "within_db"))
         sure = f"expected {expected:.1f} dB off, {100 * LEVEL:.0f} % within {within:.1f} dB"
         lines.append(f"{where}: {power:.1f} dB of the transmitted power; {sure}")

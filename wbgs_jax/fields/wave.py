@@ -157,9 +157,9 @@ class WaveField(Field):
         receiver = single_receiver(receivers, self.name)
         numbers, first = np.unique(np.asarray(links.tx_index), return_index=True)
         positions, n = np.asarray(links.query.tx_position)[first], len(first)
-        planned, parts = self.plan(None, receiver), []
-        for start in range(0, n, TRACED_AT_ONCE):
-            index = np.minimum(np.arange(start, start + TRACED_AT_ONCE), n - 1)  # blocks of one shape: one compilation
+        planned, parts, size = self.plan(None, receiver), [], min(n, TRACED_AT_ONCE)
+        for start in range(0, n, size):
+            index = np.minimum(np.arange(start, start + size), n - 1)  # blocks of one shape: one compilation
             parts.append(jax.tree.map(np.asarray, _trace(planned, jnp.asarray(positions[index]))))
         paths = jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:n]), *parts)
         return PreparedPaths(planned.search, planned.beams, paths, jnp.asarray(numbers, jnp.int32))

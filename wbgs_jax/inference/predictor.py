@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.confidence import Confidence, PowerConfidence
 from wbgs_jax.inference.neighbours import SAME_PLACE_M, Neighbours, correct, for_receiver
@@ -19,6 +21,9 @@ from wbgs_jax.types import Links, Query, Receiver, check_query
 
 BLOCK = 16
 """Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
+
+PREPARED = 1024
+"""Queries whose transmitters' paths are in memory at a time."""
 
 Predictor = Callable[[Any, Any], Array]
 """(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360) or power (*b,); leading axes broadcast like NumPy's."""
@@ -135,18 +140,26 @@ def render_pas(
     field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None = None
 ) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
-    return _render(field, params, plan, query, neighbours).pas
-
-
-@jax.jit
-def _render(field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None) -> Observation:
-    seen = field.render(params, plan, query)
-    return seen._replace(pas=correct(neighbours, seen.pas, query))
+    return correct(neighbours, field.render(params, plan, query).pas, query)
 
 
 @jax.jit
 def _observe(field: Field, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
     return field.render_links(params, plan, cache, links)
+
+
+@partial(jax.jit, static_argnames=("kept",))
+def _observe_corrected(
+    field: Field,
+    params: Any,
+    plan: Any,
+    cache: Any,
+    links: Links,
+    neighbours: Neighbours | None,
+    kept: Callable[[Observation], Any],
+) -> Any:
+    seen = field.render_links(params, plan, cache, links)
+    return kept(seen._replace(pas=correct(neighbours, seen.pas, links.query)))
 
 
 def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:
@@ -180,24 +193,40 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
         plan = field.plan(params, dataset.receiver(int(number)), None, cache)
         of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
         for block, filled in _blocks(of_receiver, BLOCK):
-            seen = _observe(field, params, plan, cache, jax.tree.map(lambda leaf, i=filled: leaf[i], links))
+            seen = _observe(field, params, plan, cache, _taken(links, filled))
             total = _like(seen, len(index)) if total is None else total
             _put(total, block, seen)
     return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
 
 
-def observe_queries(trained: Trained, receiver: Receiver, query: Query) -> Observation:
-    """Returns what a trained field says of any number of queries, as NumPy arrays in their order, the spectra with what the
-    neighbours say. Powers have no scale where the data had none (`check_power`)."""
-    plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
+def _whole(seen: Observation) -> Observation:
+    return seen
+
+
+def observe_queries(trained: Trained, receiver: Receiver, query: Query, kept: Callable[[Observation], Any] = _whole) -> Any:
+    """Returns what a trained field says of any number of queries, as NumPy arrays in their order: all of it, the spectra with
+    what the neighbours say, or what is kept of it (a function of a module; nothing else is computed).
+
+    What is known of a transmitter serves all of its frequencies. Powers have no scale where the data had none (`check_power`).
+    """
+    field, params, neighbours = trained.field, trained.params, for_receiver(trained.neighbours, receiver)
     count = len(query.frequency_hz)
-    total: Observation | None = None
-    for block, filled in _blocks(np.arange(count), min(BLOCK, count)):
-        asked = jax.tree.map(lambda leaf, i=filled: leaf[i], query)
-        seen = _render(trained.field, trained.params, plan, asked, neighbours)
-        total = _like(seen, count) if total is None else total
-        _put(total, block, seen)
-    return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
+    total: Any = None
+    tx_index = jnp.asarray(group_transmitters(np.asarray(query.tx_position)), jnp.int32)
+    links = Links(query, jnp.zeros(count, jnp.int32), tx_index)
+    for start in range(0, count, PREPARED):
+        some = np.arange(start, min(start + PREPARED, count))
+        cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
+        plan = field.plan(params, receiver, None, cache)
+        for block, filled in _blocks(some, min(BLOCK, count)):
+            seen = _observe_corrected(field, params, plan, cache, _taken(links, filled), neighbours, kept)
+            total = _like(seen, count) if total is None else total
+            _put(total, block, seen)
+    return total if total is not None else kept(Observation(jnp.zeros((0, *PAS_SHAPE))))
+
+
+def _taken(links: Links, index: Int[np.ndarray, " k"]) -> Links:
+    return jax.tree.map(lambda leaf: leaf[index], links)
 
 
 def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " size"]]]:
@@ -234,11 +263,11 @@ def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.n
     return np.asarray(observe_links(field, params, dataset, index).pas)
 
 
-def _like(seen: Observation, n: int) -> Observation:
+def _like(seen: Any, n: int) -> Any:
     return jax.tree.map(lambda leaf: np.empty((n, *leaf.shape[1:]), leaf.dtype), seen)
 
 
-def _put(total: Observation, place: Int[np.ndarray, " k"], seen: Observation) -> None:
+def _put(total: Any, place: Int[np.ndarray, " k"], seen: Any) -> None:
     for own, new in zip(jax.tree.leaves(total), jax.tree.leaves(seen), strict=True):
         own[place] = np.asarray(new)[: len(place)]
 

@@ -13,7 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import PowerConfidence, expected_power
-from wbgs_jax.inference.predictor import Trained, check_power
+from wbgs_jax.inference.predictor import Trained, check_power, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
@@ -46,23 +46,27 @@ def ask_channel(
         raise UserError(f"the {trained.field.name} field has no {what}, only spectra; train --field {able}")
     if what == "power":
         check_power(trained.field, dataset)
-    plan = trained.field.plan(trained.params, receiver)
     name, function = CHANNEL[what]
-
-    measure = jax.jit(function)
-
-    def one(tx: Any, frequency: Any) -> np.ndarray:
-        query = Query(tx[None], frequency[None])
-        if what in OBSERVED:
-            return np.asarray(getattr(_observe(trained.field, trained.params, plan, query), name)[0])
-        found = _arrivals(trained.field, trained.params, plan, query)
-        return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), receiver, frequency))
-
-    positions, frequencies = (jnp.asarray(a, jnp.float32) for a in (tx_positions, frequencies_hz))
-    values = np.array([[one(tx, f) for f in frequencies] for tx in positions])
+    query = make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
+    if what in SAID:
+        found = observe_queries(trained, receiver, query, SAID[what])
+    else:
+        plan, measure = trained.field.plan(trained.params, receiver), jax.jit(function)
+        found = np.array([_measured(trained, plan, one, receiver, measure) for one in _each(query)])
+    values = found.reshape(len(tx_positions), len(frequencies_hz), *found.shape[1:])
     asked = {"tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
     sure = trained.power_confidence if what == "power" else None
     return {name: values} | asked | ({} if sure is None else expected_errors(sure, values, receiver, **asked))
+
+
+def _each(query: Query) -> list[Query]:
+    return [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], query) for i in range(len(query.frequency_hz))]
+
+
+def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, measure: Callable[..., Any]) -> np.ndarray:
+    """Returns what follows from the arrivals of one query."""
+    found = _arrivals(trained.field, trained.params, plan, query)
+    return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), receiver, query.frequency_hz[0]))
 
 
 def expected_errors(
@@ -79,11 +83,6 @@ def expected_errors(
         name: np.asarray(values).reshape(power_db.shape)
         for name, values in zip(("expected_error_db", "within_db"), found, strict=True)
     }
-
-
-@jax.jit
-def _observe(field: Field, params: Any, plan: Any, query: Query) -> Observation:
-    return field.render(params, plan, query)
 
 
 @jax.jit
@@ -112,4 +111,9 @@ CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]]
 }
 """Name in the file, and how it follows from what arrives."""
 OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
-"""What a field says of itself, without a look at its paths."""
+"""What a field says of itself, without a look at its paths, ..."""
+SAID: dict[str, Callable[[Observation], Any]] = {
+    "snapshot": lambda seen: seen.snapshots,
+    "power": lambda seen: seen.power_db,
+}
+"""... and where."""
