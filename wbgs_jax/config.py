@@ -78,8 +78,12 @@ class SearchConfig:
     """Standard errors by which another antenna must fit better than the one that is there."""
     ideal_spectra: int = 96
     """Training spectra that are looked at for what ray tracers leave out."""
+    geometry: bool = True
+    """Whether surfaces of a doubtful mesh are moved."""
+    geometry_snapshots: int = 640
+    """Snapshots that every step of that looks at ..."""
     geometry_steps: int = 240
-    """Steps at every frequency in which surfaces of a doubtful mesh are moved; 0: the mesh stays as it is."""
+    """... or, where only spectra are known, steps at every frequency."""
     geometry_doubt: float = 5e-4
     """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
     geometry_tx: int = 160

@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from rooms import box, facets_of, room, search_of, trace
 
 from wbgs_jax.propagation.edges import edges_of_facets
 from wbgs_jax.propagation.facets import moved
 from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient, still
+from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient, length_jacobian, still
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
@@ -83,6 +84,15 @@ def test_the_gradient_says_what_the_changes_say(kind, rng):
     alive = np.asarray(paths.alive)
     by_gradient = jnp.sum(length_gradient(paths, search, len(PARTS))[:, :-1] * motion.shift, (-2, -1))
     np.testing.assert_allclose(by_gradient[alive], length_changes(paths, search, motion)[alive], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["specular", "diffracted"])
+def test_the_jacobian_says_what_the_changes_say(kind, rng):
+    search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
+    paths, motion = getattr(trace(search, TX), kind), drawn(rng, turn=3e-4)
+    alive = np.asarray(paths.alive)
+    by_jacobian = np.asarray(length_jacobian(paths, search, len(PARTS))) @ np.asarray(ravel_pytree(motion)[0])
+    np.testing.assert_allclose(by_jacobian[alive], length_changes(paths, search, motion)[alive], atol=1e-6)
 
 
 def test_lengths_follow_the_transmitter(rng):

@@ -24,7 +24,7 @@ PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"spectra": 80, "rounds": 2, "antenna_rounds": 0, "geometry_steps": 120, "geometry_tx": 40},
+    search={"spectra": 80, "rounds": 2, "antenna_rounds": 0, "geometry": True, "geometry_snapshots": 96, "geometry_tx": 40},
 )
 
 

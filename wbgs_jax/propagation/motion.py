@@ -50,13 +50,18 @@ def length_changes(paths: Paths, search: Search, motion: Motion) -> Float[Array,
     """Returns by how much the K paths of one transmitter grow (metres) if things move by so much; turning the receiver changes
     no length."""
     turn, mover = _turns(paths, search)
-    leg = jnp.minimum(paths.interaction_leg, paths.points.shape[1] - 2)
-    point = jnp.take_along_axis(paths.points, leg[..., None] + 1, 1)
-    arm = point - centres(search.facets, len(motion.shift))[mover]
+    arm = _arms(paths, search, mover, len(motion.shift))
     own = jnp.asarray(motion.shift)[mover] + jnp.cross(jnp.asarray(motion.turn)[mover], arm)
-    direction = legs_of(paths).direction
-    arriving = jnp.take_along_axis(direction, last_leg(paths)[:, None, None], 1)[:, 0]
-    return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(arriving, motion.receiver, precision=EXACT)
+    return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(_arriving(paths), motion.receiver, precision=EXACT)
+
+
+def length_jacobian(paths: Paths, search: Search, movers: int) -> Float[Array, "k numbers"]:
+    """Returns the derivative of `length_changes` with respect to all numbers of a motion, as `ravel_pytree` orders them."""
+    turn, mover = _turns(paths, search)
+    lever = jnp.cross(_arms(paths, search, mover, movers), turn)
+    nothing = jnp.zeros((len(turn), movers, 3))
+    own = [nothing.at[jnp.arange(len(turn))[:, None], mover].add(of).reshape(len(turn), -1) for of in (turn, lever)]
+    return jnp.concatenate([*own, _arriving(paths), jnp.zeros((len(turn), 3))], 1)
 
 
 def length_gradient(paths: Paths, search: Search, movers: int) -> Float[Array, "k places 3"]:
@@ -80,6 +85,18 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
     variance = jnp.sum(phase**2, -1)
     both = jnp.matmul(phase, phase.T, precision=EXACT)
     return jnp.exp(-0.5 * jnp.maximum(variance[:, None] + variance - 2 * both, 0))
+
+
+def _arms(paths: Paths, search: Search, mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k 5 3"]:
+    """Returns where paths meet what they interact with, seen from the centres that these turn about."""
+    leg = jnp.minimum(paths.interaction_leg, paths.points.shape[1] - 2)
+    point = jnp.take_along_axis(paths.points, leg[..., None] + 1, 1)
+    return point - centres(search.facets, movers)[mover]
+
+
+def _arriving(paths: Paths) -> Float[Array, "k 3"]:
+    """Returns the directions of the last legs."""
+    return jnp.take_along_axis(legs_of(paths).direction, last_leg(paths)[:, None, None], 1)[:, 0]
 
 
 def _turns(paths: Paths, search: Search) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:

@@ -68,7 +68,7 @@ class Search:
                 params, _ = search_materials(params, look.scores(config.ideal_spectra), config)
             _, guessed = search_placement(params, look.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
-            if config.geometry_steps and guessed.spread_mm > 1e3 * config.geometry_doubt:
+            if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng)
                 report["geometry"] = dataclasses.asdict(moved)
                 params, field, cache = place.params, place.field, place.cache

@@ -1,0 +1,134 @@
+"""Normal equations of motions against automatic differentiation, and what they say about a wall that was moved."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from synthetic import tiny_settings
+from wave_runs import PARTS, places, run_in
+
+from wbgs_jax.fields import wave
+from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
+from wbgs_jax.propagation.motion import Motion, length_changes
+from wbgs_jax.training.adjustment import adjust, length_variances, normal_equations
+
+N_TX, FREQUENCIES = 8, np.array([1e9, 3e9])
+SETTINGS = tiny_settings(
+    "wave",
+    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8, "mirror_areas": (0.0,)},
+)
+WIDTHS = (2e-2, 1e-3, 1e-3, 2e-3)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Of 8 transmitters whose snapshots are those of the room as it is."""
+    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(N_TX, 0.4), FREQUENCIES)
+    plan = run.field.plan(run.state.params, run.dataset.receiver(), cache=run.cache)
+    seen = jax.jit(wave.WaveField.render_links)(run.field, run.state.params, plan, run.cache, run.data.links)
+    run.data = dataclasses.replace(run.data, snapshots=seen.snapshots)
+    return run
+
+
+def widths_of(run):
+    still = run.field.motion
+    names = (field.name for field in dataclasses.fields(still))
+    return Motion(**{name: jnp.full_like(getattr(still, name), width) for name, width in zip(names, WIDTHS, strict=True)})
+
+
+def drawn(rng, run, size):
+    return jax.tree.map(lambda width: size * width * jnp.asarray(rng.normal(size=width.shape), jnp.float32), widths_of(run))
+
+
+@jax.jit
+def snapshots(flat, run_tree, links):
+    """Of the room with its things elsewhere, to first order."""
+    field, params, receiver, cache, nothing = run_tree
+    motion = ravel_pytree(nothing)[1](flat)
+    plan = field.displaced(field.plan(params, receiver, cache=cache), motion)
+    paths = jax.tree.map(lambda leaf: leaf[jnp.searchsorted(cache.tx_index, links.tx_index)], cache.paths)
+    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+
+
+def parts_of(run, count):
+    index = jnp.arange(count)
+    tree = run.field, run.state.params, run.dataset.receiver(), run.cache, run.field.motion
+    return index, tree, jax.tree.map(lambda leaf: leaf[index], run.data.links)
+
+
+def certain(run):
+    return jnp.zeros((N_TX, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
+
+
+def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
+    motion = drawn(rng, run, 0.2)
+    index, tree, links = parts_of(run, 8)
+    truth = run.data.snapshots[index]
+
+    def objective(flat):
+        return truth.shape[-1] * jnp.sum(log_decorrelation(snapshots(flat, tree, links), truth))
+
+    expected = -np.asarray(jax.grad(objective)(ravel_pytree(motion)[0]))
+    _, found = normal_equations(run.field, run.state.params, motion, run.cache, run.data, index, certain(run))
+    assert np.abs(expected).max() > 1
+    np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())
+
+
+def test_the_matrix_is_that_of_the_jacobian(run, rng):
+    motion = drawn(rng, run, 0.2)
+    index, tree, links = parts_of(run, 8)
+    flat, truth = ravel_pytree(motion)[0], np.asarray(run.data.snapshots[index], complex)
+    parts = [lambda flat, part=part: part(snapshots(flat, tree, links)) for part in (jnp.real, jnp.imag)]
+    real, imaginary = (np.asarray(jax.jacfwd(part)(flat), float) for part in parts)
+    predicted, changes, expected = np.asarray(snapshots(flat, tree, links), complex), real + 1j * imaginary, 0
+    for y, a, t in zip(predicted, changes, truth, strict=True):
+        factor, norm = np.vdot(y, t) / np.vdot(y, y), np.linalg.norm(t)
+        left = np.linalg.norm(t - factor * y) / norm
+        a = (a - np.outer(y, y.conj() @ a) / np.vdot(y, y)) * factor / norm
+        expected = expected + 2 * len(t) * (a.conj().T @ a).real / (left**2 + GOOD_MATCH)
+    found, _ = normal_equations(run.field, run.state.params, motion, run.cache, run.data, index, certain(run))
+    np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())
+    assert np.linalg.matrix_rank(expected) > 10
+
+
+def test_variances_of_lengths_follow_from_those_of_places(run, rng):
+    """One number that is uncertain: the variance is its square times that of the derivative."""
+    flat, back = ravel_pytree(run.field.motion)
+    number, width = rng.integers(flat.size), 3e-3
+    root = jnp.zeros((flat.size, flat.size)).at[number, number].set(width)
+    found = np.asarray(length_variances(run.cache, root, len(run.field.motion.shift)))
+    motion = back(jnp.zeros_like(flat).at[number].set(width))
+    for k, name in enumerate(("specular", "diffracted")):
+        paths = getattr(run.cache.paths, name)
+        changes = jax.vmap(lambda some: length_changes(some, run.cache.search, motion))(paths)
+        own = found[:, : changes.shape[1]] if k == 0 else found[:, -changes.shape[1] :]
+        alive = np.asarray(paths.alive)
+        np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)
+
+
+def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
+    """Snapshots of a room whose things stand elsewhere, without noise: lengths come back, and numbers that no path depends on
+    keep the variance of their prior."""
+    moved = drawn(rng, run, 0.5)
+    index, tree, links = parts_of(run, len(run.data.links.tx_index))
+    heard = snapshots(ravel_pytree(moved)[0], tree, links)
+    data = dataclasses.replace(run.data, snapshots=heard)
+    still, widths = run.field.motion, widths_of(run)
+    prior = np.asarray(ravel_pytree(widths)[0], float) ** 2
+    found, covariance, frequency = still, np.diag(prior), np.asarray(links.query.frequency_hz)
+    for highest in FREQUENCIES:
+        pool, known = np.flatnonzero(frequency <= highest), (found, covariance, widths)
+        found, covariance = adjust(run.field, run.state.params, run.cache, *known, data, pool, 64, rng)
+    before, after = (
+        float(jnp.mean(log_decorrelation(snapshots(ravel_pytree(m)[0], tree, links), heard))) for m in (still, found)
+    )
+    assert after < before - 1, (before, after)
+    equations = normal_equations(run.field, run.state.params, still, run.cache, data, jnp.resize(index, 16), certain(run))
+    unseen = np.diag(equations[0]) == 0
+    assert 0 < unseen.sum() < len(unseen)
+    np.testing.assert_allclose(np.diag(covariance)[unseen], prior[unseen], rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(ravel_pytree(found)[0])[unseen], 0, atol=1e-9)
+    assert np.diag(covariance).min() < 0.5 * prior.min()

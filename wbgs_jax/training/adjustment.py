@@ -1,0 +1,175 @@
+"""Where surfaces and the receiver stand, by least squares over snapshots, as surveyors adjust a network.
+
+What a model leaves unexplained of a snapshot is linear in small motions: every path turns by its wavenumber times the change
+of its length (propagation/motion.py). With a normal prior of every motion this gives the normal equations of a Gauss-Newton
+step, and with their inverse how well every motion is known by now. What nobody has seen stays where it was.
+
+Nobody knows the common factor of a snapshot: only what is orthogonal to the prediction counts. The noise level of every
+snapshot is unknown too (`losses.log_decorrelation`), which gives those that are explained badly less weight. Paths whose
+lengths are uncertain by more than a wavelength are expected to cancel, and tell nothing, until lower frequencies have told
+where their surfaces are.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float, Int
+
+from wbgs_jax.fields.losses import GOOD_MATCH
+from wbgs_jax.fields.wave_channel import arrivals_at
+from wbgs_jax.propagation.motion import Motion, length_jacobian
+from wbgs_jax.propagation.transport import element_voltages
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT
+from wbgs_jax.radio.channel import FAINTEST, Arrivals
+from wbgs_jax.radio.geometry import rotation_matrix
+from wbgs_jax.training.data import TrainingData
+from wbgs_jax.types import Receiver
+
+ROUNDS = 3
+"""Steps at every frequency."""
+AT_ONCE = 8
+"""Snapshots."""
+ALIKE = 30.0
+"""What places do not explain (wrong materials, paths that are missing) is alike in many snapshots: so many say as much as one
+whose error is its own."""
+LONGEST_STEP = 0.1
+"""In wavelengths of the highest frequency: beyond, phases are not linear."""
+ARM = 3.0
+"""Metres from its centre at which a turn moves a surface as far as a shift."""
+TINY = 1e-7
+"""Metres or radians: added to standard deviations, for the sake of their factorisation."""
+
+
+def adjust(
+    field: Any,
+    params: Any,
+    cache: Any,
+    motion: Motion,
+    covariance: Float[np.ndarray, "p p"],
+    widths: Motion,
+    data: TrainingData,
+    pool: Int[np.ndarray, " n"],
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Motion, Float[np.ndarray, "p p"]]:
+    """Returns the motion by which snapshots up to some frequency are explained best, and its covariance.
+
+    Args:
+        field, params: a coherent field, which is not moved: the motion is small.
+        cache: paths of the transmitters of the pool.
+        motion: the one to start with.
+        covariance: of all of its numbers (as `ravel_pytree` orders them) by lower frequencies, or by the prior.
+        widths: standard deviations of the prior of the whole motion, that of the field included.
+        data: with snapshots.
+        pool: links, up to the highest frequency that counts.
+        count: snapshots that a step looks at, drawn anew for each.
+        rng: draws them.
+    """
+    flat, back = ravel_pytree(motion)
+    start = np.asarray(ravel_pytree(field.motion)[0], np.float64)
+    moves, stiffness = np.asarray(flat, np.float64), 1 / np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
+    root = np.linalg.cholesky(covariance + TINY**2 * np.eye(len(moves)))
+    variance = length_variances(cache, jnp.asarray(root, jnp.float32), len(motion.shift))
+    frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
+    furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)
+    for _ in range(ROUNDS):
+        some = jnp.asarray(rng.choice(pool, -(-min(count, len(pool)) // AT_ONCE) * AT_ONCE), jnp.int32)
+        now = back(jnp.asarray(moves, jnp.float32))
+        equations = normal_equations(field, params, now, cache, data, some, variance)
+        curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
+        precision = curvature + np.diag(stiffness)
+        step = np.linalg.solve(precision, pull - stiffness * (start + moves))
+        moves = moves + np.clip(step, -furthest, furthest)
+    return back(jnp.asarray(moves, jnp.float32)), np.linalg.inv(precision)
+
+
+def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
+    """Returns how far every number of a motion moves things, per metre or radian."""
+    one = jax.tree.map(np.ones_like, motion)
+    return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
+
+
+@partial(jax.jit, static_argnames=("movers",))
+def length_variances(cache: Any, root: Float[Array, "p p"], movers: int) -> Float[Array, "tx k"]:
+    """Returns the variances (square metres) of the lengths of all paths, from a square root of the covariance of the motion."""
+    return jax.lax.map(
+        lambda paths: jnp.sum(jnp.matmul(_jacobian(cache, paths, movers), root, precision=EXACT) ** 2, -1), cache.paths
+    )
+
+
+def _jacobian(cache: Any, paths: Any, movers: int) -> Float[Array, "k p"]:
+    return jnp.concatenate([length_jacobian(some, cache.search, movers) for some in (paths.specular, paths.diffracted)])
+
+
+@jax.jit
+def normal_equations(
+    field: Any,
+    params: Any,
+    motion: Motion,
+    cache: Any,
+    data: TrainingData,
+    index: Int[Array, " n"],
+    variance: Float[Array, "tx k"],
+) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
+    """Returns the matrix J^T W J and the vector J^T W r of some snapshots, a multiple of `AT_ONCE`: what is left of them is
+    about r - J (a further motion), in units of its standard deviation."""
+
+    def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
+        batch = data.batch(link[None], jax.random.key(0))
+        assert batch.snapshots is not None, "phases are what it looks at"
+        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), motion)
+        place, frequency = jnp.searchsorted(cache.tx_index, batch.links.tx_index[0]), batch.links.query.frequency_hz[0]
+        paths: Any = jax.tree.map(lambda leaf: leaf[place], cache.paths)
+        wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
+        arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
+        expected = jnp.exp(-0.5 * wavenumber**2 * variance[place])
+        arrived = arrived._replace(amplitude=arrived.amplitude * expected)
+        voltages = element_voltages(arrived, plan.receiver, frequency, params.curved)
+        lengths = _jacobian(cache, paths, len(motion.shift)).astype(voltages.dtype)
+        changes = -1j * wavenumber * jnp.matmul(voltages.T, lengths, precision=EXACT)
+        changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))
+        return _whitened(jnp.sum(voltages, 0), changes, batch.snapshots[0])
+
+    def add(total: Any, links: Int[Array, " b"]) -> tuple[Any, None]:
+        changes, left = jax.vmap(one)(links)
+        changes, left = changes.reshape(-1, changes.shape[-1]), left.reshape(-1)
+        curvature = jnp.matmul(changes.T, changes, precision=EXACT)
+        return (total[0] + curvature, total[1] + jnp.matmul(changes.T, left, precision=EXACT)), None
+
+    size = ravel_pytree(motion)[0].size
+    total, _ = jax.lax.scan(add, (jnp.zeros((size, size)), jnp.zeros(size)), index.reshape(-1, AT_ONCE))
+    return total
+
+
+def _turned(
+    voltages: Complex[Array, "k elements"], arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""]
+) -> Complex[Array, "elements 3"]:
+    """Returns how the elements' voltages change with the rotation vector (world frame) of the receiver."""
+    axes = rotation_matrix(receiver.orientation)  # row i: the world's axis i in the receiver's frame
+    aside = -jnp.cross(axes[:, None], arrived.direction)
+    phases = jnp.matmul(aside, receiver.element_wavelengths(frequency_hz).T, precision=EXACT)
+    return jnp.sum(2j * jnp.pi * phases * voltages, 1).T
+
+
+def _whitened(
+    predicted: Complex[Array, " elements"], changes: Complex[Array, "elements p"], truth: Complex[Array, " elements"]
+) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
+    """Returns the Jacobian and what is left of a snapshot, real and imaginary parts one below the other, free of what a common
+    factor explains, in units of the standard deviation that is left."""
+    faintest = jnp.asarray(FAINTEST, predicted.real.dtype)
+    scale, norm = (jnp.maximum(jnp.max(jnp.abs(y)), faintest) for y in (predicted, truth))  # squares of faint ones would vanish
+    predicted, changes, truth = predicted / scale, changes / scale, truth / norm
+    norm = jnp.sqrt(jnp.sum(jnp.abs(truth) ** 2))
+    power = jnp.sum(jnp.abs(predicted) ** 2)
+    factor = jnp.vdot(predicted, truth) / power
+    left = (truth - factor * predicted) / norm
+    along = jnp.matmul(predicted.conj(), changes, precision=EXACT) / power
+    orthogonal = (changes - predicted[:, None] * along) * factor / norm
+    weight = jnp.sqrt(2 * len(truth) / (jnp.sum(jnp.abs(left) ** 2) + GOOD_MATCH))
+    both = [jnp.concatenate([part.real, part.imag]) * weight for part in (orthogonal, left)]
+    usable = jnp.isfinite(weight) & jnp.isfinite(both[0]).all()
+    return jnp.where(usable, both[0], 0), jnp.where(usable, both[1], 0)
