@@ -43,7 +43,7 @@ def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
         settings = (BEFORE_MUON.get(field, {}) if edition < 2 else {}) | settings
         settings = (BEFORE_NERF2_BY_MUON.get(field, {}) if edition < 3 else {}) | settings
     if edition < 3 and "mesh.displacement" in settings:  # nobody moved surfaces back by then
-        settings = {"search.geometry_steps": 0} | settings
+        settings = {"search.geometry": False} | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value
