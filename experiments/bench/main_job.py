@@ -65,7 +65,7 @@ def measure(dataset: Any, versions: dict[str, Settings], epochs: int, folder: Pa
             run.epoch()
             times[name].append(1e3 * (time.process_time() - begin) / run.settings.loop.epoch_steps)
     report: dict[str, Any] = {name: figures(values, versions[name].optim.steps, first[name]) for name, values in times.items()}
-    whole = [report[name]["training_cpu_s"] for name in versions]
+    whole = [float(np.median(values)) * versions[name].optim.steps for name, values in times.items()]
     return report | {"share_of_training": round(whole[0] / whole[1], 3)}
 
 
@@ -74,8 +74,8 @@ def figures(milliseconds: list[float], steps: int, first: float) -> dict[str, fl
     included (of the version that comes first, also what both share)."""
     low, median, high = np.percentile(milliseconds, [25, 50, 75])
     return {
-        "step_cpu_ms": round(float(median), 1),
-        "spread_ms": round(float(high - low) / 2, 1),
+        "step_cpu_ms": round(float(median), 2),
+        "spread_ms": round(float(high - low) / 2, 2),
         "steps": steps,
         "training_cpu_s": round(float(median) * steps / 1e3, 1),
         "first_epoch_s": round(first, 1),
