@@ -12,6 +12,7 @@ import tyro
 from jaxtyping import Int
 
 from data_gen.ceilings import scaled, scaled_images
+from data_gen.report import table
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import SceneFile, load_scene
@@ -44,9 +45,7 @@ def compare(first: SceneFile, second: SceneFile) -> str:
     frequencies = _common(first.frequencies_hz[:, None], second.frequencies_hz[:, None])
     if not len(tx) or not len(frequencies):
         raise UserError(f"{first.name} and {second.name} have no transmitter or no frequency in common")
-    rows = [_row(first, second, tx, int(i), int(k)) for i, k in frequencies]
-    lines = [HEADING, ["---:"] * len(HEADING), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return table(list(HEADING), [_row(first, second, tx, int(i), int(k)) for i, k in frequencies])
 
 
 def _common(first: np.ndarray, second: np.ndarray) -> Int[np.ndarray, "n 2"]:

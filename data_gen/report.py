@@ -39,9 +39,9 @@ def report(files: tuple[Path, ...]) -> str:
     scenes = {file: load_scene(file) for file in files}
     parts = [
         "### Files",
-        _table(["file", "TX", "frequencies", "spectra", "triangles", "kB", "sha256"], map(_row, scenes.items())),
+        table(["file", "TX", "frequencies", "spectra", "triangles", "kB", "sha256"], map(_row, scenes.items())),
     ]
-    parts += ["### Median over frequencies", _table(["file", *CEILINGS.values()], (_medians(*item) for item in scenes.items()))]
+    parts += ["### Median over frequencies", table(["file", *CEILINGS.values()], (_medians(*item) for item in scenes.items()))]
     for file, scene in scenes.items():
         parts += [f"### {file.stem}: median SSIM", _by_frequency(scene.meta["ceilings"], CEILINGS, 3)]
         parts += [f"### {file.stem}: channel", _by_frequency(scene.meta["channel"], CHANNEL, 2)]
@@ -65,10 +65,11 @@ def _by_frequency(rows: list[dict[str, Any]], columns: dict[str, str], digits: i
     lines = [
         [f"{row['frequency_ghz']:g}", *(f"{row[key]:.{digits}f}" if key in row else "" for key in columns)] for row in rows
     ]
-    return _table(["GHz", *columns.values()], lines)
+    return table(["GHz", *columns.values()], lines)
 
 
-def _table(heading: list[str], rows: Any) -> str:
+def table(heading: list[str], rows: Any) -> str:
+    """Returns a Markdown table; its first column is left-aligned."""
     lines = [heading, ["---"] + ["---:"] * (len(heading) - 1), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

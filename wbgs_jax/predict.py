@@ -200,25 +200,17 @@ def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
     return lines[:SHOWN]
 
 
-def write_channel(path: Path, answer: dict[str, np.ndarray], source: dict[str, Any]) -> None:
-    """Writes the answer's arrays, and where they come from as JSON text in `meta`."""
-    arrays: dict[str, Any] = answer
+def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> None:
+    """Writes the answer's arrays that are known, and where they come from as JSON text in `meta`."""
+    known = {name: value for name, value in arrays.items() if value is not None}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(source)))
+        np.savez_compressed(stream, **known, meta=np.array(json.dumps(source)))
 
 
 def _source(trained: TrainedField, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
     asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
     origin = {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
     return origin | {"receiver": asked}
-
-
-def write_spectra(path: Path, spectra: Spectra, source: dict[str, Any]) -> None:
-    """Writes `pas` (tx, freq, 90, 360), `tx_positions`, `frequencies_hz`, `expected` (tx, freq, 3) if it is known, and where
-    they come from as JSON text in `meta`."""
-    arrays = {name: value for name, value in vars(spectra).items() if value is not None}
-    with atomic_write(path) as stream:
-        np.savez_compressed(stream, **arrays, meta=np.array(json.dumps(source)))
 
 
 def draw(spectra: Spectra) -> Figure:
@@ -264,14 +256,14 @@ def main(arguments: list[str] | None = None) -> None:
         answer = ask_channel(command.what, trained, dataset, receiver, tx_positions, frequencies_hz)
         for line in power_lines(answer):
             say(line)
-        write_channel(command.out, answer, _source(trained, dataset, receiver))
+        write_answer(command.out, answer, _source(trained, dataset, receiver))
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
         return
     spectra = ask(trained, receiver, tx_positions, frequencies_hz)
     for line in sureness(spectra):
         say(line)
     if command.out:
-        write_spectra(command.out, spectra, _source(trained, dataset, receiver))
+        write_answer(command.out, vars(spectra), _source(trained, dataset, receiver))
         say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
     if command.picture:
         with atomic_write(command.picture) as stream:

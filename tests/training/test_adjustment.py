@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import wave_runs
 from jax.flatten_util import ravel_pytree
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
@@ -48,9 +49,7 @@ def snapshots(flat, run_tree, links):
     """Of the room with its things elsewhere, to first order."""
     field, params, receiver, cache, nothing = run_tree
     motion = ravel_pytree(nothing)[1](flat)
-    plan = field.displaced(field.plan(params, receiver, cache=cache), motion)
-    paths = jax.tree.map(lambda leaf: leaf[jnp.searchsorted(cache.tx_index, links.tx_index)], cache.paths)
-    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+    return wave_runs.snapshots(params, field.displaced(field.plan(params, receiver, cache=cache), motion), cache, links)
 
 
 def parts_of(run, count):

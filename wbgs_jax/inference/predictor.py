@@ -22,7 +22,7 @@ from wbgs_jax.types import Links, Query, Receiver, check_query
 BLOCK = 16
 """Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
 
-PREPARED = 1024
+PREPARED = 8192
 """Queries whose transmitters' paths are in memory at a time."""
 
 Predictor = Callable[[Any, Any], Array]
@@ -143,23 +143,12 @@ def render_pas(
     return correct(neighbours, field.render(params, plan, query).pas, query)
 
 
-@jax.jit
-def _observe(field: Field, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
-    return field.render_links(params, plan, cache, links)
-
-
-@partial(jax.jit, static_argnames=("kept",))
-def _observe_corrected(
-    field: Field,
-    params: Any,
-    plan: Any,
-    cache: Any,
-    links: Links,
-    neighbours: Neighbours | None,
-    kept: Callable[[Observation], Any],
+@partial(jax.jit, static_argnames=("quantity",))
+def _observe(
+    field: Field, params: Any, plan: Any, cache: Any, links: Links, neighbours: Neighbours | None, quantity: str | None
 ) -> Any:
     seen = field.render_links(params, plan, cache, links)
-    return kept(seen._replace(pas=correct(neighbours, seen.pas, links.query)))
+    return getattr(seen, quantity) if quantity else seen._replace(pas=correct(neighbours, seen.pas, links.query))
 
 
 def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:
@@ -188,41 +177,49 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
     """
     links = dataset.links(index)
     cache = field.prepare(links, dataset.receivers)
-    total: Observation | None = None
-    for number in np.unique(dataset.receiver_index[index]):
-        plan = field.plan(params, dataset.receiver(int(number)), None, cache)
-        of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
-        for block, filled in _blocks(of_receiver, BLOCK):
-            seen = _observe(field, params, plan, cache, _taken(links, filled))
-            total = _like(seen, len(index)) if total is None else total
-            _put(total, block, seen)
-    return total if total is not None else Observation(jnp.zeros((0, *PAS_SHAPE)))
+
+    def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Observation]]:
+        for number in np.unique(dataset.receiver_index[index]):
+            plan = field.plan(params, dataset.receiver(int(number)), None, cache)
+            of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
+            for block, filled in _blocks(of_receiver, BLOCK):
+                yield block, _observe(field, params, plan, cache, _taken(links, filled), None, None)
+
+    return _gathered(answers(), len(index))
 
 
-def _whole(seen: Observation) -> Observation:
-    return seen
-
-
-def observe_queries(trained: Trained, receiver: Receiver, query: Query, kept: Callable[[Observation], Any] = _whole) -> Any:
-    """Returns what a trained field says of any number of queries, as NumPy arrays in their order: all of it, the spectra with
-    what the neighbours say, or what is kept of it (a function of a module; nothing else is computed).
+def observe_queries(trained: Trained, receiver: Receiver, query: Query, quantity: str | None = None) -> Any:
+    """Returns what a trained field says of any number of queries, as NumPy arrays in their order: an `Observation`, its spectra
+    with what the neighbours say, or one of its quantities by name (nothing else is computed then).
 
     What is known of a transmitter serves all of its frequencies. Powers have no scale where the data had none (`check_power`).
     """
     field, params, neighbours = trained.field, trained.params, for_receiver(trained.neighbours, receiver)
     count = len(query.frequency_hz)
-    total: Any = None
     tx_index = jnp.asarray(group_transmitters(np.asarray(query.tx_position)), jnp.int32)
     links = Links(query, jnp.zeros(count, jnp.int32), tx_index)
-    for start in range(0, count, PREPARED):
-        some = np.arange(start, min(start + PREPARED, count))
-        cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
-        plan = field.plan(params, receiver, None, cache)
-        for block, filled in _blocks(some, min(BLOCK, count)):
-            seen = _observe_corrected(field, params, plan, cache, _taken(links, filled), neighbours, kept)
-            total = _like(seen, count) if total is None else total
-            _put(total, block, seen)
-    return total if total is not None else kept(Observation(jnp.zeros((0, *PAS_SHAPE))))
+
+    def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Any]]:
+        for start in range(0, count, PREPARED):
+            some = np.arange(start, min(start + PREPARED, count))
+            cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
+            plan = field.plan(params, receiver, None, cache)
+            for block, filled in _blocks(some, min(BLOCK, count)):
+                yield block, _observe(field, params, plan, cache, _taken(links, filled), neighbours, quantity)
+
+    return _gathered(answers(), count)
+
+
+def _gathered(answers: Iterator[tuple[Int[np.ndarray, " k"], Any]], count: int) -> Any:
+    """Returns blocks of answers, each with the places they belong to and perhaps filled beyond, as arrays in order; of no
+    queries, no spectra."""
+    total: Any = None
+    for place, seen in answers:
+        if total is None:
+            total = jax.tree.map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), seen)
+        for own, new in zip(jax.tree.leaves(total), jax.tree.leaves(seen), strict=True):
+            own[place] = np.asarray(new)[: len(place)]
+    return Observation(jnp.zeros((0, *PAS_SHAPE))) if total is None else total
 
 
 def _taken(links: Links, index: Int[np.ndarray, " k"]) -> Links:
@@ -261,15 +258,6 @@ _correct = jax.jit(correct)
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns the predicted spectra (float32) of some of a dataset's links."""
     return np.asarray(observe_links(field, params, dataset, index).pas)
-
-
-def _like(seen: Any, n: int) -> Any:
-    return jax.tree.map(lambda leaf: np.empty((n, *leaf.shape[1:]), leaf.dtype), seen)
-
-
-def _put(total: Any, place: Int[np.ndarray, " k"], seen: Any) -> None:
-    for own, new in zip(jax.tree.leaves(total), jax.tree.leaves(seen), strict=True):
-        own[place] = np.asarray(new)[: len(place)]
 
 
 def trained_band(dataset: Dataset) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.fields import Field, Observation, field_names, get_field
+from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import PowerConfidence, expected_power
 from wbgs_jax.inference.predictor import Trained, check_power, observe_queries
@@ -48,8 +48,8 @@ def ask_channel(
         check_power(trained.field, dataset)
     name, function = CHANNEL[what]
     query = make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
-    if what in SAID:
-        found = observe_queries(trained, receiver, query, SAID[what])
+    if function is None:
+        found = observe_queries(trained, receiver, query, name)
     else:
         plan, measure = trained.field.plan(trained.params, receiver), jax.jit(function)
         found = np.array([_measured(trained, plan, one, receiver, measure) for one in _each(query)])
@@ -90,10 +90,6 @@ def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> channel.Arr
     return field.arrivals(params, plan, query)
 
 
-def _power(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
-    return channel.received_power_db(snapshots_from_paths(arrivals, receiver, frequency_hz))
-
-
 def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
     y = snapshots_from_paths(arrivals, receiver, frequency_hz)
     directions = jnp.asarray(pas_directions(), jnp.float32)
@@ -102,18 +98,13 @@ def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_
     )
 
 
-CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any]]] = {
-    "snapshot": ("snapshots", snapshots_from_paths),
-    "power": ("power_db", _power),
+CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any] | None]] = {
+    "snapshot": ("snapshots", None),
+    "power": ("power_db", None),
     "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
     "k-factor": ("k_factor_db", lambda arrivals, *_: channel.k_factor_db(arrivals)),
     "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
 }
-"""Name in the file, and how it follows from what arrives."""
+"""Name in the file, and how it follows from what arrives; None: the field says it itself, under that name (`Observation`)."""
 OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
-"""What a field says of itself, without a look at its paths, ..."""
-SAID: dict[str, Callable[[Observation], Any]] = {
-    "snapshot": lambda seen: seen.snapshots,
-    "power": lambda seen: seen.power_db,
-}
-"""... and where."""
+"""What a field that knows of no paths may know nevertheless."""

@@ -59,8 +59,7 @@ def length_jacobian(paths: Paths, search: Search, movers: int) -> Float[Array, "
     """Returns the derivative of `length_changes` with respect to all numbers of a motion, as `ravel_pytree` orders them."""
     turn, mover = _turns(paths, search)
     lever = jnp.cross(_arms(paths, search, mover, movers), turn)
-    nothing = jnp.zeros((len(turn), movers, 3))
-    own = [nothing.at[jnp.arange(len(turn))[:, None], mover].add(of).reshape(len(turn), -1) for of in (turn, lever)]
+    own = [_by_mover(of, mover, movers).reshape(len(turn), -1) for of in (turn, lever)]
     return jnp.concatenate([*own, _arriving(paths), jnp.zeros((len(turn), 3))], 1)
 
 
@@ -68,8 +67,13 @@ def length_gradient(paths: Paths, search: Search, movers: int) -> Float[Array, "
     """Returns the derivative of the K path lengths of one transmitter with respect to the shifts of all movers of the facets
     and, last, of the transmitter."""
     turn, mover = _turns(paths, search)
-    start = jnp.zeros((len(turn), movers + 1, 3)).at[:, movers].set(-legs_of(paths).direction[:, 0])
-    return start.at[jnp.arange(len(turn))[:, None], mover].add(turn)
+    departing = -legs_of(paths).direction[:, :1]
+    return jnp.concatenate([_by_mover(turn, mover, movers), departing], 1)
+
+
+def _by_mover(values: Float[Array, "k 5 3"], mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k movers 3"]:
+    """Returns what paths have at their interactions, summed over those with the same mover."""
+    return jnp.zeros((len(values), movers, 3)).at[jnp.arange(len(values))[:, None], mover].add(values)
 
 
 def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], wavenumber: Float[Array, ""]) -> Float[Array, "k k"]:

@@ -23,7 +23,7 @@ from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.fields.wave_channel import arrivals_at
 from wbgs_jax.propagation.motion import Motion, length_jacobian
 from wbgs_jax.propagation.transport import element_voltages
-from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import FAINTEST, Arrivals
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.training.data import TrainingData
@@ -163,13 +163,13 @@ def _whitened(
     faintest = jnp.asarray(FAINTEST, predicted.real.dtype)
     scale, norm = (jnp.maximum(jnp.max(jnp.abs(y)), faintest) for y in (predicted, truth))  # squares of faint ones would vanish
     predicted, changes, truth = predicted / scale, changes / scale, truth / norm
-    norm = jnp.sqrt(jnp.sum(jnp.abs(truth) ** 2))
-    power = jnp.sum(jnp.abs(predicted) ** 2)
+    norm = jnp.sqrt(jnp.sum(squared_magnitude(truth)))
+    power = jnp.sum(squared_magnitude(predicted))
     factor = jnp.vdot(predicted, truth) / power
     left = (truth - factor * predicted) / norm
     along = jnp.matmul(predicted.conj(), changes, precision=EXACT) / power
     orthogonal = (changes - predicted[:, None] * along) * factor / norm
-    weight = jnp.sqrt(2 * len(truth) / (jnp.sum(jnp.abs(left) ** 2) + GOOD_MATCH))
+    weight = jnp.sqrt(2 * len(truth) / (jnp.sum(squared_magnitude(left)) + GOOD_MATCH))
     both = [jnp.concatenate([part.real, part.imag]) * weight for part in (orthogonal, left)]
     usable = jnp.isfinite(weight) & jnp.isfinite(both[0]).all()
     return jnp.where(usable, both[0], 0), jnp.where(usable, both[1], 0)

@@ -114,22 +114,28 @@ def learn_geometry(
     told, told_by_all = _Told(data, own, config, rng), _Told(data, train, config, rng)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
     start = told.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds)
-    now = _followed(start, told, links, named=True)
-    now = _traced(now.field, _fresh(now.params, place.params), data.links, data)
+    field, params = _followed(start, told, links, named=True)
+    now = _traced(field, _fresh(params, place.params), data.links, data)
     now = told_by_all.named(told_by_all.guessed(now), 1)
     moved = [now, told_by_all.named(now, config.rounds, "snapshots")]
-    if data.snapshots is not None:  # places are found better with the right materials
-        again = _followed(moved[-1], told, links, named=False)
-        moved.append(told_by_all.named(_traced(again.field, again.params, data.links, data), 1, "snapshots"))
+    for _ in range(config.geometry_repeats if data.snapshots is not None else 0):  # with the right materials, better
+        field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), told, links, named=False)
+        moved.append(told_by_all.named(_traced(field, params, data.links, data), 1, "snapshots"))
     return _judged(place, moved, told_by_all)
 
 
-def _followed(start: Place, told: _Told, links: Links, named: bool) -> Place:
-    """Returns the place with things moved as spectra say, from low frequencies to high ones. Paths are traced again on the way,
-    and materials named, if they are."""
+def _followed(now: Place, told: _Told, links: Links, named: bool) -> tuple[Any, Any]:
+    """Returns the field with things moved as spectra say, from low frequencies to high ones, and its parameters. Paths are
+    traced again on the way, and materials named, if they are.
+
+    Args:
+        now: with the paths of the transmitters of `links`.
+        told: what their spectra say.
+        links: of which paths are traced.
+        named: whether materials are named.
+    """
     data, config, frequency = told.data, told.config, np.asarray(told.data.links.query.frequency_hz)[told.spectra]
-    now = _traced(start.field, start.params, links, data)
-    traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, start.field.motion)
+    traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
     for highest in np.unique(frequency):
@@ -137,7 +143,7 @@ def _followed(start: Place, told: _Told, links: Links, named: bool) -> Place:
             now, motion = _traced(now.field.moved(motion), now.params, links, data), none
             now = told.named(now, 1) if named else now
             traced_at = float(highest)
-        now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width)) if named else now
+        now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
         pool = told.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, known = config.geometry_snapshots, (motion, covariance, widths)
@@ -146,7 +152,7 @@ def _followed(start: Place, told: _Told, links: Links, named: bool) -> Place:
             count = config.geometry_steps
             params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, told.rng)
             now = dataclasses.replace(now, params=params)
-    return dataclasses.replace(now, field=now.field.moved(motion))
+    return now.field.moved(motion), now.params
 
 
 def _widths(motion: Motion, shift: float) -> Motion:
