@@ -81,11 +81,9 @@ class SearchConfig:
     geometry: bool = True
     """Whether surfaces of a doubtful mesh are moved."""
     geometry_snapshots: int = 640
-    """Snapshots that every step of that looks at, ..."""
-    geometry_repeats: int = 1
-    """... times that it is gone through again after materials have been named by phases, ..."""
+    """Snapshots that every step of that looks at ..."""
     geometry_steps: int = 240
-    """... and, where only spectra are known, steps at every frequency."""
+    """... or, where only spectra are known, steps at every frequency."""
     geometry_doubt: float = 5e-4
     """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
     geometry_tx: int = 160

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.wave_settings import WaveConfig
@@ -171,7 +172,7 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         if plan.motion is not None:
             turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
-            gain = gain * jnp.exp(-2j * jnp.pi * turns)
+            gain = gain * phasor(-turns)
         found.append(one._replace(amplitude=one.amplitude * gain))
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from wbgs_jax._util.complex_numbers import phasor, quotient, root
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
@@ -61,17 +62,17 @@ def slab_coefficients(
         frequency_hz: of the wave.
         air: share of that phase which is taken out: 0 as ray tracers have it, 1 as nature has it.
     """
-    inner = jnp.sqrt(permittivity - (1 - cosine**2))
-    # Twice the one-way phase; clipped where nothing is left, so that gradients stay finite.
-    q = 2 * jnp.pi * frequency_hz / SPEED_OF_LIGHT * thickness * inner
-    one_way = DAMPING * jnp.exp(-1j * q.real + jnp.maximum(q.imag, -40.0))
+    inner, wavelengths = root(permittivity - (1 - cosine**2)), frequency_hz / SPEED_OF_LIGHT * thickness
+    # Clipped where nothing is left, so that gradients stay finite.
+    left = DAMPING * jnp.exp(jnp.maximum(2 * jnp.pi * wavelengths * inner.imag, -40.0))
+    one_way = left * phasor(-wavelengths * inner.real)
     round_trip = one_way * one_way
 
     def both(r):
         ground = 1 - r * r * round_trip
-        return r * (1 - round_trip) / ground, (1 - r * r) * one_way / ground
+        return quotient(r * (1 - round_trip), ground), quotient((1 - r * r) * one_way, ground)
 
-    te = both((cosine - inner) / (cosine + inner))
-    tm = both((permittivity * cosine - inner) / (permittivity * cosine + inner))
-    replaced = jnp.exp(2j * jnp.pi * air * frequency_hz / SPEED_OF_LIGHT * thickness * cosine)
+    te = both(quotient(cosine - inner, cosine + inner))
+    tm = both(quotient(permittivity * cosine - inner, permittivity * cosine + inner))
+    replaced = phasor(air * wavelengths * cosine)
     return SlabCoefficients(te[0], tm[0], te[1] * replaced, tm[1] * replaced)

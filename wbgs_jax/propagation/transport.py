@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax.propagation.edges import Edges
 from wbgs_jax.propagation.image_method import Search
 from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
@@ -94,7 +95,7 @@ def arrivals(
     own = dataclasses.replace(element, exponents=element.exponents + receiver.pattern_exponents)
     seen = _dot(to_local(field, receiver.orientation), antenna_field(own, local))
     wavelength = SPEED_OF_LIGHT / frequency_hz
-    carrier = jnp.exp(-2j * jnp.pi * jnp.mod(legs.total / wavelength, 1.0))
+    carrier = phasor(-legs.total / wavelength)
     amplitude = wavelength / (4 * jnp.pi) * spreading * seen * carrier
     return Arrivals(jnp.where(paths.alive, amplitude, 0), local, legs.total)
 
@@ -118,8 +119,8 @@ def element_voltages(
     across = jnp.maximum(jnp.sum(metres**2, -1) - along**2, 0)
     distance = jnp.sqrt((far - along) ** 2 + across + SHORTEST**2)
     longer = across / (distance + jnp.abs(far - along))  # than of a plane wave, without a difference of large numbers
-    turn = -2j * jnp.pi * frequency_hz / SPEED_OF_LIGHT * curved * longer
-    return plane * jnp.exp(turn) * (1 + curved * (far / distance - 1))
+    turns = -frequency_hz / SPEED_OF_LIGHT * curved * longer
+    return plane * phasor(turns) * (1 + curved * (far / distance - 1))
 
 
 def snapshots_from_paths(

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from wbgs_jax._util.complex_numbers import quotient
+
 _TERMS = 16
 
 
@@ -30,11 +32,12 @@ _SCALE, _POLYNOMIAL = _weideman(_TERMS)
 
 def faddeeva(z: Complex[Array, "*n"]) -> Complex[Array, "*n"]:
     """Returns the Faddeeva function w(z) = exp(-z^2) erfc(-jz) in the upper half plane, to about 1e-6."""
-    ratio = (_SCALE + 1j * z) / (_SCALE - 1j * z)
+    below = quotient(jnp.ones_like(z), _SCALE - 1j * z)
+    ratio = (_SCALE + 1j * z) * below
     p = jnp.zeros_like(ratio)
     for coefficient in _POLYNOMIAL:
         p = p * ratio + float(coefficient)
-    return 2 * p / (_SCALE - 1j * z) ** 2 + (1 / math.sqrt(math.pi)) / (_SCALE - 1j * z)
+    return (2 * p * below + 1 / math.sqrt(math.pi)) * below
 
 
 def transition(root: Float[Array, "*n"]) -> Complex[Array, "*n"]:

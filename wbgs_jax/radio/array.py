@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax._util.pytree import pytree
 
 PAS_HEIGHT, PAS_WIDTH = 90, 360
@@ -60,7 +61,7 @@ def steering_vector(
     element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]
 ) -> Complex[Array, "*n elements"]:
     """Returns the element phases exp(+j 2 pi p.k) of plane waves from unit vectors `directions`; positions in wavelengths."""
-    return jnp.exp(2j * jnp.pi * jnp.matmul(directions, element_positions.T, precision=EXACT))
+    return phasor(jnp.matmul(directions, element_positions.T, precision=EXACT))
 
 
 def array_response(

@@ -118,7 +118,7 @@ def learn_geometry(
     now = _traced(field, _fresh(params, place.params), data.links, data)
     now = told_by_all.named(told_by_all.guessed(now), 1)
     moved = [now, told_by_all.named(now, config.rounds, "snapshots")]
-    for _ in range(config.geometry_repeats if data.snapshots is not None else 0):  # with the right materials, better
+    if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
         field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), told, links, named=False)
         moved.append(told_by_all.named(_traced(field, params, data.links, data), 1, "snapshots"))
     return _judged(place, moved, told_by_all)

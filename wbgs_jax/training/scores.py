@@ -14,7 +14,10 @@ from scipy.stats import norm, permutation_test
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.data import TrainingData
+from wbgs_jax.types import Batch
 
+AT_ONCE = 8
+"""Spectra."""
 Compared = Literal["snapshots", "covariances", "spectra"]
 """What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
 (`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known."""
@@ -32,30 +35,53 @@ class Scores(Protocol):
 def make_scores(
     field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
 ) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver."""
+    """Returns the function that scores candidates on some spectra of one receiver. What leaves say that all candidates share
+    (the very same arrays) is computed once for all of them."""
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
-        return np.asarray(_score(field, stacked, cache, data, spectra[:first], compared))
+        structure = jax.tree.structure(candidates[0])
+        columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
+        differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
+        leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, columns, strict=True))
+        if not any(differ):
+            once = _score(field, structure, differ, leaves, cache, data, spectra[:first], compared)
+            return np.repeat(np.asarray(once), len(candidates), 0)
+        return np.asarray(_score(field, structure, differ, leaves, cache, data, spectra[:first], compared))
 
     return score
 
 
-@partial(jax.jit, static_argnames=("compared",))
-def _score(field: Field, candidates: Any, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared):
-    batch = data.batch(spectra, jax.random.key(0))
-    plan = field.plan(jax.tree.map(lambda leaf: leaf[0], candidates), batch.receiver, None, cache)
+@partial(jax.jit, static_argnames=("structure", "differ", "compared"))
+def _score(
+    field: Field,
+    structure: Any,
+    differ: tuple[bool, ...],
+    leaves: tuple[Array, ...],
+    cache: Any,
+    data: TrainingData,
+    spectra: Int[Array, " n"],
+    compared: Compared,
+) -> Float[Array, "k n"]:
+    """Returns the scores of K candidates whose leaves that differ have a leading axis; of one, where none does."""
 
-    def one(params):
-        seen = field.render_links(params, plan, cache, batch.links)
+    def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
+        params = jax.tree.unflatten(structure, leaves)
+        seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
         if batch.snapshots is not None and compared == "snapshots" and seen.snapshots is not None:
-            return log_decorrelation(seen.snapshots, batch.snapshots)
+            return log_decorrelation(seen.snapshots, batch.snapshots)[0]
         if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
-            return surprise(seen.covariance, batch.snapshots)
+            return surprise(seen.covariance, batch.snapshots)[0]
         assert batch.pas is not None, "candidates are scored by spectra or snapshots"
-        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas), (-2, -1)))
+        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas)))
 
-    return jax.lax.map(one, candidates)
+    def one(link: Int[Array, ""]) -> Float[Array, " k"]:
+        batch = data.batch(link[None], jax.random.key(0))
+        if not any(differ):
+            return compare(batch, leaves)[None]
+        axes = tuple(0 if own else None for own in differ)
+        return jax.vmap(lambda *leaves: compare(batch, leaves), axes)(*leaves)
+
+    return jax.lax.map(one, spectra, batch_size=AT_ONCE).T
 
 
 def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[float, float]:

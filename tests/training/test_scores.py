@@ -1,0 +1,48 @@
+"""Candidates scored side by side, which share what they have in common, against each scored by itself."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_settings
+from wave_runs import PARTS, places, run_in
+
+from wbgs_jax.training.scores import make_scores
+
+N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
+SETTINGS = tiny_settings(
+    "wave", field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8}
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    heard = np.random.default_rng(1).normal(size=(2, N_TX, 1, len(FREQUENCIES), 16))
+    snapshots = (heard[0] + 1j * heard[1]).astype(np.complex64)
+    return run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(N_TX), FREQUENCIES, snapshots)
+
+
+def other_materials(params, rng):
+    materials = params.materials
+    moved = materials.log_susceptibility + jnp.asarray(rng.normal(0, 0.3, materials.slope.shape), jnp.float32)
+    return dataclasses.replace(params, materials=dataclasses.replace(materials, log_susceptibility=moved))
+
+
+@pytest.mark.parametrize("compared", ["snapshots", "covariances", "spectra"])
+def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
+    params = run.state.params
+    candidates = [params, *(other_materials(params, rng) for _ in range(2))]
+    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train), compared)
+    found = score(candidates)
+    assert found.shape == (3, len(run.dataset.train))
+    apart = np.abs(found[0] - found[1:]).mean(1)
+    assert (apart > 1e-3).all()
+    for row, candidate in zip(found, candidates, strict=True):
+        np.testing.assert_allclose(score([candidate])[0], row, atol=1e-4)
+        copied = jax.tree.map(jnp.copy, candidate)
+        np.testing.assert_allclose(score([copied, candidate])[0], row, atol=1e-4)
+    first = score(candidates, 3)
+    np.testing.assert_allclose(first, found[:, :3], atol=1e-4)
+    np.testing.assert_array_equal(score([params, params])[0], score([params])[0])
