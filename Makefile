@@ -17,9 +17,10 @@ READY  := $(VENV)/.ready
 CUDA   := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo cuda)
 SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
 NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCENE)),$(notdir $(basename $(SCENE))),scene$(SCENE)))
+MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval test test-slow simulator data lint typecheck bench experiments tables docs clean
+.PHONY: help setup train eval measured test test-slow simulator data lint typecheck bench experiments tables docs clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -45,6 +46,10 @@ train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|
 
 eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
 	$(VENV)/bin/wbgs-jax eval --run $(RUN)
+
+measured: setup  ## learn and score a map of measured powers: make measured DATA=folder [OUT=folder]  (docs/measured.md)
+	@test -n "$(DATA)" || { echo "error: give the folder with the readings: make measured DATA=folder" >&2; exit 2; }
+	$(VENV)/bin/wbgs-jax measure --data $(DATA) --out $(MEASURED)/scores.json --picture $(MEASURED)/maps.png
 
 test: setup  ## run the tests
 	$(PY) -m pytest -n 2 --dist worksteal -m "not slow"

@@ -24,6 +24,7 @@ TITLES = {
     "data": "Data",
     "inference": "A trained field",
     "training": "A trained field",
+    "measured": "Measured powers",
     "_util": "Writing a field",
 }
 """Headings, in their order, by the room of a name."""

@@ -33,6 +33,11 @@ from .inference.maps import predict_map as predict_map
 from .inference.predictor import at_receiver as at_receiver
 from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
+from .measured.floor_plan import load_walls as load_walls
+from .measured.power_map import learn_map as learn_map
+from .measured.power_map import received_power as received_power
+from .measured.readings import cell_means as cell_means
+from .measured.readings import load_readings as load_readings
 from .radio.array import cbf as cbf
 from .radio.array import pas_directions as pas_directions
 from .radio.array import planar_array as planar_array

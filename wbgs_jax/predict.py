@@ -23,7 +23,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 import wbgs_jax
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
@@ -77,21 +77,6 @@ class Spectra:
     frequencies_hz: Float[np.ndarray, " freq"]
     expected: Float[np.ndarray, "tx freq 3"] | None = None
     """Expected SSIM of every answer, and the ends of its interval; None where a run does not know how sure it is."""
-
-
-def positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
-    """Returns positions in metres from "x,y,z" each; anything else is a `UserError`."""
-
-    def parse(word: str) -> list[float]:
-        try:
-            values = [float(part) for part in word.split(",")]
-        except ValueError:
-            values = []
-        if len(values) != 3 or not np.isfinite(values).all():
-            raise UserError(f"--tx {word} is no position; give x,y,z in metres, such as --tx 1.0,2.5,1.5")
-        return values
-
-    return np.array([parse(word) for word in words]).reshape(-1, 3)
 
 
 def receiver_at(word: str, like: Receiver) -> Receiver:
@@ -239,7 +224,7 @@ def main(arguments: list[str] | None = None) -> None:
     use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax predict")
     check(command)
-    tx_positions, frequencies_hz = positions(command.tx), frequencies(command.ghz)
+    tx_positions, frequencies_hz = parse_positions(command.tx), frequencies(command.ghz)
     trained = load_trained(command.run)
     dataset = trained.dataset()
     if command.export:

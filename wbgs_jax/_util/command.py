@@ -3,6 +3,9 @@
 import sys
 from collections.abc import Callable, Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from wbgs_jax._util.errors import UserError
 
 
@@ -32,3 +35,18 @@ def option_value(arguments: Sequence[str], name: str, default: str) -> str:
         elif argument.startswith(f"{name}="):
             value = argument.split("=", 1)[1]
     return value
+
+
+def parse_positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
+    """Returns positions in metres from "x,y,z" each; anything else is a `UserError`."""
+
+    def parse(word: str) -> list[float]:
+        try:
+            values = [float(part) for part in word.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not np.isfinite(values).all():
+            raise UserError(f"--tx {word} is no position; give x,y,z in metres, such as --tx 1.0,2.5,1.5")
+        return values
+
+    return np.array([parse(word) for word in words]).reshape(-1, 3)

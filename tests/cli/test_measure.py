@@ -1,0 +1,73 @@
+"""`wbgs-jax measure` as people call it."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from commands import assert_error_for_people, call
+from flats import LAW, folder, powers
+
+from wbgs_jax.measure import main
+
+
+def test_scores_pictures_and_answers(tmp_path, rng):
+    data = folder(tmp_path, rng)
+    files = {
+        name: tmp_path / f"answer{suffix}" for name, suffix in (("out", ".json"), ("picture", ".png"), ("answers", ".csv"))
+    }
+    options = [word for name, path in files.items() for word in (f"--{name}", path)]
+    done = call(main, "--data", data, "--tx", "1,1,1.3", "7,1,1.3", *options)
+    assert done.code == 0, done.err
+    report = json.loads(files["out"].read_text())
+    assert set(report["scores"]) == {"room_west", "room_east", "blocks_of_1_m"}
+    assert abs(report["law"]["first_wall_db"] - LAW[2]) < 2.5
+    assert all(0.7 < score["within"] <= 1 for score in report["scores"].values())
+    table = np.genfromtxt(files["answers"], delimiter=",", names=True)
+    expected = powers(np.array([[1, 1, 1.3], [7, 1, 1.3]]))
+    assert np.abs(table["dbm_1"] - expected[:, 0]).max() < 6 and (table["within_db_1"] > 0).all()
+    assert files["picture"].read_bytes()[:4] == b"\x89PNG"
+    assert "dBm of receiver 1:" in done.out and "blocks of 1 m" in done.out
+
+
+def test_walls_become_a_mesh(tmp_path, rng):
+    folder(tmp_path, rng, n=20)
+    done = call(main, "--floor-plan", tmp_path / "walls.csv", "--ceiling", 2.5, "--mesh", tmp_path / "walls.ply")
+    assert done.code == 0, done.err
+    mesh = trimesh.load(tmp_path / "walls.ply", process=False)
+    np.testing.assert_allclose(mesh.bounds[1][2], 2.5)
+
+
+def test_cells_grow_until_a_map_can_hold_them(tmp_path, rng):
+    data = folder(tmp_path, rng, n=1700, rooms=False)
+    done = call(main, "--data", data, "--cell", 0.01, "--tx", "1,1,1.3")
+    assert done.code == 0 and "cells of 0.01 m" not in done.err, done.err
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ([], "give --data FOLDER"),
+        (["--data", "nowhere"], "there is no folder nowhere"),
+        (["--data", "DATA", "--out", "scores.txt"], "does not end in .json"),
+        (["--data", "DATA", "--answers", "a.csv"], "--answers needs --tx"),
+        (["--data", "DATA", "--cell", "0"], "--cell is 0"),
+        (["--data", "DATA", "--tx", "1,2"], "--tx 1,2 is no position"),
+        (["--data", "DATA", "--floor-plan", "nowhere.csv"], "there is no floor plan nowhere.csv"),
+        (["--floor-plan", "walls.csv", "--mesh", "w.ply", "--tx", "1,1,1"], "powers follow from readings"),
+    ],
+)
+def test_errors_are_for_people(tmp_path, rng, options, says):
+    data = folder(tmp_path, rng, n=20)
+    assert_error_for_people(call(main, *(str(data) if word == "DATA" else word for word in options)), says)
+
+
+def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
+    done = call(main, "--data", shared_data("ble_flat"), "--out", tmp_path / "scores.json")
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "scores.json").read_text())["scores"]
+    for room, law in (("room_east", 5.5), ("room_south", 4.9)):
+        assert found[room]["error_db"] < 4.0 < law
+        np.testing.assert_allclose(found[room]["rivals_db"]["log_distance"], law, atol=0.1)
+        assert 0.86 <= found[room]["within"] <= 0.94
+    assert "CC BY 4.0" in done.err

@@ -1,0 +1,132 @@
+"""Maps of received power: the law is found, what was measured comes back, and what is not known is said not to be."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flats import LAW, RECEIVERS, WALL, places, powers, walls_between
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.measured.floor_plan import NO_WALLS, Walls
+from wbgs_jax.measured.held_out import NINETY, kriging, scores
+from wbgs_jax.measured.power_map import LENGTH, MOST, Scales, learn_map, received_power
+from wbgs_jax.measured.readings import Readings
+
+WALLS = Walls(WALL, np.ones(1))
+EXACT = Scales(room=2.0, wall=2.0, place=1e-3, reading=1e-3)
+
+
+def readings(tx, heard):
+    rooms = tuple("west" if x < 4 else "east" for x in tx[:, 0])
+    return Readings(tx, heard, np.isfinite(heard).astype(float), rooms, RECEIVERS)
+
+
+def test_a_law_without_noise_is_found_and_holds_everywhere(rng):
+    tx = places(rng, 250)
+    learned = learn_map(readings(tx, powers(tx)), WALLS)
+    np.testing.assert_allclose(learned.law, LAW, atol=0.5)
+    far = places(rng, 50)
+    mean, std = jax.jit(received_power)(learned, jnp.asarray(far, jnp.float32))
+    assert np.abs(mean - powers(far)).mean() < 0.3
+    assert (np.asarray(std) > 0).all() and np.asarray(std).mean() < 2
+
+
+def test_what_was_measured_comes_back_and_fades(rng):
+    tx = np.array([[1.0, 1.0, 1.3], [6.0, 2.0, 1.3], [3.0, 3.5, 1.3], [7.0, 1.0, 1.3]])
+    heard = powers(tx) + rng.normal(0, 3, (4, 3))
+    learned = learn_map(readings(tx, heard), WALLS, EXACT)
+    mean, _ = received_power(learned, jnp.asarray(tx, jnp.float32))
+    np.testing.assert_allclose(mean, heard, atol=0.02)
+    law_alone = dataclasses.replace(learned, weights=jnp.zeros_like(learned.weights))
+    away = tx + np.array([0, 0, 20 * LENGTH])
+    for place, same in ((away, True), (tx, False)):
+        answers = [np.asarray(received_power(m, jnp.asarray(place, jnp.float32))[0]) for m in (learned, law_alone)]
+        assert np.allclose(*answers, atol=1e-3) == same
+
+
+def test_the_covariance_is_that_of_the_formula(rng):
+    """Mean and variance against the textbook's equations in double precision (Rasmussen and Williams, 2.25 and 2.26)."""
+    tx, asked = places(rng, 30), places(rng, 7)
+    heard = powers(tx, 3.0, rng)
+    heard[rng.random(heard.shape) < 0.2] = np.nan
+    scales = Scales(room=3.0, wall=2.0, place=0.5, reading=2.0)
+    learned = learn_map(readings(tx, heard), WALLS, scales)
+    mean, std = (np.asarray(a, float) for a in received_power(learned, jnp.asarray(asked, jnp.float32)))
+    law, covariance = np.asarray(learned.law, float), np.asarray(learned.law_covariance, float)
+    for r, receiver in enumerate(RECEIVERS):
+        own = np.isfinite(heard[:, r])
+
+        def phi(at, r=r, receiver=receiver):
+            distance = np.linalg.norm(at - receiver, axis=-1)
+            return np.stack([np.ones(len(at)), -10 * np.log10(distance), -np.sqrt(walls_between(at)[:, r])], -1)
+
+        def k(a, b, phi=phi):
+            distance = np.linalg.norm(a[:, None] - b, axis=-1)
+            return np.exp(-distance / LENGTH) * (scales.room**2 + scales.wall**2 * np.outer(phi(a)[:, 2], phi(b)[:, 2]))
+
+        inverse = np.linalg.inv(k(tx[own], tx[own]) + (scales.place**2 + scales.reading**2) * np.eye(own.sum()))
+        left = heard[own, r] - phi(tx[own]) @ law
+        np.testing.assert_allclose(mean[:, r], phi(asked) @ law + k(asked, tx[own]) @ inverse @ left, atol=2e-3)
+        variance = np.diag(k(asked, asked) - k(asked, tx[own]) @ inverse @ k(tx[own], asked))
+        variance = variance + np.einsum("bi,ij,bj->b", phi(asked), covariance, phi(asked))
+        np.testing.assert_allclose(std[:, r], np.sqrt(variance), rtol=2e-3)
+
+
+def test_intervals_hold_nine_in_ten(rng):
+    """Fields drawn from the covariance that the map assumes, told of all but a tenth."""
+    held, total, scales = 0, 0, Scales(room=3.0, wall=0.0, place=0.1, reading=1.0)
+    for _ in range(4):
+        tx = places(rng, 200)
+        distance = np.linalg.norm(tx[:, None] - tx, axis=-1)
+        root = np.linalg.cholesky(scales.room**2 * np.exp(-distance / LENGTH) + 1e-6 * np.eye(200))
+        local = powers(tx) + root @ rng.normal(size=(200, 3))
+        heard = local + rng.normal(0, 1, local.shape)
+        learned = learn_map(readings(tx, heard).at(np.arange(180)), WALLS, scales)
+        mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(tx[180:], jnp.float32)))
+        held, total = held + (np.abs(mean - local[180:]) <= NINETY * std).sum(), total + mean.size
+    assert 0.82 < held / total < 0.97, held / total
+
+
+def test_gradients_point_to_more_power(rng):
+    tx = places(rng, 60)
+    learned = learn_map(readings(tx, powers(tx, 2.0, rng)), WALLS)
+    slope = jax.grad(lambda at: received_power(learned, at)[0].sum())
+    at = jnp.asarray(tx[:5], jnp.float32)
+    assert np.isfinite(slope(at)).all()  # where it was measured, too
+    away = jnp.asarray([[1.0, 2.0, 2.0], [2.0, 1.0, 2.0]])
+    along = slope(away) / jnp.linalg.norm(slope(away))
+    more, less = (received_power(learned, away + sign * 2e-2 * along)[0].sum() for sign in (1, -1))
+    np.testing.assert_allclose(more - less, 4e-2 * jnp.linalg.norm(slope(away)), rtol=0.05)
+
+
+def test_walls_tell_about_rooms_that_were_not_measured(rng):
+    tx = places(rng, 400)
+    found = {score.held_out: score for score in scores(readings(tx, powers(tx, 2.0, rng)), WALLS)}
+    assert set(found) == {"room west", "room east", "blocks of 1 m"}
+    for room in ("room west", "room east"):
+        score = found[room]
+        assert score.error_db < 3 < score.rivals_db["log-distance"] + 1.5
+        assert score.error_db < min(score.rivals_db.values()) + 0.3
+        assert score.within > 0.8
+    assert found["blocks of 1 m"].error_db < found["blocks of 1 m"].rivals_db["inverse distance"] + 0.1
+
+
+def test_kriging_of_one_place_is_its_power_there(rng):
+    tx = places(rng, 40)
+    heard = powers(tx)
+    known, asked = readings(tx, heard), readings(tx[:1], heard[:1])
+    near = kriging(known, asked)
+    away = kriging(known, dataclasses.replace(asked, places=asked.places + np.array([0, 0, 50.0])))
+    assert np.abs(near - heard[:1]).mean() < np.abs(away - heard[:1]).mean()
+    np.testing.assert_allclose(away[0], heard.mean(0), atol=1e-6)
+
+
+def test_what_cannot_be_learned_is_said(rng):
+    tx = places(rng, 3)
+    with pytest.raises(UserError, match="too few to learn from"):
+        learn_map(readings(tx, powers(tx)), NO_WALLS)
+    tx = places(rng, MOST + 1)
+    with pytest.raises(UserError, match="more than a map can hold"):
+        learn_map(readings(tx, powers(tx)), NO_WALLS)

@@ -1,0 +1,1 @@
+"""Received powers that people have measured at many places: read, averaged, interpolated and extrapolated."""

@@ -1,0 +1,90 @@
+"""Walls of a floor plan: how many of them stand between two points, and what mesh they make.
+
+walls.csv (or layout.csv) holds segments x1,y1,x2,y2, each a wall, or the corners x,y of one outline around all free space, in
+which a wall between rooms has two faces. Metres.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.measured.readings import numbers, read_table
+
+FILES = ("walls.csv", "layout.csv")
+PARALLEL = 1e-9
+"""Square metres: what is smaller crosses nothing."""
+
+
+@pytree
+class Walls:
+    """W vertical walls."""
+
+    ends: Float[Array | np.ndarray, "w 2 2"]
+    """Of every wall on the floor, metres."""
+    share: Float[Array | np.ndarray, " w"]
+    """1, or 1/2 of each face of a wall that is drawn with two."""
+
+
+NO_WALLS = Walls(np.zeros((0, 2, 2)), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Format:
+    columns: tuple[str, ...]
+    share: float
+
+
+SEGMENTS, OUTLINE = _Format(("x1", "y1", "x2", "y2"), 1.0), _Format(("x", "y"), 0.5)
+
+
+def load_walls(path: Path) -> Walls:
+    """Reads the walls of a CSV file; anything else than the two forms is a `UserError`."""
+    header, rows = read_table(path)
+    form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
+    values = numbers(path, header, rows, list(form.columns))
+    if not np.isfinite(values).all():
+        raise UserError(f"{path} has empty cells; every corner needs its coordinates in metres")
+    ends = values.reshape(-1, 2, 2) if form is SEGMENTS else np.stack([values, np.roll(values, -1, 0)], 1)
+    return Walls(ends, np.full(len(ends), form.share))
+
+
+def namespace(array: Any) -> Any:
+    """Returns the library that an array is of: geometry is found in NumPy, in double precision, and used in JAX."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def crossings(
+    walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
+) -> Float[Array | np.ndarray, "*#n"]:
+    """Returns how many walls stand between points of the plan; the outline's face that a point lies on does not count."""
+    xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
+    ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
+    ground = _cross(ray, along)
+    safe = xp.where(xp.abs(ground) < PARALLEL, 1.0, ground)
+    on_ray, on_wall = _cross(corner, along) / safe, _cross(corner, ray) / safe
+    hit = (xp.abs(ground) >= PARALLEL) & (on_ray > 0) & (on_ray < 1) & (on_wall >= 0) & (on_wall < 1)
+    return xp.sum(xp.where(hit, walls.share, 0.0), -1)
+
+
+def _cross(a: Any, b: Any) -> Any:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def extruded(walls: Walls, height: float) -> trimesh.Trimesh:
+    """Returns the walls as upright rectangles without thickness, between a floor at z = 0 and a ceiling that span all of them:
+    a mesh for the fields that want one."""
+    low, high = np.asarray(walls.ends).min((0, 1)), np.asarray(walls.ends).max((0, 1))
+    sheets = [[[*a, 0], [*b, 0], [*b, height], [*a, height]] for a, b in np.asarray(walls.ends) if not np.allclose(a, b)]
+    for z in (0.0, height):
+        sheets.append([[low[0], low[1], z], [high[0], low[1], z], [high[0], high[1], z], [low[0], high[1], z]])
+    vertices = np.array(sheets, float).reshape(-1, 3)
+    corner = 4 * np.arange(len(sheets))[:, None, None]
+    faces = (corner + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, faces, process=False)
