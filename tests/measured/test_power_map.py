@@ -1,6 +1,8 @@
 """Maps of received power: the law is found, what was measured comes back, and what is not known is said not to be."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from wbgs_jax.measured.held_out import NINETY, kriging, scores
 from wbgs_jax.measured.power_map import LENGTH, MOST, Scales, learn_map, received_power
 from wbgs_jax.measured.readings import Readings
 
+GUIDE = Path(__file__).parents[2] / "docs" / "measured.md"
 WALLS = Walls(WALL, np.ones(1))
 EXACT = Scales(room=2.0, wall=2.0, place=1e-3, reading=1e-3)
 
@@ -130,3 +133,11 @@ def test_what_cannot_be_learned_is_said(rng):
     tx = places(rng, MOST + 1)
     with pytest.raises(UserError, match="more than a map can hold"):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
+
+
+def test_the_guide_runs():
+    names: dict = {}
+    (block,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)
+    exec(compile(block, str(GUIDE), "exec"), names)
+    assert names["mean"].shape == (1, 2) and np.isfinite(names["std"]).all()
+    assert float(jnp.linalg.norm(names["uphill"])) > 0
