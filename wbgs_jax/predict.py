@@ -2,6 +2,7 @@
 
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
 wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
+wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what paths --out paths.csv
 wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --out elsewhere.npz
 wbgs-jax predict --run RUN --export field.zip
 """
@@ -12,6 +13,7 @@ import wbgs_jax._util.quiet
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +25,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 import wbgs_jax
-from wbgs_jax._util.command import parse_positions, run_command, say
+from wbgs_jax._util.command import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
@@ -31,9 +33,11 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
+from wbgs_jax.inference.links import ask_mimo, ask_paths, ask_response, write_csv
 from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import at_receiver, observe_queries, trained_band
 from wbgs_jax.inference.quantities import ask_channel
+from wbgs_jax.radio.array import planar_array
 from wbgs_jax.training.run_folder import TrainedField, load_trained
 from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver, make_query
 
@@ -42,6 +46,19 @@ SHOWN = 12
 SHORTEST = 1e-3
 """Of quaternions that are taken."""
 SUFFIXES = {"out": ".npz", "picture": ".png", "export": ".zip"}
+What = Literal[
+    "spectra",
+    "snapshot",
+    "power",
+    "beamforming-gain",
+    "k-factor",
+    "angular-spread",
+    "delay-spread",
+    "paths",
+    "frequency-response",
+    "mimo",
+]
+MOST_POINTS, MOST_ELEMENTS = 4096, 1024
 
 
 @dataclass(frozen=True)
@@ -57,10 +74,20 @@ class Command:
     rx: str = ""
     """Another receiver than the trained one: x,y,z in metres, or x,y,z,w,i,j,k with the quaternion that turns its array into
     the world frame. Array and pattern stay. Only fields with paths know others."""
-    what: Literal["spectra", "snapshot", "power", "beamforming-gain", "k-factor", "delay-spread"] = "spectra"
+    what: What = "spectra"
     """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
+    tx_velocity: str = "0,0,0"
+    """Of the transmitters, metres a second: Doppler shifts of paths follow from it."""
+    rx_velocity: str = "0,0,0"
+    """Of the receiver."""
+    band_mhz: float = 100.0
+    """Width of the band of a frequency response ..."""
+    points: int = 64
+    """... and frequencies in it."""
+    tx_array: str = "1x1"
+    """Of a MIMO matrix: ROWSxCOLUMNS elements of each transmitter half a wavelength apart, in the y-z plane of the world."""
     out: Path | None = None
-    """Write the answers to this .npz file."""
+    """Write the answers to this .npz file; a table of paths to a .csv file, too."""
     picture: Path | None = None
     """Draw the spectra (the first 12) into this .png file."""
     export: Path | None = None
@@ -106,13 +133,18 @@ def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
     for name, suffix in SUFFIXES.items():
         path = getattr(command, name)
-        if path is not None and path.suffix != suffix:
+        if path is not None and path.suffix != suffix and not (command.what == "paths" and path.suffix == ".csv"):
             raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
     asks, writes = bool(command.tx or command.ghz), bool(command.out or command.picture)
     if not (asks or writes or command.export):
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
     if (asks or writes) and not (command.tx and command.ghz and writes):
         raise UserError("answers need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+    for name, word in _velocities(command).items():
+        parse_vector(word, f"--{name}-velocity")
+    _array(command.tx_array)
+    if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
+        raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
     if command.what != "spectra" and (command.picture or (asks and not command.out)):
         raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
 
@@ -170,6 +202,39 @@ def sureness(spectra: Spectra) -> list[str]:
         where = _link(spectra.tx_positions[tx], float(spectra.frequencies_hz[frequency]))
         lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
     return lines[:SHOWN]
+
+
+def ask_for(
+    command: Command,
+    trained: TrainedField,
+    dataset: Dataset,
+    receiver: Receiver,
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+) -> dict[str, np.ndarray]:
+    """Returns the arrays that answer what is asked for beside spectra."""
+    asked = receiver, tx_positions, frequencies_hz
+    if command.what == "paths":
+        velocities = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
+        return ask_paths(trained, dataset, *asked, *velocities)
+    if command.what == "frequency-response":
+        return ask_response(trained, *asked, 1e6 * command.band_mhz, command.points)
+    if command.what == "mimo":
+        return ask_mimo(trained, *asked, planar_array(*_array(command.tx_array)))
+    return ask_channel(command.what, trained, dataset, *asked)
+
+
+def _velocities(command: Command) -> dict[str, str]:
+    return {"tx": command.tx_velocity, "rx": command.rx_velocity}
+
+
+def _array(word: str) -> tuple[int, int]:
+    """Returns rows and columns of "4x2"; anything else is a `UserError`."""
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
+    rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
+    if not 0 < rows * columns <= MOST_ELEMENTS:
+        raise UserError(f"--tx-array {word} is no array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
+    return rows, columns
 
 
 def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
@@ -238,10 +303,13 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"warning: {line}; the field was not trained there")
     if command.what != "spectra":
         assert command.out is not None, "checked"
-        answer = ask_channel(command.what, trained, dataset, receiver, tx_positions, frequencies_hz)
+        answer = ask_for(command, trained, dataset, receiver, tx_positions, frequencies_hz)
         for line in power_lines(answer):
             say(line)
-        write_answer(command.out, answer, _source(trained, dataset, receiver))
+        if command.out.suffix == ".csv":
+            write_csv(command.out, answer)
+        else:
+            write_answer(command.out, answer, _source(trained, dataset, receiver))
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
         return
     spectra = ask(trained, receiver, tx_positions, frequencies_hz)

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from commands import call
 from PIL import Image
-from synthetic import tiny_scene
+from synthetic import tiny_scene, tiny_settings
 from toys import RippleConfig, RippleField, registered, toy_settings
 from untrained import State, make_run
 
 from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import Observation
+from wbgs_jax.fields.wave import WaveField
 from wbgs_jax.inference.confidence import PowerConfidence, write_confidence
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.training import checkpoint
@@ -181,3 +183,59 @@ def test_powers_come_with_how_sure_they_are(tmp_path):
 )
 def test_numbers_are_written_and_not_drawn(run, tmp_path, arguments, words):
     test_what_cannot_be_asked(run, tmp_path, arguments, words)
+
+
+@pytest.fixture(scope="module")
+def coherent(tmp_path_factory):
+    """A run of the coherent field, untrained."""
+    folder = tmp_path_factory.mktemp("runs") / "coherent"
+    scene = folder.with_suffix(".npz")
+    save_scene(scene, tiny_scene())
+    settings = tiny_settings("wave", field={"specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8})
+    config = RunConfig(str(scene), "wave", "smoke", 0, None, settings)
+    write_config(folder, config)
+    field = WaveField.make(settings.field, DatasetScene(config.dataset()), 0)
+    state = State(field.init(jax.random.key(0)))
+    checkpoint.save(folder / "checkpoints", 3, state, field, {"limits": None, "seconds": 1.0}, keep=1)
+    return folder
+
+
+def test_the_whole_channel(coherent, tmp_path):
+    ask = ["--run", coherent, "--tx", *INSIDE, "--ghz", 2.4, 28]
+    for what, options, shapes in (
+        ("paths", ["--tx-velocity", "1,0,0"], {}),
+        ("frequency-response", ["--band-mhz", 20, "--points", 8], {"frequency_response": (2, 2, 8, 16), "delays_s": (8,)}),
+        ("mimo", ["--tx-array", "2x1"], {"mimo": (2, 2, 16, 2), "tx_elements": (2, 3)}),
+        ("angular-spread", [], {"angular_spread_deg": (2, 2, 2)}),
+    ):
+        out = tmp_path / f"{what}.npz"
+        result = predict(*ask, "--what", what, *options, "--out", out)
+        assert result.code == 0, result.err
+        with np.load(out) as answer:
+            for name, shape in shapes.items():
+                assert answer[name].shape == shape, name
+            assert json.loads(str(answer["meta"]))["field"] == "wave"
+    with np.load(tmp_path / "paths.npz") as table:
+        assert {*table["tx"]} == {0, 1} and np.abs(table["doppler_hz"]).max() > 1
+        assert "line of sight" in table["meets"]
+        rows = len(table["tx"])
+    result = predict(*ask, "--what", "paths", "--out", tmp_path / "paths.csv")
+    assert result.code == 0, result.err
+    assert len((tmp_path / "paths.csv").read_text().splitlines()) == 1 + rows
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--what", "paths"], ["knows no paths", "wave or hybrid"]),
+        (["--what", "mimo"], ["knows no paths"]),
+        (["--what", "frequency-response"], ["knows no paths"]),
+        (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is no array"]),
+        (["--what", "mimo", "--tx-array", "0x3"], ["--tx-array 0x3"]),
+        (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is no velocity"]),
+        (["--what", "frequency-response", "--points", "1"], ["is no band"]),
+        (["--what", "frequency-response", "--band-mhz", "-5"], ["is no band"]),
+    ],
+)
+def test_what_of_the_channel_cannot_be_asked(run, tmp_path, arguments, words):
+    test_what_cannot_be_asked(run, tmp_path, [*ASK, "--out", "OUT/a.npz", *arguments], words)

@@ -44,3 +44,18 @@ def test_correlation_is_blind_to_phase_and_scale(rng):
     expected = np.abs(np.sum(np.conj(a) * b, -1)) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
     np.testing.assert_allclose(correlation(a, b), expected, rtol=1e-4)
     assert (correlation(a, 0 * a) == 0).all()
+
+
+def test_angles_of_two_paths_spread_by_their_separation():
+    """Equal powers at +-a around a direction: sqrt(-2 ln cos a), about a where it is small; TR 38.901, annex A."""
+    apart, zenith = np.radians([5.0, 50.0]), np.radians(60.0)
+    for a in apart:
+        azimuth = np.array([1.0 - a, 1.0 + a])
+        direction = np.stack(
+            [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.full(2, np.cos(zenith))], -1
+        )
+        found = arrivals([1.0, 1.0j], [3.0, 4.0])._replace(direction=jnp.asarray(direction, jnp.float32))
+        spread = channel.angular_spread_deg(found)
+        np.testing.assert_allclose(spread[0], np.degrees(np.sqrt(-2 * np.log(np.cos(a)))), rtol=1e-3)
+        assert spread[1] < 0.1
+    assert abs(np.degrees(np.sqrt(-2 * np.log(np.cos(apart[0])))) - 5) < 0.05

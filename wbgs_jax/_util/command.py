@@ -39,14 +39,16 @@ def option_value(arguments: Sequence[str], name: str, default: str) -> str:
 
 def parse_positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
     """Returns positions in metres from "x,y,z" each; anything else is a `UserError`."""
+    unit = "metres, such as --tx 1.0,2.5,1.5"
+    return np.array([parse_vector(word, "--tx", "position", unit) for word in words]).reshape(-1, 3)
 
-    def parse(word: str) -> list[float]:
-        try:
-            values = [float(part) for part in word.split(",")]
-        except ValueError:
-            values = []
-        if len(values) != 3 or not np.isfinite(values).all():
-            raise UserError(f"--tx {word} is no position; give x,y,z in metres, such as --tx 1.0,2.5,1.5")
-        return values
 
-    return np.array([parse(word) for word in words]).reshape(-1, 3)
+def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "metres a second") -> Float[np.ndarray, "3"]:
+    """Returns three numbers from "x,y,z"; anything else is a `UserError`."""
+    try:
+        values = np.array([float(part) for part in word.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise UserError(f"{option} {word} is no {kind}; give x,y,z in {unit}")
+    return values

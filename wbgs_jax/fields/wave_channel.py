@@ -173,7 +173,8 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
         if plan.motion is not None:
             turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
             gain = gain * phasor(-turns)
-        found.append(one._replace(amplitude=one.amplitude * gain))
+        assert one.polarised is not None, "paths that were traced have it"
+        found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
     return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 
 

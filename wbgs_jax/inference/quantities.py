@@ -103,6 +103,7 @@ CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any] |
     "power": ("power_db", None),
     "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),
     "k-factor": ("k_factor_db", lambda arrivals, *_: channel.k_factor_db(arrivals)),
+    "angular-spread": ("angular_spread_deg", lambda arrivals, *_: channel.angular_spread_deg(arrivals)),
     "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
 }
 """Name in the file, and how it follows from what arrives; None: the field says it itself, under that name (`Observation`)."""

@@ -21,7 +21,7 @@ from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import to_local
-from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
+from wbgs_jax.radio.patterns import Antenna, antenna_field, upright, zenith_vector
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
@@ -91,13 +91,24 @@ def arrivals(
     else:
         field, spreading = _through_slabs(field, interactions, active), 1 / legs.total
     last = last_leg(paths)
-    local = to_local(-legs.direction[jnp.arange(len(last)), last], receiver.orientation)
+    arrival = legs.direction[jnp.arange(len(last)), last]
+    local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
     own = dataclasses.replace(element, exponents=element.exponents + receiver.pattern_exponents)
-    seen = _dot(to_local(field, receiver.orientation), antenna_field(own, local))
-    wavelength = SPEED_OF_LIGHT / frequency_hz
-    carrier = phasor(-legs.total / wavelength)
-    amplitude = wavelength / (4 * jnp.pi) * spreading * seen * carrier
-    return Arrivals(jnp.where(paths.alive, amplitude, 0), local, legs.total)
+    theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
+    parts = jnp.stack([_dot(here, seen) for seen in (antenna_field(own, local), theta, jnp.cross(local, theta))], -1)
+    scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
+    amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
+    met = paths.interaction_type, _materials(paths, search)
+    return Arrivals(amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:], *met)
+
+
+def _materials(paths: Paths, search: Search) -> Int[Array, "k 5"]:
+    """Returns what paths meet is made of; -1 where they meet nothing."""
+    kind, number = paths.interaction_type, paths.interaction_facet
+    facet = jnp.where(kind == DIFFRACTED, 0, number)
+    if search.edges.facet.shape[0]:
+        facet = jnp.where(kind == DIFFRACTED, search.edges.facet[jnp.where(kind == DIFFRACTED, number, 0)], facet)
+    return jnp.where(kind == NONE, -1, search.facets.material[facet])
 
 
 def element_voltages(
@@ -129,6 +140,24 @@ def snapshots_from_paths(
     """Returns the complex voltages of the receiver's elements, all paths together; `jax.vmap` takes more transmitters.
     Arguments are those of `element_voltages`."""
     return jnp.sum(element_voltages(arrived, receiver, frequency_hz, curved), 0)
+
+
+def mimo_matrix(
+    arrived: Arrivals,
+    receiver: Receiver,
+    frequency_hz: Float[Array, ""],
+    tx_elements: Float[Array, "m 3"],
+    curved: Float[Array, ""] | float = 0.0,
+) -> Complex[Array, "elements m"]:
+    """Returns the voltages of the receiver's elements by each of M elements of the transmitter, alike and seeing plane waves.
+
+    Args:
+        arrived, receiver, frequency_hz, curved: as in `element_voltages`.
+        tx_elements: their places around the transmitter's position, in wavelengths, world frame.
+    """
+    assert arrived.departure is not None, "arrivals of traced paths have it"
+    voltages = element_voltages(arrived, receiver, frequency_hz, curved)
+    return jnp.matmul(voltages.T, steering_vector(tx_elements, arrived.departure), precision=EXACT)
 
 
 def covariance_from_paths(

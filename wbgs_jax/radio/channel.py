@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
@@ -22,6 +22,16 @@ class Arrivals(NamedTuple):
     """Unit vectors in the receiver's frame, towards where the wave comes from."""
     length: Float[Array, "*b k"]
     """Length of the whole path, metres."""
+    departure: Float[Array, "*b k 3"] | None = None
+    """Unit vectors in the world frame, in which the wave leaves the transmitter."""
+    arrival: Float[Array, "*b k 3"] | None = None
+    """Unit vectors in the world frame, in which it travels when it arrives."""
+    polarised: Complex[Array, "*b k 2"] | None = None
+    """Amplitudes that isotropic elements would see, polarised along theta-hat and along phi-hat of the receiver's frame."""
+    interaction: Int[Array, "*b k 5"] | None = None
+    """What the wave meets, in its order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
+    material: Int[Array, "*b k 5"] | None = None
+    """Index of the material that it meets there; -1 beyond the last."""
 
 
 FAINTEST = 1e-30
@@ -82,6 +92,28 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
     delay = arrivals.length / SPEED_OF_LIGHT
     mean = jnp.sum(weight * delay, -1, keepdims=True)
     return jnp.sqrt(jnp.sum(weight * (delay - mean) ** 2, -1))
+
+
+def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
+    """Returns the spreads of azimuth and zenith of arrival in the receiver's frame (degrees), weighted by power (3GPP TR
+    38.901, annex A)."""
+    power = squared_magnitude(arrivals.amplitude)
+    weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
+    x, y, z = jnp.moveaxis(arrivals.direction, -1, 0)
+    level = jnp.sqrt(jnp.maximum(x * x + y * y, SMALLEST))
+    unit = jnp.stack([jnp.stack([x / level, y / level], -1), jnp.stack([z, level], -1)], -3)  # (*b, 2, k, 2)
+    mean = jnp.sum(weight[..., None, :, None] * unit, -2)
+    length = jnp.clip(jnp.sum(mean**2, -1), SMALLEST, 1.0)
+    return jnp.degrees(jnp.sqrt(-jnp.log(length)))
+
+
+def doppler_hz(
+    arrivals: Arrivals, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
+) -> Float[Array, "*b k"]:
+    """Returns the Doppler shifts of all paths (hertz) while transmitter and receiver move (metres a second, world frame)."""
+    assert arrivals.departure is not None and arrivals.arrival is not None, "arrivals of traced paths have them"
+    along_departure = jnp.sum(arrivals.departure * tx_velocity, -1)
+    return frequency_hz / SPEED_OF_LIGHT * (along_departure - jnp.sum(arrivals.arrival * rx_velocity, -1))
 
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:

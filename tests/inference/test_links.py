@@ -1,0 +1,169 @@
+"""Tables of paths, responses and matrices against closed forms, and against each other."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_settings
+from wave_runs import PARTS, RX, places, run_in
+
+from wbgs_jax.inference.links import SIGHT, ask_mimo, ask_paths, ask_response, write_csv
+from wbgs_jax.inference.predictor import observe_queries
+from wbgs_jax.measured.readings import read_table
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
+from wbgs_jax.types import make_query
+
+SETTINGS = tiny_settings(
+    "wave",
+    field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 32, "diffracted_kept": 16, "mirror_areas": (0.0,)},
+)
+TX, GHZ = np.array([[4.5, 3.0, 1.6]]), np.array([6e9])
+NOTHING = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Known:
+    """A field that nobody has trained."""
+
+    field: Any
+    params: Any
+    neighbours: None = None
+    confidence: None = None
+    power_confidence: None = None
+
+    def dataset(self):
+        raise AssertionError("it is given")
+
+    def origin(self):
+        return {}
+
+
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
+    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(2), np.array([6e9]))
+    trained = Known(run.field, run.state.params)
+    return SimpleNamespace(trained=trained, dataset=run.dataset, receiver=run.dataset.receiver())
+
+
+def paths(asked, tx=TX, tx_velocity=NOTHING, rx_velocity=NOTHING, ghz=GHZ):
+    return ask_paths(asked.trained, asked.dataset, asked.receiver, tx, ghz, tx_velocity, rx_velocity)
+
+
+def amplitudes(table, name="element"):
+    return table[f"{name}_re"] + 1j * table[f"{name}_im"]
+
+
+def directions(table, end):
+    zenith, azimuth = (np.radians(table[f"{end}_{angle}_deg"]) for angle in ("zenith", "azimuth"))
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
+
+
+def steering(asked, table):
+    towards = jnp.asarray(directions(table, "arrival"), jnp.float32)
+    return np.asarray(steering_vector(jnp.asarray(asked.receiver.element_positions), towards))
+
+
+def snapshot(asked, tx=TX, hz=GHZ):
+    query = make_query(np.repeat(tx, len(hz), 0), np.tile(hz, len(tx)))
+    return np.asarray(observe_queries(asked.trained, asked.receiver, query, "snapshots"))
+
+
+def test_the_line_of_sight_is_that_of_free_space(asked):
+    table = paths(asked)
+    (sight,) = np.flatnonzero(table["meets"] == SIGHT)
+    separation = TX[0] - RX
+    length = np.linalg.norm(separation)
+    np.testing.assert_allclose(table["length_m"][sight], length, rtol=1e-6)
+    np.testing.assert_allclose(table["delay_ns"][sight], length / SPEED_OF_LIGHT * 1e9, rtol=1e-6)
+    np.testing.assert_allclose(directions(table, "departure")[sight], -separation / length, atol=1e-5)
+    np.testing.assert_allclose(directions(table, "arrival")[sight], separation / length, atol=1e-5)
+    wave = SPEED_OF_LIGHT / GHZ[0]
+    np.testing.assert_allclose(np.abs(amplitudes(table, "theta"))[sight], wave / (4 * np.pi * length), rtol=1e-5)
+    assert np.abs(amplitudes(table, "phi"))[sight] < 1e-6 * wave
+    np.testing.assert_allclose(table["power_db"], 20 * np.log10(np.abs(amplitudes(table))), atol=1e-3)
+    assert (np.diff(table["power_db"]) <= 1e-6).all() and len(table["meets"]) > 8
+
+
+def test_walls_mirror_the_transmitter(asked):
+    """Every path with one reflection is as long as the way to the transmitter's image in one of the planes."""
+    table = paths(asked)
+    words = np.char.startswith(table["meets"].astype(str), "off ") & (np.char.find(table["meets"].astype(str), ",") < 0)
+    facets = asked.trained.field.facets
+    height = TX[0] @ np.asarray(facets.normal).T - np.asarray(facets.offset)
+    images = TX[0] - 2 * height[:, None] * np.asarray(facets.normal)
+    lengths = np.linalg.norm(images - np.asarray(RX), axis=-1)
+    assert words.sum() >= 4
+    for length in table["length_m"][words]:
+        assert np.abs(lengths - length).min() < 1e-4
+    assert {word.removeprefix("off ") for word in table["meets"][words]} <= set(asked.dataset.materials.names)
+
+
+def test_paths_add_up_to_the_snapshot(asked):
+    table = paths(asked)
+    total = amplitudes(table) @ steering(asked, table)
+    truth = snapshot(asked)[0]
+    np.testing.assert_allclose(total, truth, atol=2e-4 * np.abs(truth).max())
+
+
+def test_doppler_shifts_are_rates_of_lengths(asked, rng):
+    tx_velocity, rx_velocity, moment = rng.normal(size=3), np.zeros(3), 1e-3
+    now = paths(asked, tx_velocity=tx_velocity, rx_velocity=rx_velocity)
+    later = paths(asked, tx=TX + moment * tx_velocity)
+    compared = 0
+    for i, meets in enumerate(now["meets"]):
+        alike = np.flatnonzero(later["meets"] == meets)
+        near = alike[np.abs(later["length_m"][alike] - now["length_m"][i]) < 2 * moment * np.linalg.norm(tx_velocity)]
+        if len(near) != 1:
+            continue
+        rate = (later["length_m"][near[0]] - now["length_m"][i]) / moment
+        expected = -GHZ[0] / SPEED_OF_LIGHT * rate
+        np.testing.assert_allclose(now["doppler_hz"][i], expected, atol=0.03 * 20 * np.linalg.norm(tx_velocity))
+        compared += 1
+    assert compared >= 5
+    together = paths(asked, tx_velocity=tx_velocity, rx_velocity=tx_velocity)
+    (sight,) = np.flatnonzero(together["meets"] == SIGHT)
+    assert abs(together["doppler_hz"][sight]) < 1e-3  # both ends move alike
+
+
+def test_a_response_is_that_of_the_paths(asked):
+    band, points = 40e6, 16
+    answer = ask_response(asked.trained, asked.receiver, TX, GHZ, band, points)
+    response, table = answer["frequency_response"][0, 0], paths(asked)
+    assert response.shape == (points, 16) and answer["offsets_hz"][points // 2] == 0
+    turns = np.exp(-2j * np.pi * answer["offsets_hz"][:, None] * table["delay_ns"] * 1e-9)
+    expected = (turns * amplitudes(table)) @ steering(
+        asked, table
+    )  # materials and spreading hardly change over so narrow a band
+    np.testing.assert_allclose(response, expected, atol=0.05 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        np.sum(np.abs(answer["impulse_response"]) ** 2), np.sum(np.abs(response) ** 2) / points, rtol=1e-4
+    )  # Parseval
+    kernel = np.exp(2j * np.pi * np.outer(answer["delays_s"], answer["offsets_hz"])) / points
+    np.testing.assert_allclose(answer["impulse_response"][0, 0], kernel @ response, atol=1e-4 * np.abs(response).max())
+
+
+def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
+    elements = planar_array(2, 2)
+    matrix = ask_mimo(asked.trained, asked.receiver, TX, GHZ, elements)["mimo"][0, 0]
+    assert matrix.shape == (16, 4)
+    centre = ask_mimo(asked.trained, asked.receiver, TX, GHZ, np.zeros((1, 3)))["mimo"][0, 0]
+    np.testing.assert_allclose(centre[:, 0], snapshot(asked)[0], rtol=1e-4, atol=1e-8)
+    small = elements * 0.02  # plane waves hold for small arrays
+    found = ask_mimo(asked.trained, asked.receiver, TX, GHZ, small)["mimo"][0, 0]
+    for column, place in zip(found.T, small, strict=True):
+        truth = snapshot(asked, TX + place * SPEED_OF_LIGHT / GHZ[0])[0]
+        np.testing.assert_allclose(column, truth, atol=0.01 * np.abs(truth).max())
+    assert np.linalg.norm(found - found[:, :1]) > 0.01 * np.linalg.norm(found)
+
+
+def test_a_table_becomes_a_file(asked, tmp_path):
+    table = paths(asked, tx=np.concatenate([TX, TX + 0.5]))
+    write_csv(tmp_path / "paths.csv", table)
+    header, rows = read_table(tmp_path / "paths.csv")
+    assert header == list(table) and len(rows) == len(table["tx"]) and set(table["tx"]) == {0, 1}
+    powers = np.array([float(row[header.index("power_db")]) for row in rows])
+    np.testing.assert_allclose(powers, table["power_db"], atol=1e-3)
+    assert [row[header.index("meets")] for row in rows] == table["meets"].tolist()
