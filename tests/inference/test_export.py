@@ -20,6 +20,10 @@ import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.splits import hold_out_validation
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import get_field
+from wbgs_jax.fields.hybrid import HybridConfig
+from wbgs_jax.fields.wave import WaveConfig
 from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.predictor import predictor
@@ -205,3 +209,23 @@ def test_an_export_that_fails_leaves_nothing(trained, tmp_path):
         export_field(broken, tmp_path / "field.zip", dataset=tiny_dataset())
     assert jax.config.jax_traceback_in_locations_limit == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(("name", "unit"), [("hybrid", "wavelengths"), ("wave", "metres")])
+def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
+    coherent = WaveConfig(specular_tried=32, specular_kept=8, diffracted_tried=32, diffracted_kept=8)
+    blurred = make_trained(tmp_path).field.config
+    config = coherent if name == "wave" else HybridConfig(coherent, blurred)
+    dataset = tiny_dataset(unit=unit)
+    field = get_field(name).make(config, DatasetScene(dataset), 0)
+    whole = dataclasses.replace(make_trained(tmp_path), field=field, params=field.init(jax.random.key(1)))
+    export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
+    exported, predict = load_exported(tmp_path / "field.zip"), predictor(whole, dataset.receiver())
+    expected = predict(TX, HZ)
+    np.testing.assert_allclose(exported(TX, HZ), expected, atol=2e-4)
+    np.testing.assert_allclose(exported(TX[:1], HZ[:1]), expected[:1], atol=2e-4)
+    if name == "wave":
+        return  # the hybrid field's derivative is its own, too
+    slopes = [jax.grad(lambda tx, f=f: jnp.sum(f(tx, HZ) ** 2))(jnp.asarray(TX, jnp.float32)) for f in (exported, predict)]
+    assert float(jnp.abs(slopes[1]).max()) > 0
+    np.testing.assert_allclose(*slopes, rtol=0.02, atol=0.02 * float(jnp.abs(slopes[1]).max()))

@@ -121,7 +121,7 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz
     if plan.beams is not None:
         pas = covariance_to_pas(covariance, plan.beams)
     else:
-        pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (len(y), *elements.shape[-2:])))
+        pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (y.shape[0], *elements.shape[-2:])))
     return Observation(pas, y, decibels(power), covariance)
 
 

@@ -140,7 +140,7 @@ def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams:
     Where nothing is random it agrees with `snapshot_to_pas`, to the root of single precision.
     """
     count, flat = beams.basis.shape[1] // 2, covariance.reshape(-1, *covariance.shape[-2:])
-    counted = jnp.where(beams.once, flat, 0).reshape(len(flat), -1)
+    counted = jnp.where(beams.once, flat, 0).reshape(flat.shape[0], -1)
     sums = jax.vmap(lambda pairs: jnp.zeros(count, pairs.dtype).at[beams.lag.reshape(-1)].add(pairs))(counted)
     power = jnp.matmul(jnp.concatenate([sums.real, sums.imag], -1), beams.basis.T, precision=EXACT)
     return normalise(_root(power).reshape(*covariance.shape[:-2], *PAS_SHAPE))

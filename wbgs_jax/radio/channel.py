@@ -61,7 +61,7 @@ def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]
 def beyond_free_space_db(
     power_db: Float[Array, "*b"],
     tx_position: Float[Array, "*b 3"],
-    rx_position: Float[Array, "*#b 3"],
+    rx_position: Float[Array, "*rx 3"],
     frequency_hz: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
     """Returns received powers relative to those over a line of sight (dB): how deep in the shadow transmitters stand."""
