@@ -12,8 +12,9 @@ HEIGHT = 1.3
 
 
 def places(rng, n):
-    """In a flat of 8 m x 4 m, with a wall at x = 4 m and a door at its end."""
-    return np.column_stack([rng.uniform(0.2, 7.8, n), rng.uniform(0.2, 3.8, n), np.full(n, HEIGHT)])
+    """In a flat of 8 m x 4 m, with a wall at x = 4 m and a door at its end; nobody stands in the wall."""
+    x = np.where(rng.random(n) < 0.5, rng.uniform(0.2, 3.95, n), rng.uniform(4.05, 7.8, n))
+    return np.column_stack([x, rng.uniform(0.2, 3.8, n), np.full(n, HEIGHT)])
 
 
 def walls_between(tx):

@@ -93,7 +93,7 @@ def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Rec
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
     specular = arrivals(traced.specular, search, slabs, frequency, receiver, False, *antennas)
     diffracted = arrivals(traced.diffracted, search, slabs, frequency, receiver, True, *antennas)
-    return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(specular, diffracted, strict=True)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), specular, diffracted)
 
 
 def snapshot_of(search, tx, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:

@@ -5,12 +5,11 @@ wbgs-jax measure --data FOLDER --tx x,y,z [x,y,z ...] [--answers powers.csv]
 wbgs-jax measure --floor-plan walls.csv --ceiling 2.6 --mesh walls.ply
 """
 
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
-import csv
 import dataclasses
-import io
 import re
 import sys
 from dataclasses import dataclass
@@ -22,19 +21,20 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from trimesh.exchange.ply import export_ply
 
 from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, write_json
+from wbgs_jax._util.files import atomic_write, write_csv, write_json
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.measured.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
-from wbgs_jax.measured.held_out import NINETY, RIVALS, Score, scores
+from wbgs_jax.measured.held_out import COMPARED, NINETY, Score, scores
 from wbgs_jax.measured.pictures import draw
-from wbgs_jax.measured.power_map import MOST, PowerMap, learn_map, received_power
-from wbgs_jax.measured.readings import Readings, attribution, cell_means, load_readings
+from wbgs_jax.measured.power_map import MAX_PLACES, PowerMap, learn_map, received_power
+from wbgs_jax.measured.readings import Readings, attribution, cell_means, check_positions, load_readings
 
 SUFFIXES = {"out": ".json", "picture": ".png", "answers": ".csv", "mesh": ".ply"}
 
@@ -48,7 +48,7 @@ class Command:
     floor_plan: Path | None = None
     """Walls: a CSV file of segments x1,y1,x2,y2 or of the corners x,y of an outline; by default the one of the folder."""
     height: float = 1.3
-    """Of the transmitter above the floor (metres), where readings have no z."""
+    """Height of the transmitters above the floor (metres), where readings have no z."""
     cell: float = 0.25
     """Size of the cells (metres) over which readings are averaged."""
     out: Path | None = None
@@ -95,16 +95,16 @@ def walls_of(command: Command) -> Walls:
 def means(readings: Readings, size: float) -> tuple[Readings, float]:
     """Returns means over cells, and the size of the cells: doubled until there are no more than a map can hold."""
     cells = cell_means(readings, size)
-    return (cells, size) if len(cells.places) <= MOST else means(readings, 2 * size)
+    return (cells, size) if len(cells.places) <= MAX_PLACES else means(readings, 2 * size)
 
 
 def table(found: list[Score]) -> Table:
     """Returns the scores for people."""
-    columns = ["held out", "means", "this map", "90 % hold", *RIVALS]
+    columns = ["held out", "means", "this map", "90 % hold", *COMPARED]
     shown = Table(*columns, title="mean absolute error of the means of cells, dB")
     for score in found:
-        errors = (f"{score.rivals_db[rival]:.2f}" for rival in RIVALS)
-        shown.add_row(score.held_out, str(score.means), f"{score.error_db:.2f}", f"{100 * score.within:.0f} %", *errors)
+        errors = (f"{score.rivals_db[rival]:.2f}" for rival in COMPARED)
+        shown.add_row(escape(score.held_out), str(score.means), f"{score.error_db:.2f}", f"{100 * score.within:.0f} %", *errors)
     return shown
 
 
@@ -117,14 +117,6 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"]) -> list[list[s
     return [["x", "y", "z", *names], *rows]
 
 
-def write_answers(path: Path, rows: list[list[str]]) -> None:
-    """Writes rows as a CSV file."""
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode())
-
-
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
     """Returns what a results file holds."""
     law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
@@ -135,12 +127,12 @@ def report(learned: PowerMap, found: list[Score], command: Command, size: float)
         "cell_m": size,
         "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db"), law, strict=True)),
         "scales_db": dict(zip(("room", "wall", "place", "reading"), scales, strict=True)),
-        "scores": {_key(score.held_out): _plain(score) for score in found},
+        "scores": {_key(score.held_out): _as_json(score) for score in found},
         "environment": environment(),
     }
 
 
-def _plain(score: Score) -> dict[str, Any]:
+def _as_json(score: Score) -> dict[str, Any]:
     return dataclasses.asdict(score) | {"rivals_db": {_key(name): error for name, error in score.rivals_db.items()}}
 
 
@@ -154,6 +146,9 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax measure")
     check(command)
     places, walls = parse_positions(command.tx), walls_of(command)
+    check_positions("--tx", places)
+    if command.mesh and not len(walls.ends):
+        raise UserError("--mesh needs walls: give --floor-plan walls.csv")
     if command.mesh:
         with atomic_write(command.mesh) as stream:
             stream.write(export_ply(extruded(walls, command.ceiling)))
@@ -169,13 +164,13 @@ def main(arguments: list[str] | None = None) -> None:
         rows = answers(learned, places)
         for row in rows[1:]:
             heard = (f"{r + 1}: {row[3 + 2 * r]} ± {row[4 + 2 * r]}" for r in range(len(cells.receivers)))
-            print(f"TX ({', '.join(row[:3])}) m, dBm of receiver {', '.join(heard)}")
+            print(f"TX ({', '.join(row[:3])}) m, mean dBm, 90 % within: receiver {', '.join(heard)}")
         if command.answers:
-            write_answers(command.answers, rows)
+            write_csv(command.answers, rows)
             say(f"answers: {command.answers}")
     if command.picture:
         with atomic_write(command.picture) as stream:
-            draw(learned, walls, cells, command.height).savefig(stream, format="png", dpi=110)
+            draw(learned, walls, cells).savefig(stream, format="png", dpi=110)
         say(f"picture: {command.picture}")
     if command.out or not (command.tx or command.picture):
         found = scores(cells, walls)

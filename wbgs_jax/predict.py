@@ -28,12 +28,12 @@ import wbgs_jax
 from wbgs_jax._util.command import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, write_csv
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
-from wbgs_jax.inference.links import ask_mimo, ask_paths, ask_response, write_csv
+from wbgs_jax.inference.links import as_rows, ask_mimo, ask_paths, ask_response
 from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import at_receiver, observe_queries, trained_band
 from wbgs_jax.inference.quantities import ask_channel
@@ -133,7 +133,7 @@ def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
     for name, suffix in SUFFIXES.items():
         path = getattr(command, name)
-        if path is not None and path.suffix != suffix and not (command.what == "paths" and path.suffix == ".csv"):
+        if path is not None and path.suffix not in (suffix, *([".csv"] if (name, command.what) == ("out", "paths") else [])):
             raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
     asks, writes = bool(command.tx or command.ghz), bool(command.out or command.picture)
     if not (asks or writes or command.export):
@@ -218,10 +218,18 @@ def ask_for(
         velocities = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
         return ask_paths(trained, dataset, *asked, *velocities)
     if command.what == "frequency-response":
+        _check_band(frequencies_hz, 1e6 * command.band_mhz)
         return ask_response(trained, *asked, 1e6 * command.band_mhz, command.points)
     if command.what == "mimo":
         return ask_mimo(trained, *asked, planar_array(*_array(command.tx_array)))
     return ask_channel(command.what, trained, dataset, *asked)
+
+
+def _check_band(frequencies_hz: Float[np.ndarray, " freq"], band_hz: float) -> None:
+    for edge in (frequencies_hz.min() - band_hz / 2, frequencies_hz.max() + band_hz / 2):
+        if not MIN_FREQUENCY_HZ <= edge <= MAX_FREQUENCY_HZ:
+            span = f"{MIN_FREQUENCY_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
+            raise UserError(f"--band-mhz {band_hz / 1e6:g} reaches {edge / 1e9:g} GHz; the model knows {span}")
 
 
 def _velocities(command: Command) -> dict[str, str]:
@@ -307,7 +315,7 @@ def main(arguments: list[str] | None = None) -> None:
         for line in power_lines(answer):
             say(line)
         if command.out.suffix == ".csv":
-            write_csv(command.out, answer)
+            write_csv(command.out, as_rows(answer))
         else:
             write_answer(command.out, answer, _source(trained, dataset, receiver))
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")

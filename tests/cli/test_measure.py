@@ -20,14 +20,14 @@ def test_scores_pictures_and_answers(tmp_path, rng):
     done = call(main, "--data", data, "--tx", "1,1,1.3", "7,1,1.3", *options)
     assert done.code == 0, done.err
     report = json.loads(files["out"].read_text())
-    assert set(report["scores"]) == {"room_west", "room_east", "blocks_of_1_m"}
+    assert set(report["scores"]) == {"room_west", "room_east", "squares_of_1_m"}
     assert abs(report["law"]["first_wall_db"] - LAW[2]) < 2.5
     assert all(0.7 < score["within"] <= 1 for score in report["scores"].values())
     table = np.genfromtxt(files["answers"], delimiter=",", names=True)
     expected = powers(np.array([[1, 1, 1.3], [7, 1, 1.3]]))
     assert np.abs(table["dbm_1"] - expected[:, 0]).max() < 6 and (table["within_db_1"] > 0).all()
     assert files["picture"].read_bytes()[:4] == b"\x89PNG"
-    assert "dBm of receiver 1:" in done.out and "blocks of 1 m" in done.out
+    assert "mean dBm, 90 % within: receiver 1:" in done.out and "squares of 1 m" in done.out
 
 
 def test_walls_become_a_mesh(tmp_path, rng):
@@ -55,6 +55,7 @@ def test_cells_grow_until_a_map_can_hold_them(tmp_path, rng):
         (["--data", "DATA", "--tx", "1,2"], "--tx 1,2 is no position"),
         (["--data", "DATA", "--floor-plan", "nowhere.csv"], "there is no floor plan nowhere.csv"),
         (["--floor-plan", "walls.csv", "--mesh", "w.ply", "--tx", "1,1,1"], "powers follow from readings"),
+        (["--data", "DATA", "--tx", "1e30,0,0"], "--tx must be numbers of metres"),
     ],
 )
 def test_errors_are_for_people(tmp_path, rng, options, says):
@@ -71,3 +72,28 @@ def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
         np.testing.assert_allclose(found[room]["rivals_db"]["log_distance"], law, atol=0.1)
         assert 0.86 <= found[room]["within"] <= 0.94
     assert "CC BY 4.0" in done.err
+
+
+def test_odd_rooms_and_receivers(tmp_path, rng):
+    """A receiver heard in one room alone, one never heard, and names of rooms that are markup."""
+    data = folder(tmp_path, rng, n=200)
+    header, *lines = (data / "readings.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    for row in rows:
+        row[2] = "[/hall]" if row[2] == "west" else "[kitchen]"
+        row[4], row[5] = (row[4] if row[2] == "[/hall]" else ""), ""
+    (data / "readings.csv").write_text("\n".join([header, *(",".join(row) for row in rows)]))
+    done = call(main, "--data", data, "--out", tmp_path / "scores.json")
+    assert done.code == 0, done.err
+    assert "room [/hall]" in done.out and "room [kitchen]" in done.out
+    assert len(json.loads((tmp_path / "scores.json").read_text())["scores"]) == 3
+
+
+def test_a_mesh_needs_walls_and_scores_need_room(tmp_path, rng):
+    data = folder(tmp_path, rng, n=40)
+    (data / "walls.csv").unlink()
+    assert_error_for_people(call(main, "--data", data, "--mesh", tmp_path / "w.ply"), "--mesh needs walls")
+    lines = [f"{x:.2f},{y:.2f},room,-50,-60,-70" for x, y in rng.uniform(0.1, 0.9, (30, 2))]
+    (data / "readings.csv").write_text("\n".join(["x,y,room,rssi_1,rssi_2,rssi_3", *lines]))
+    result = call(main, "--data", data)
+    assert result.code == 2 and "nothing can be held out" in result.err

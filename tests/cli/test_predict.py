@@ -217,7 +217,7 @@ def test_the_whole_channel(coherent, tmp_path):
             assert json.loads(str(answer["meta"]))["field"] == "wave"
     with np.load(tmp_path / "paths.npz") as table:
         assert {*table["tx"]} == {0, 1} and np.abs(table["doppler_hz"]).max() > 1
-        assert "line of sight" in table["meets"]
+        assert "line of sight" in table["interactions"]
         rows = len(table["tx"])
     result = predict(*ask, "--what", "paths", "--out", tmp_path / "paths.csv")
     assert result.code == 0, result.err
@@ -235,6 +235,8 @@ def test_the_whole_channel(coherent, tmp_path):
         (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is no velocity"]),
         (["--what", "frequency-response", "--points", "1"], ["is no band"]),
         (["--what", "frequency-response", "--band-mhz", "-5"], ["is no band"]),
+        (["--what", "frequency-response", "--band-mhz", "100000"], ["reaches -22 GHz"]),
+        (["--what", "paths", "--export", "OUT/a.csv"], ["does not end in .zip"]),
     ],
 )
 def test_what_of_the_channel_cannot_be_asked(run, tmp_path, arguments, words):

@@ -1,5 +1,6 @@
 """Tables of paths, responses and matrices against closed forms, and against each other."""
 
+import dataclasses
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,8 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
-from wbgs_jax.inference.links import SIGHT, ask_mimo, ask_paths, ask_response, write_csv
+from wbgs_jax._util.files import write_csv
+from wbgs_jax.inference.links import SIGHT, as_rows, ask_mimo, ask_paths, ask_response
 from wbgs_jax.inference.predictor import observe_queries
 from wbgs_jax.measured.readings import read_table
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
@@ -73,7 +75,7 @@ def snapshot(asked, tx=TX, hz=GHZ):
 
 def test_the_line_of_sight_is_that_of_free_space(asked):
     table = paths(asked)
-    (sight,) = np.flatnonzero(table["meets"] == SIGHT)
+    (sight,) = np.flatnonzero(table["interactions"] == SIGHT)
     separation = TX[0] - RX
     length = np.linalg.norm(separation)
     np.testing.assert_allclose(table["length_m"][sight], length, rtol=1e-6)
@@ -84,13 +86,15 @@ def test_the_line_of_sight_is_that_of_free_space(asked):
     np.testing.assert_allclose(np.abs(amplitudes(table, "theta"))[sight], wave / (4 * np.pi * length), rtol=1e-5)
     assert np.abs(amplitudes(table, "phi"))[sight] < 1e-6 * wave
     np.testing.assert_allclose(table["power_db"], 20 * np.log10(np.abs(amplitudes(table))), atol=1e-3)
-    assert (np.diff(table["power_db"]) <= 1e-6).all() and len(table["meets"]) > 8
+    assert (np.diff(table["power_db"]) <= 1e-6).all() and len(table["interactions"]) > 8
 
 
 def test_walls_mirror_the_transmitter(asked):
     """Every path with one reflection is as long as the way to the transmitter's image in one of the planes."""
     table = paths(asked)
-    words = np.char.startswith(table["meets"].astype(str), "off ") & (np.char.find(table["meets"].astype(str), ",") < 0)
+    words = np.char.startswith(table["interactions"].astype(str), "off ") & (
+        np.char.find(table["interactions"].astype(str), ",") < 0
+    )
     facets = asked.trained.field.facets
     height = TX[0] @ np.asarray(facets.normal).T - np.asarray(facets.offset)
     images = TX[0] - 2 * height[:, None] * np.asarray(facets.normal)
@@ -98,7 +102,7 @@ def test_walls_mirror_the_transmitter(asked):
     assert words.sum() >= 4
     for length in table["length_m"][words]:
         assert np.abs(lengths - length).min() < 1e-4
-    assert {word.removeprefix("off ") for word in table["meets"][words]} <= set(asked.dataset.materials.names)
+    assert {word.removeprefix("off ") for word in table["interactions"][words]} <= set(asked.dataset.materials.names)
 
 
 def test_paths_add_up_to_the_snapshot(asked):
@@ -113,8 +117,8 @@ def test_doppler_shifts_are_rates_of_lengths(asked, rng):
     now = paths(asked, tx_velocity=tx_velocity, rx_velocity=rx_velocity)
     later = paths(asked, tx=TX + moment * tx_velocity)
     compared = 0
-    for i, meets in enumerate(now["meets"]):
-        alike = np.flatnonzero(later["meets"] == meets)
+    for i, met in enumerate(now["interactions"]):
+        alike = np.flatnonzero(later["interactions"] == met)
         near = alike[np.abs(later["length_m"][alike] - now["length_m"][i]) < 2 * moment * np.linalg.norm(tx_velocity)]
         if len(near) != 1:
             continue
@@ -124,7 +128,7 @@ def test_doppler_shifts_are_rates_of_lengths(asked, rng):
         compared += 1
     assert compared >= 5
     together = paths(asked, tx_velocity=tx_velocity, rx_velocity=tx_velocity)
-    (sight,) = np.flatnonzero(together["meets"] == SIGHT)
+    (sight,) = np.flatnonzero(together["interactions"] == SIGHT)
     assert abs(together["doppler_hz"][sight]) < 1e-3  # both ends move alike
 
 
@@ -149,8 +153,11 @@ def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
     elements = planar_array(2, 2)
     matrix = ask_mimo(asked.trained, asked.receiver, TX, GHZ, elements)["mimo"][0, 0]
     assert matrix.shape == (16, 4)
-    centre = ask_mimo(asked.trained, asked.receiver, TX, GHZ, np.zeros((1, 3)))["mimo"][0, 0]
-    np.testing.assert_allclose(centre[:, 0], snapshot(asked)[0], rtol=1e-4, atol=1e-8)
+    for curved in (0.0, 1.0):
+        params = dataclasses.replace(asked.trained.params, curved=jnp.asarray(curved))
+        own = SimpleNamespace(**vars(asked) | {"trained": dataclasses.replace(asked.trained, params=params)})
+        centre = ask_mimo(own.trained, asked.receiver, TX, GHZ, np.zeros((1, 3)))["mimo"][0, 0]
+        np.testing.assert_allclose(centre[:, 0], snapshot(own)[0], rtol=1e-3, atol=1e-7)
     small = elements * 0.02  # plane waves hold for small arrays
     found = ask_mimo(asked.trained, asked.receiver, TX, GHZ, small)["mimo"][0, 0]
     for column, place in zip(found.T, small, strict=True):
@@ -161,9 +168,9 @@ def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
 
 def test_a_table_becomes_a_file(asked, tmp_path):
     table = paths(asked, tx=np.concatenate([TX, TX + 0.5]))
-    write_csv(tmp_path / "paths.csv", table)
+    write_csv(tmp_path / "paths.csv", as_rows(table))
     header, rows = read_table(tmp_path / "paths.csv")
     assert header == list(table) and len(rows) == len(table["tx"]) and set(table["tx"]) == {0, 1}
     powers = np.array([float(row[header.index("power_db")]) for row in rows])
     np.testing.assert_allclose(powers, table["power_db"], atol=1e-3)
-    assert [row[header.index("meets")] for row in rows] == table["meets"].tolist()
+    assert [row[header.index("interactions")] for row in rows] == table["interactions"].tolist()

@@ -7,7 +7,7 @@ import pytest
 from flats import RECEIVERS, WALL, places, walls_between, write_table
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.measured.floor_plan import NO_WALLS, Walls, crossings, extruded, load_walls
+from wbgs_jax.measured.floor_plan import NO_WALLS, ON_WALL, Walls, crossings, extruded, load_walls
 
 SINGLE = Walls(WALL, np.ones(1))
 
@@ -22,8 +22,12 @@ def test_one_wall_with_a_door(rng):
 
 
 def test_random_walls_by_orientations(rng):
-    """Two segments cross where the ends of each lie on both sides of the other."""
-    ends, start, goal = rng.uniform(0, 5, (40, 2, 2)), rng.uniform(0, 5, (60, 2)), rng.uniform(0, 5, (60, 2))
+    """Two segments cross where the ends of each lie on both sides of the other; no point lies on a wall."""
+    ends, points = rng.uniform(0, 5, (20, 2, 2)), rng.uniform(0, 5, (400, 2))
+    along = (ends[:, 1] - ends[:, 0]) / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1, keepdims=True)
+    apart = (points[:, None] - ends[:, 0]) @ np.array([[0, 1], [-1, 0]])
+    points = points[(np.abs(np.sum(apart * along, -1)) > 2 * ON_WALL).all(1)]
+    start, goal = points[: len(points) // 2], points[len(points) // 2 : 2 * (len(points) // 2)]
 
     def side(a, b, p):
         return np.sign((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
@@ -32,7 +36,8 @@ def test_random_walls_by_orientations(rng):
         sum(side(a, b, p) != side(a, b, q) and side(p, q, a) != side(p, q, b) for a, b in ends)
         for p, q in zip(start, goal, strict=True)
     ]
-    np.testing.assert_array_equal(crossings(Walls(ends, np.ones(40)), start, goal), expected)
+    np.testing.assert_array_equal(crossings(Walls(ends, np.ones(20)), start, goal), expected)
+    assert len(expected) > 50
 
 
 def test_an_outline_has_two_faces_a_wall(tmp_path):
@@ -55,9 +60,25 @@ def test_walls_stand_between_floor_and_ceiling(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [("x,z\n1,2\n", "has no column 'y'"), ("x1,y1,x2,y2\n1,2,3,\n", "empty cells"), ("x,y\n", "no rows")],
+    [
+        ("x,z\n1,2\n", "has no column 'y'"),
+        ("x1,y1,x2,y2\n1,2,3,\n", "corners must be numbers of metres"),
+        ("x,y\n1,1e300\n2,2\n", "corners must be numbers of metres"),
+        ("x,y\n", "no rows"),
+    ],
 )
 def test_what_is_wrong_is_said(tmp_path, content, says):
     (tmp_path / "walls.csv").write_text(content)
     with pytest.raises(UserError, match=says):
         load_walls(tmp_path / "walls.csv")
+
+
+def test_a_receiver_on_a_wall_is_not_behind_it(rng):
+    """On a slanted wall, in single and in double precision."""
+    ends = rng.uniform(0, 5, (1, 2, 2))
+    wall, share = Walls(ends, np.ones(1)), rng.uniform(0.1, 0.9, (200, 1))
+    on = ends[0, 0] + share * (ends[0, 1] - ends[0, 0])
+    tx = rng.uniform(-5, 10, (200, 2))
+    assert not crossings(wall, tx, on).any()
+    single = [jnp.asarray(a, jnp.float32) for a in (tx, on)]
+    assert not crossings(jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), wall), *single).any()

@@ -12,8 +12,8 @@ from flats import LAW, RECEIVERS, WALL, places, powers, walls_between
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.measured.floor_plan import NO_WALLS, Walls
-from wbgs_jax.measured.held_out import NINETY, kriging, scores
-from wbgs_jax.measured.power_map import LENGTH, MOST, Scales, learn_map, received_power
+from wbgs_jax.measured.held_out import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores
+from wbgs_jax.measured.power_map import LENGTH, MAX_PLACES, Scales, learn_map, received_power
 from wbgs_jax.measured.readings import Readings
 
 GUIDE = Path(__file__).parents[2] / "docs" / "measured.md"
@@ -86,7 +86,7 @@ def test_intervals_hold_nine_in_ten(rng):
         root = np.linalg.cholesky(scales.room**2 * np.exp(-distance / LENGTH) + 1e-6 * np.eye(200))
         local = powers(tx) + root @ rng.normal(size=(200, 3))
         heard = local + rng.normal(0, 1, local.shape)
-        learned = learn_map(readings(tx, heard).at(np.arange(180)), WALLS, scales)
+        learned = learn_map(readings(tx, heard).without(np.arange(200) >= 180), WALLS, scales)
         mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(tx[180:], jnp.float32)))
         held, total = held + (np.abs(mean - local[180:]) <= NINETY * std).sum(), total + mean.size
     assert 0.82 < held / total < 0.97, held / total
@@ -107,30 +107,47 @@ def test_gradients_point_to_more_power(rng):
 def test_walls_tell_about_rooms_that_were_not_measured(rng):
     tx = places(rng, 400)
     found = {score.held_out: score for score in scores(readings(tx, powers(tx, 2.0, rng)), WALLS)}
-    assert set(found) == {"room west", "room east", "blocks of 1 m"}
+    assert set(found) == {"room west", "room east", "squares of 1 m"}
     for room in ("room west", "room east"):
         score = found[room]
         assert score.error_db < 3 < score.rivals_db["log-distance"] + 1.5
         assert score.error_db < min(score.rivals_db.values()) + 0.3
         assert score.within > 0.8
-    assert found["blocks of 1 m"].error_db < found["blocks of 1 m"].rivals_db["inverse distance"] + 0.1
+    assert found["squares of 1 m"].error_db < found["squares of 1 m"].rivals_db["inverse distance"] + 0.1
 
 
-def test_kriging_of_one_place_is_its_power_there(rng):
-    tx = places(rng, 40)
+def test_rivals_where_nobody_was_heard(rng):
+    """Far from all that was heard kriging is the receiver's average, and so is everything of a receiver that heard nothing."""
+    tx = np.concatenate([places(rng, 40), places(rng, 5) + np.array([0, 0, 50.0])])
     heard = powers(tx)
-    known, asked = readings(tx, heard), readings(tx[:1], heard[:1])
-    near = kriging(known, asked)
-    away = kriging(known, dataclasses.replace(asked, places=asked.places + np.array([0, 0, 50.0])))
-    assert np.abs(near - heard[:1]).mean() < np.abs(away - heard[:1]).mean()
-    np.testing.assert_allclose(away[0], heard.mean(0), atol=1e-6)
+    heard[:, 2] = np.nan
+    known = readings(tx, heard).without(np.arange(45) >= 40)
+    told, average = heard[:40], np.nanmean(heard[:40])
+    for rival in (kriging, inverse_distance, log_distance):
+        assert np.isfinite(rival(known)).all()
+    np.testing.assert_allclose(kriging(known)[40:, :2], np.tile(told[:, :2].mean(0), (5, 1)), atol=1e-6)
+    assert np.abs(kriging(known)[:40, :2] - told[:, :2]).mean() < np.abs(told[:, :2].mean(0) - told[:, :2]).mean()
+    for rival in (kriging, inverse_distance):
+        np.testing.assert_allclose(rival(known)[:, 2], average)
+
+
+def test_squares_are_held_out_once_each(rng):
+    """Many squares are drawn together, and a square is never torn."""
+    for n, size in ((300, 1.0), (400, 10.0)):
+        tx = places(rng, n) * np.array([size, size, 1.0])
+        parts = folds(readings(tx, powers(tx)))
+        assert len(parts) <= FOLDS and (np.sum(parts, 0) == 1).all()
+        square = np.floor(tx[:, :2]).astype(int)
+        for part in parts:
+            inside = {tuple(own) for own in square[part]}
+            assert not inside & {tuple(own) for own in square[~part]}
 
 
 def test_what_cannot_be_learned_is_said(rng):
     tx = places(rng, 3)
     with pytest.raises(UserError, match="too few to learn from"):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
-    tx = places(rng, MOST + 1)
+    tx = places(rng, MAX_PLACES + 1)
     with pytest.raises(UserError, match="more than a map can hold"):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
 

@@ -78,3 +78,9 @@ def test_gradients_are_finite_over_the_band(cosine):
     grid = np.meshgrid([-3.0, 0.0, 3.0], [-12.0, 0.0, 11.5], [-7.0, -2.0, 0.0], np.geomspace(1e9, 1e11, 5))
     for found in gradient(*(jnp.asarray(g.ravel(), jnp.float32) for g in grid)):
         assert np.isfinite(found).all()
+
+
+def test_air_at_grazing_incidence_is_finite():
+    for cosine in (0.0, 1e-4, 1e-2):
+        found = slab_coefficients(jnp.asarray(cosine), jnp.asarray(1 + 0j), jnp.asarray(0.1), jnp.asarray(FREQUENCY))
+        assert np.isfinite(np.array(found)).all()

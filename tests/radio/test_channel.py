@@ -35,6 +35,7 @@ def test_two_paths():
 def test_one_path_and_none():
     assert k_factor_db(arrivals([[1e-6, 0]], [[3, 4]])) > 150
     assert delay_spread_s(arrivals([[0.0, 0.0]], [[3, 4]])) == 0
+    np.testing.assert_array_equal(channel.angular_spread_deg(arrivals([0.0, 0.0], [3, 4])), 0)
 
 
 def test_correlation_is_blind_to_phase_and_scale(rng):

@@ -12,6 +12,8 @@ from jaxtyping import Array, Complex, Float
 
 _SINE = tuple((-1) ** (power // 2) * (2 * math.pi) ** power / math.factorial(power) for power in range(1, 13, 2))
 """Taylor series of sin(2 pi y) in y, y^3, ..., y^11: enough for single precision up to a quarter of a turn."""
+SMALLEST = 1e-12
+"""Size of complex numbers that stand for 0."""
 
 
 @jax.custom_jvp
@@ -46,6 +48,8 @@ def quotient(a: Complex[Array, "*#n"], b: Complex[Array, "*#n"]) -> Complex[Arra
 
 
 def root(z: Complex[Array, "*n"]) -> Complex[Array, "*n"]:
-    """Returns the square root of numbers whose real part is positive, and whose |z|^2 single precision knows."""
-    real = jnp.sqrt(0.5 * (jnp.sqrt(z.real * z.real + z.imag * z.imag) + z.real))
+    """Returns the square root of numbers whose real part is not negative, and whose |z|^2 single precision knows; finite at 0,
+    with its gradient."""
+    size = jnp.sqrt(jnp.maximum(z.real * z.real + z.imag * z.imag, SMALLEST**2))
+    real = jnp.sqrt(0.5 * (size + jnp.maximum(z.real, 0)))
     return jax.lax.complex(real, 0.5 * z.imag / real)

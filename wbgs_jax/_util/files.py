@@ -1,10 +1,12 @@
 """Files that are either whole or absent: written under a temporary name beside the target, then renamed."""
 
 import contextlib
+import csv
+import io
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,6 +36,14 @@ def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
                 f"cannot write {path}: {error.strerror or error}; free some space or choose another folder"
             ) from error
         raise
+
+
+def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
+    """Writes rows, a header first, as a CSV file, atomically."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    with atomic_write(path) as stream:
+        stream.write(text.getvalue().encode())
 
 
 def write_json(path: Path | str, value: Any) -> None:

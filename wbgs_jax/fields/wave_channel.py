@@ -108,7 +108,7 @@ def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, freque
 def _snapshots(
     params: WaveParams, plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]
 ) -> Complex[Array, "b elements"]:
-    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f, params.curved))(arrived, frequency_hz)
+    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
 
 
 def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
@@ -137,7 +137,7 @@ def path_covariances(
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
         gradient = jnp.concatenate([length_gradient(some, plan.search, movers) for some in (paths.specular, paths.diffracted)])
         left = coherence(gradient, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
-        covariance = covariance_from_paths(arrived, plan.receiver, f, left, params.curved)
+        covariance = covariance_from_paths(arrived, plan.receiver, f, left)
         trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
         return covariance / trace, trace / len(covariance) * strongest**2
 
@@ -175,7 +175,8 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
             gain = gain * phasor(-turns)
         assert one.polarised is not None, "paths that were traced have it"
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
-    return Arrivals(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+    joined: Any = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    return joined._replace(curved=params.curved)
 
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:

@@ -3,9 +3,6 @@
 What a coherent field knows of a link beyond what its receiver's array sees of it, asked for transmitters at frequencies.
 """
 
-import csv
-import io
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.inference.predictor import Trained, observe_queries
@@ -50,7 +46,7 @@ def ask_paths(
 
     Angles of arrival are in the receiver's frame, those of departure in the world's, zenith 0 upwards. Amplitudes are relative
     to the transmitted one, carrier phase included: what an element of the array sees, and what isotropic elements would see
-    that are polarised along theta-hat and phi-hat.
+    that are polarised along theta-hat and phi-hat. They add up to the snapshot where waves are plane.
 
     Args:
         trained: the field.
@@ -91,9 +87,9 @@ def names_of(dataset: Dataset) -> tuple[str, ...]:
 def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], names: tuple[str, ...]) -> dict[str, np.ndarray]:
     power = np.asarray(decibels(jnp.asarray(np.abs(found.amplitude) ** 2)))
     order = np.argsort(-power, kind="stable")
-    order = order[np.abs(found.amplitude[order]) > 0]
+    order = order[(np.abs(found.polarised[order]) > 0).any(-1)]
     columns: dict[str, np.ndarray] = {name: np.full(len(order), value) for name, value in link.items()}
-    columns["meets"] = np.array([_words(found.interaction[i], found.material[i], names) for i in order], dtype=np.str_)
+    columns["interactions"] = np.array([_words(found.interaction[i], found.material[i], names) for i in order], dtype=np.str_)
     columns["length_m"] = found.length[order]
     columns["delay_ns"] = found.length[order] / SPEED_OF_LIGHT * 1e9
     for end, direction in (("arrival", found.direction), ("departure", found.departure)):
@@ -131,7 +127,7 @@ def ask_response(
     Every frequency of the band is asked for by itself, so materials may change over it.
 
     Raises:
-        UserError: the field knows no phases.
+        UserError: the field knows no paths.
     """
     check_paths(trained)
     offsets = (np.arange(points) - points // 2) * band_hz / points
@@ -158,7 +154,7 @@ def ask_mimo(
 ) -> dict[str, np.ndarray]:
     """Returns the matrix between all elements of the receiver and M of each transmitter, (tx, freq, elements, m).
 
-    `tx_elements` are in wavelengths around the transmitter's position, world frame, isotropic like the one they replace.
+    `tx_elements` are in wavelengths around the transmitter's position, world frame; each is like the antenna it replaces.
 
     Raises:
         UserError: the field knows no paths.
@@ -177,12 +173,10 @@ def _matrix(field: Field, params: Any, plan: Any, query: Query, receiver: Receiv
     return mimo_matrix(found, receiver, query.frequency_hz[0], elements)
 
 
-def write_csv(path: Path, table: dict[str, np.ndarray]) -> None:
-    """Writes columns of one length as a CSV file; numbers with seven digits."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table)
-    for row in zip(*table.values(), strict=True):
-        writer.writerow([f"{value:.7g}" if isinstance(value, np.floating) else value for value in row])
-    with atomic_write(path) as stream:
-        stream.write(text.getvalue().encode())
+def as_rows(table: dict[str, np.ndarray]) -> list[list[Any]]:
+    """Returns columns of one length as rows with a header; numbers have seven digits."""
+    body = [
+        [f"{value:.7g}" if isinstance(value, np.floating) else value for value in row]
+        for row in zip(*table.values(), strict=True)
+    ]
+    return [list(table), *body]

@@ -148,7 +148,8 @@ def _observe(
     field: Field, params: Any, plan: Any, cache: Any, links: Links, neighbours: Neighbours | None, quantity: str | None
 ) -> Any:
     seen = field.render_links(params, plan, cache, links)
-    return getattr(seen, quantity) if quantity else seen._replace(pas=correct(neighbours, seen.pas, links.query))
+    seen = seen._replace(pas=correct(neighbours, seen.pas, links.query))
+    return getattr(seen, quantity) if quantity else seen
 
 
 def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:

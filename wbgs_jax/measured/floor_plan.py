@@ -13,13 +13,14 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float
 
-from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.measured.readings import numbers, read_table
+from wbgs_jax.measured.readings import check_positions, numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
 PARALLEL = 1e-9
 """Square metres: what is smaller crosses nothing."""
+ON_WALL = 1e-2
+"""Metres: what is as near to a wall is on it, and the wall not in its way."""
 
 
 @pytree
@@ -49,8 +50,7 @@ def load_walls(path: Path) -> Walls:
     header, rows = read_table(path)
     form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
     values = numbers(path, header, rows, list(form.columns))
-    if not np.isfinite(values).all():
-        raise UserError(f"{path} has empty cells; every corner needs its coordinates in metres")
+    check_positions(f"{path}: corners", values)
     ends = values.reshape(-1, 2, 2) if form is SEGMENTS else np.stack([values, np.roll(values, -1, 0)], 1)
     return Walls(ends, np.full(len(ends), form.share))
 
@@ -63,13 +63,16 @@ def namespace(array: Any) -> Any:
 def crossings(
     walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
 ) -> Float[Array | np.ndarray, "*#n"]:
-    """Returns how many walls stand between points of the plan; the outline's face that a point lies on does not count."""
+    """Returns how many walls stand between points of the plan; one that a point lies on does not count."""
     xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
     ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
     ground = _cross(ray, along)
     safe = xp.where(xp.abs(ground) < PARALLEL, 1.0, ground)
     on_ray, on_wall = _cross(corner, along) / safe, _cross(corner, ray) / safe
-    hit = (xp.abs(ground) >= PARALLEL) & (on_ray > 0) & (on_ray < 1) & (on_wall >= 0) & (on_wall < 1)
+    long = xp.sqrt(xp.sum(along**2, -1))
+    apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # of the ends, across the wall
+    near = xp.minimum(on_ray, 1 - on_ray) * apart  # of the nearer one from it
+    hit = (xp.abs(ground) >= PARALLEL) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
     return xp.sum(xp.where(hit, walls.share, 0.0), -1)
 
 

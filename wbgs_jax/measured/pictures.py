@@ -20,8 +20,9 @@ SHOWN = 12
 COLUMNS = 3
 
 
-def draw(learned: PowerMap, walls: Walls, cells: Readings, height: float) -> Figure:
-    """Returns a figure with the map of every receiver: mean received power at one height, walls, and where was measured."""
+def draw(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
+    """Returns a figure with the map of every receiver at the median height of what was measured, walls, and the cells."""
+    height = float(np.median(cells.places[:, 2]))
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
     low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
     spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / PIXELS)))
@@ -44,7 +45,7 @@ def draw(learned: PowerMap, walls: Walls, cells: Readings, height: float) -> Fig
         axis.set_title(f"receiver {r + 1}", fontsize=10)
     figure.supxlabel("x [m]", fontsize=9)
     figure.supylabel("y [m]", fontsize=9)
-    figure.colorbar(image, ax=axes, shrink=0.8, label="mean received power [dBm]")
+    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
     return figure
 
 

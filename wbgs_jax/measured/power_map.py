@@ -35,10 +35,10 @@ APART = 5.0
 """... whose error has this standard deviation (dB)."""
 NEAREST = 0.1
 """Metres: nearer transmitters are that far away."""
-MOST = 1500
-"""Places that a map remembers."""
-HEARD = 10
-"""Means below which there is nothing to learn from."""
+MAX_PLACES = 1500
+"""Places that a map holds."""
+MIN_POWERS = 10
+"""Powers below which there is nothing to learn from."""
 LENGTH = 1.0
 """Metres over which u and v fall to 1/e. It is not learned: what is most likely in one room is longer, and says wrong things
 about the next."""
@@ -86,7 +86,7 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
     """Returns the map that follows from means of readings (`readings.cell_means`), in float32.
 
     Args:
-        readings: at most `MOST` places.
+        readings: at most `MAX_PLACES` places.
         walls: of the floor plan.
         scales: of what the law leaves; by default they are learned.
 
@@ -94,10 +94,10 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
         UserError: too few powers, or too many places.
     """
     heard = np.isfinite(readings.powers)
-    if heard.sum() < HEARD:
-        raise UserError(f"{int(heard.sum())} powers are too few to learn from; there must be {HEARD}")
-    if len(readings.places) > MOST:
-        raise UserError(f"{len(readings.places)} places are more than a map can hold ({MOST}); average over larger cells")
+    if heard.sum() < MIN_POWERS:
+        raise UserError(f"{int(heard.sum())} powers are too few to learn from; there must be {MIN_POWERS}")
+    if len(readings.places) > MAX_PLACES:
+        raise UserError(f"{len(readings.places)} places are more than a map can hold ({MAX_PLACES}); average over larger cells")
     law_features = _law_features(readings.places, readings.receivers, walls)
     law, covariance = _law(readings, law_features)
     left = np.where(heard, readings.powers - law_features @ law, 0)
@@ -108,7 +108,7 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
     for r in range(len(readings.receivers)):
         own = np.flatnonzero(heard[:, r])
         k = _covariance(scales, readings.places[own], root_walls[own, r])
-        k[np.diag_indices(len(own))] += _noise(scales, readings.counts[own, r])
+        k[np.diag_indices(len(own))] += noise(scales, readings.counts[own, r])
         factor = np.linalg.cholesky(k)
         weights[r, own] = cho_solve((factor, True), left[own, r])
         roots[r][np.ix_(own, own)] = solve_triangular(factor, np.eye(len(own)), lower=True)
@@ -121,11 +121,8 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     mean may be off, not how far a single reading is. Pure; for `jit`, `vmap` and `grad`."""
     features = _law_features(tx_position, learned.receivers, learned.walls)
     room, wall = learned.scales[:2]
-    separation = tx_position[:, None] - learned.places
-    distance = jnp.sqrt(jnp.sum(separation**2, -1) + 1e-12)  # with a gradient at places that were measured
-    alike = jnp.exp(-distance / LENGTH)[:, None]
     walls = -features[..., 2]
-    k = alike * (room**2 + wall**2 * walls[..., None] * learned.features.T)
+    k = alike(tx_position, learned.places)[:, None] * (room**2 + wall**2 * walls[..., None] * learned.features.T)
     mean = features @ learned.law + jnp.einsum("brn,rn->br", k, learned.weights)
     known = jnp.sum(jnp.einsum("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
     of_law = jnp.einsum("bri,ij,brj->br", features, learned.law_covariance, features)
@@ -133,16 +130,31 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     return mean, jnp.sqrt(jnp.maximum(variance, 0))
 
 
+def distances(a: Any, b: Any) -> Any:
+    """Returns how far places (n, 3) are from others (m, 3): (n, m), metres, with a gradient where it is none."""
+    return namespace(a).sqrt(namespace(a).sum((a[:, None] - b) ** 2, -1) + 1e-12)
+
+
+def alike(a: Any, b: Any) -> Any:
+    """Returns the correlation (n, m) of what the law leaves at places (n, 3) and at others (m, 3)."""
+    return namespace(a).exp(-distances(a, b) / LENGTH)
+
+
+def noise(scales: Scales, counts: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Returns the variance (dB^2) of means of so many readings around what is a function of the place."""
+    return scales.place**2 + scales.reading**2 / counts
+
+
 def _law_features(tx: Any, receivers: Any, walls: Walls) -> Any:
     """Returns (b, r, 3): what the law's three numbers are multiplied by."""
     xp = namespace(tx)
-    distance = xp.sqrt(xp.maximum(xp.sum((tx[:, None] - receivers) ** 2, -1), NEAREST**2))
+    distance = xp.maximum(distances(tx, receivers), NEAREST)
     between = crossings(walls, tx[:, None, :2], receivers[None, :, :2])
     root = xp.sqrt(xp.where(between > 0, between, 1.0)) * (between > 0)
     return xp.stack([xp.ones_like(distance), -10 * xp.log10(distance), -root], -1)
 
 
-def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
     _, square = np.unique(np.floor(readings.places / ALIKE).astype(int), axis=0, return_inverse=True)
     heard = np.isfinite(readings.powers)
@@ -156,14 +168,11 @@ def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[np.n
     return LAW + covariance @ np.einsum("nri,nr,nr->i", features, weights, left), covariance
 
 
-def _covariance(scales: Scales, places: Float[np.ndarray, "n 3"], root_walls: Float[np.ndarray, " n"]) -> np.ndarray:
+def _covariance(
+    scales: Scales, places: Float[np.ndarray, "n 3"], root_walls: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n n"]:
     """Returns the covariance of what the law leaves at one receiver."""
-    distance = np.sqrt(np.sum((places[:, None] - places) ** 2, -1))
-    return np.exp(-distance / LENGTH) * (scales.room**2 + scales.wall**2 * np.outer(root_walls, root_walls))
-
-
-def _noise(scales: Scales, counts: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return scales.place**2 + scales.reading**2 / counts
+    return alike(places, places) * (scales.room**2 + scales.wall**2 * np.outer(root_walls, root_walls))
 
 
 def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left: Float[np.ndarray, "n r"]) -> Scales:
@@ -179,7 +188,7 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
     def surprise(logs: np.ndarray) -> float:
         scales, total = Scales(*np.exp(logs)), 0.5 * np.sum(((logs - first) / WIDTH) ** 2)
         for places, walls, values, counts in chosen:
-            k = _covariance(scales, places, walls) + np.diag(_noise(scales, counts))
+            k = _covariance(scales, places, walls) + np.diag(noise(scales, counts))
             factor = cho_factor(k, lower=True)
             total += 0.5 * values @ cho_solve(factor, values) + np.sum(np.log(np.diag(factor[0])))
         return float(total)

@@ -1,11 +1,12 @@
-"""Readings of received power from many places, of several fixed receivers: in from folders, out as means of cells.
+"""Readings of received power at several fixed receivers from many places, read from folders and averaged over cells.
 
     readings.csv (or calibration.csv)   x,y[,z][,room], then one column a receiver, dBm: rssi_1,rssi_2,... ; empty: not received
     receivers.csv (or anchors.csv)      id,x,y,z, in the order of those columns
     walls.csv (or layout.csv)           optional; floor_plan.py
 
 or as NeRF2 publishes received powers of Bluetooth gateways: tx_pos.csv (x,y,z), gateway_position.yml (name: [x, y, z]) and
-gateway_rssi.csv (one column a gateway; -100: not received). Metres and one frame throughout.
+gateway_rssi.csv (one column a gateway; -100: not received). Metres and one frame throughout. Headers may be in capitals.
+Columns of powers that end in the receivers' ids may stand in any order; others stand in that of the receivers.
 """
 
 import csv
@@ -16,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
 
 READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
 NERF2 = ("tx_pos.csv", "gateway_position.yml", "gateway_rssi.csv")
 NERF2_NOT_RECEIVED = -100.0
-MOST_POWER = 100.0
-"""dBm, and the other way as little: beyond it numbers are no powers."""
+POWERS_DBM = (-200.0, 50.0)
+"""Beyond it numbers are no powers; +100 often stands for nothing."""
 FURTHEST = 1e4
 """Metres."""
 
@@ -44,12 +45,9 @@ class Readings:
     receivers: Float[np.ndarray, "r 3"]
     """Metres."""
 
-    def at(self, chosen: np.ndarray) -> "Readings":
-        """Returns some of the places, by index or mask."""
-        rooms = tuple(np.array(self.rooms, object)[chosen])
-        return dataclasses.replace(
-            self, places=self.places[chosen], powers=self.powers[chosen], counts=self.counts[chosen], rooms=rooms
-        )
+    def without(self, places: Bool[np.ndarray, " n"]) -> "Readings":
+        """Returns them as if nothing had been received from some of the places."""
+        return dataclasses.replace(self, powers=np.where(places[:, None], np.nan, self.powers))
 
 
 def load_readings(folder: Path, height: float) -> Readings:
@@ -70,7 +68,7 @@ def load_readings(folder: Path, height: float) -> Readings:
 
 
 def found(folder: Path, names: tuple[str, ...]) -> Path:
-    """Returns the first of some files that there is; none is a `UserError`."""
+    """Returns the first of these files that exists; none is a `UserError`."""
     for name in names:
         if (folder / name).exists():
             return folder / name
@@ -78,18 +76,24 @@ def found(folder: Path, names: tuple[str, ...]) -> Path:
 
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Returns the header and the rows of a CSV file, every row as long as the header."""
+    """Returns the header of a CSV file in small letters, and its rows, all of one length."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [[cell.strip() for cell in row] for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+            reader = csv.reader(stream)
+            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path} cannot be read: {error}") from None
     if len(lines) < 2:
         raise UserError(f"{path} has no rows below its header")
-    for number, row in enumerate(lines[1:], 2):
-        if len(row) != len(lines[0]):
-            raise UserError(f"{path}, row {number} has {len(row)} cells, the header {len(lines[0])}")
-    return lines[0], lines[1:]
+    header = [name.lower() for name in lines[0][1]]
+    if len(header) == 1 and ";" in header[0]:
+        raise UserError(f"{path} has ';' between its cells; separate them by commas")
+    if len(set(header)) < len(header):
+        raise UserError(f"{path} names two columns alike: {', '.join(header)}")
+    for number, row in lines[1:]:
+        if len(row) != len(header):
+            raise UserError(f"{path}, line {number} has {len(row)} cells, the header {len(header)}")
+    return header, [row for _, row in lines[1:]]
 
 
 def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[str]) -> Float[np.ndarray, "n k"]:
@@ -102,17 +106,23 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
             try:
                 values[i, k] = float(row[column]) if row[column] else np.nan
             except ValueError:
-                raise UserError(f"{path}, row {i + 2}: {row[column]!r} is no number") from None
+                hint = "leave cells empty where nothing was received"
+                raise UserError(f"{path}, row {i + 1}: {row[column]!r} is no number; {hint}") from None
     return values
 
 
 def _load_tables(folder: Path, height: float) -> Readings:
     path, of_receivers = found(folder, READINGS), found(folder, RECEIVERS)
-    receivers = numbers(of_receivers, *read_table(of_receivers), ["x", "y", "z"])
+    names, entries = read_table(of_receivers)
+    receivers = numbers(of_receivers, names, entries, ["x", "y", "z"])
     header, rows = read_table(path)
     powers = [name for name in header if name not in ("x", "y", "z", "room")]
     if len(powers) != len(receivers):
-        raise UserError(f"{path} has {len(powers)} columns of powers, {of_receivers} {len(receivers)} receivers")
+        raise UserError(
+            f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} {len(receivers)} receivers"
+        )
+    if "id" in names:
+        powers = _in_order(powers, [entry[names.index("id")].lower() for entry in entries])
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
@@ -121,13 +131,20 @@ def _load_tables(folder: Path, height: float) -> Readings:
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers)
 
 
+def _in_order(columns: list[str], ids: list[str]) -> list[str]:
+    """Returns columns in the order of the receivers whose ids they end in; as they are, where they do not."""
+    by_id = {column.rsplit("_", 1)[-1]: column for column in columns}
+    return [by_id[name] for name in ids] if sorted(by_id) == sorted(ids) else columns
+
+
 def _load_nerf2(folder: Path) -> Readings:
     tx, gateways, heard = (found(folder, (name,)) for name in NERF2)
     places = numbers(tx, *read_table(tx), ["x", "y", "z"])
     try:
         entries = yaml.safe_load(gateways.read_text(encoding="utf-8"))
-        receivers = np.array([[float(value) for value in position] for position in entries.values()])
-    except (OSError, ValueError, TypeError, AttributeError, yaml.YAMLError):
+        found_at = [entry["position"] if isinstance(entry, dict) else entry for entry in entries.values()]
+        receivers = np.array([[float(value) for value in position] for position in found_at])
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
         raise UserError(f"{gateways} does not list positions; write 'gateway1: [x, y, z]' for each") from None
     header, rows = read_table(heard)
     values = numbers(heard, header, rows, header)
@@ -141,31 +158,37 @@ def _load_nerf2(folder: Path) -> Readings:
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:
-    """Returns readings whose positions and powers can be ones."""
-    for name, values in (("places", readings.places), ("receivers", readings.receivers)):
-        if not (np.abs(values) < FURTHEST).all():
-            raise UserError(f"{folder}: {name} must be numbers of metres, each nearer than {FURTHEST:g} m to the origin")
-    heard = readings.powers[np.isfinite(readings.powers)]
+    """Returns readings whose positions and powers are plausible."""
+    check_positions(f"{folder}: places", readings.places)
+    check_positions(f"{folder}: receivers", readings.receivers)
+    heard = readings.powers[~np.isnan(readings.powers)]
     if not len(heard):
         raise UserError(f"{folder}: nothing was received anywhere")
-    if np.isinf(readings.powers).any() or not (np.abs(heard) <= MOST_POWER).all():
-        raise UserError(f"{folder}: powers must be dBm, between {-MOST_POWER:g} and {MOST_POWER:g}")
+    if not ((heard >= POWERS_DBM[0]) & (heard <= POWERS_DBM[1])).all():
+        span = " to ".join(f"{power:g}" for power in POWERS_DBM)
+        raise UserError(f"{folder}: powers must be dBm, {span}; leave cells empty where nothing was received")
     return readings
+
+
+def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
+    """Raises a `UserError` for positions that are none."""
+    if not (np.abs(positions) < FURTHEST).all():
+        raise UserError(f"{what} must be numbers of metres, each nearer than {FURTHEST:g} m to the origin")
 
 
 def cell_means(readings: Readings, size: float) -> Readings:
     """Returns the means (of dBm) over cubic cells: what is left when fading is averaged. A cell stands where its readings were
-    taken on average, and in the room in which most of them were."""
-    _, cell = np.unique(np.floor(readings.places / size).astype(int), axis=0, return_inverse=True)
-    cell, n = cell.reshape(-1), int(cell.max()) + 1
+    taken on average; one that reaches into two rooms is two."""
+    names, room = np.unique(np.array(readings.rooms), return_inverse=True)
+    cubes = np.column_stack([np.floor(readings.places / size).astype(int), room.reshape(-1)])
+    cubes, cell = np.unique(cubes, axis=0, return_inverse=True)
+    cell, n = cell.reshape(-1), len(cubes)
     heard = np.isfinite(readings.powers)
     counts = _sums(cell, n, np.where(heard, readings.counts, 0))
     totals = _sums(cell, n, np.where(heard, readings.counts * np.nan_to_num(readings.powers), 0))
     powers = np.where(counts > 0, totals / np.maximum(counts, 1), np.nan)
     places = _sums(cell, n, readings.places) / np.bincount(cell)[:, None]
-    names, number = np.unique(np.array(readings.rooms), return_inverse=True)
-    most = np.argmax(_sums(cell, n, np.eye(len(names))[number.reshape(-1)]), 1)
-    return Readings(places, powers, counts, tuple(names[most].tolist()), readings.receivers)
+    return Readings(places, powers, counts, tuple(names[cubes[:, -1]].tolist()), readings.receivers)
 
 
 def _sums(cell: Int[np.ndarray, " m"], n: int, values: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "n k"]:
@@ -177,7 +200,7 @@ def _sums(cell: Int[np.ndarray, " m"], n: int, values: Float[np.ndarray, "m k"])
 def attribution(folder: Path) -> list[str]:
     """Returns the paragraphs of a folder's README that say whose data they are, and on what terms."""
     path = folder / "README.md"
-    if not path.exists():
+    if not path.is_file():
         return []
     paragraphs = re.split(r"\n\s*\n", path.read_text(encoding="utf-8", errors="replace"))
     terms = re.compile(r"licen[cs]e|\bdoi\b|copyright|CC BY", re.IGNORECASE)

@@ -112,7 +112,7 @@ def _materials(paths: Paths, search: Search) -> Int[Array, "k 5"]:
 
 
 def element_voltages(
-    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float = 0.0
+    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
 ) -> Complex[Array, "k elements"]:
     """Returns what every path alone gives every element.
 
@@ -121,8 +121,10 @@ def element_voltages(
         receiver: whose elements it is received with.
         frequency_hz: of the carrier; it matters to elements whose positions are in metres.
         curved: 0 for plane waves; 1 for spheres around mirrored sources, which are as far away as the path is long. A wave off
-            an edge is curved more than that across the edge.
+            an edge is curved more than that across the edge. By default what the arrivals say, else plane.
     """
+    if curved is None:
+        curved = 0.0 if arrived.curved is None else arrived.curved
     positions = receiver.element_wavelengths(frequency_hz)
     plane = arrived.amplitude[:, None] * steering_vector(positions, arrived.direction)
     metres, far = positions * (SPEED_OF_LIGHT / frequency_hz), jnp.maximum(arrived.length, SHORTEST)[:, None]
@@ -135,7 +137,7 @@ def element_voltages(
 
 
 def snapshots_from_paths(
-    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float = 0.0
+    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
 ) -> Complex[Array, " elements"]:
     """Returns the complex voltages of the receiver's elements, all paths together; `jax.vmap` takes more transmitters.
     Arguments are those of `element_voltages`."""
@@ -147,7 +149,7 @@ def mimo_matrix(
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     tx_elements: Float[Array, "m 3"],
-    curved: Float[Array, ""] | float = 0.0,
+    curved: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "elements m"]:
     """Returns the voltages of the receiver's elements by each of M elements of the transmitter, alike and seeing plane waves.
 
@@ -165,7 +167,7 @@ def covariance_from_paths(
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     coherence: Float[Array, "k k"],
-    curved: Float[Array, ""] | float = 0.0,
+    curved: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "elements elements"]:
     """Returns the mean product y y^H of the snapshots of a transmitter whose K paths are partially coherent.
 

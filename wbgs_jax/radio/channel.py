@@ -32,6 +32,8 @@ class Arrivals(NamedTuple):
     """What the wave meets, in its order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
     material: Int[Array, "*b k 5"] | None = None
     """Index of the material that it meets there; -1 beyond the last."""
+    curved: Float[Array, "*b"] | None = None
+    """1 where waves reach the array as spheres, 0 where they are plane (`propagation.transport.element_voltages`)."""
 
 
 FAINTEST = 1e-30
@@ -95,16 +97,17 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
 
 
 def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
-    """Returns the spreads of azimuth and zenith of arrival in the receiver's frame (degrees), weighted by power (3GPP TR
-    38.901, annex A)."""
+    """Returns the spreads of azimuth and zenith of arrival (in this order) in the receiver's frame, degrees, weighted by power
+    (3GPP TR 38.901, annex A); 0 where nothing arrives."""
     power = squared_magnitude(arrivals.amplitude)
-    weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
+    total = jnp.sum(power, -1, keepdims=True)
+    weight = power / jnp.maximum(total, SMALLEST)
     x, y, z = jnp.moveaxis(arrivals.direction, -1, 0)
     level = jnp.sqrt(jnp.maximum(x * x + y * y, SMALLEST))
     unit = jnp.stack([jnp.stack([x / level, y / level], -1), jnp.stack([z, level], -1)], -3)  # (*b, 2, k, 2)
     mean = jnp.sum(weight[..., None, :, None] * unit, -2)
     length = jnp.clip(jnp.sum(mean**2, -1), SMALLEST, 1.0)
-    return jnp.degrees(jnp.sqrt(-jnp.log(length)))
+    return jnp.where(total > 0, jnp.degrees(jnp.sqrt(-jnp.log(length))), 0.0)
 
 
 def doppler_hz(

@@ -128,7 +128,7 @@ def normal_equations(
         arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[place])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
-        voltages = element_voltages(arrived, plan.receiver, frequency, params.curved)
+        voltages = element_voltages(arrived, plan.receiver, frequency)
         lengths = _jacobian(cache, paths, len(motion.shift)).astype(voltages.dtype)
         changes = -1j * wavenumber * jnp.matmul(voltages.T, lengths, precision=EXACT)
         changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))
