@@ -105,7 +105,7 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
 
         return score
 
-    monkeypatch.setattr(search_module, "make_scores", scores)
+    monkeypatch.setattr("wbgs_jax.training.scores.make_scores", scores)
     monkeypatch.setattr(search_module, "search_idealisations", lambda params, *_: (params, {}))
     run.control()
     count = len(PARTS)

@@ -25,9 +25,9 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.adjustment import adjust
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.descent import descend
-from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
-from wbgs_jax.training.scores import Compared, Scores, make_scores, surely_better
+from wbgs_jax.training.scores import Compared, Told, surely_better
+from wbgs_jax.training.thicknesses import search_slabs
 from wbgs_jax.types import Links
 
 SPREAD = 0.05
@@ -76,29 +76,28 @@ class Place:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """Some training spectra, and what they say of a place."""
+class _Heard:
+    """Some training spectra, and what they say of places."""
 
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
     config: SearchConfig
     rng: np.random.Generator
 
-    def scores(self, now: Place, count: int, compared: Compared) -> Scores:
-        """Returns the function that scores candidates for a place's parameters on a few of them, drawn anew."""
-        chosen = self.rng.choice(self.spectra, min(count, len(self.spectra)), replace=False)
-        return make_scores(now.field, now.cache, self.data, jnp.asarray(chosen), compared)
+    def told(self, now: Place) -> Told:
+        """Returns what they say of a place, in an order drawn anew."""
+        return Told(now.field, now.cache, self.data, self.rng.permutation(self.spectra))
 
     def named(self, now: Place, rounds: int, compared: Compared = "covariances") -> Place:
         """Names the materials: as far as places are believed, or as if all of them were known."""
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
         once = dataclasses.replace(self.config, rounds=rounds)
-        params, _ = search_materials(now.params, self.scores(now, count, compared), once)
+        params, _ = search_slabs(now.params, self.told(now), once, count, compared)
         return dataclasses.replace(now, params=params)
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
         """Believes places as far as spectra say."""
-        params, _ = search_placement(now.params, self.scores(now, self.config.placement_spectra, compared))
+        params, _ = search_placement(now.params, self.told(now).scores(self.config.placement_spectra, compared))
         return dataclasses.replace(now, params=params)
 
 
@@ -111,46 +110,46 @@ def learn_geometry(
     some_tx = rng.permutation(np.unique(tx[train]))[: config.geometry_tx]
     own = train[np.isin(tx[train], some_tx)]
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
-    told, told_by_all = _Told(data, own, config, rng), _Told(data, train, config, rng)
+    heard, all_heard = _Heard(data, own, config, rng), _Heard(data, train, config, rng)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
-    start = told.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds)
-    field, params = _followed(start, told, links, named=True)
+    start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds)
+    field, params = _followed(start, heard, links, named=True)
     now = _traced(field, _fresh(params, place.params), data.links, data)
-    now = told_by_all.named(told_by_all.guessed(now), 1)
-    moved = [now, told_by_all.named(now, config.rounds, "snapshots")]
+    now = all_heard.named(all_heard.guessed(now), 1)
+    moved = [now, all_heard.named(now, config.rounds, "snapshots")]
     if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
-        field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), told, links, named=False)
-        moved.append(told_by_all.named(_traced(field, params, data.links, data), 1, "snapshots"))
-    return _judged(place, moved, told_by_all)
+        field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, named=False)
+        moved.append(all_heard.named(_traced(field, params, data.links, data), 1, "snapshots"))
+    return _judged(place, moved, all_heard)
 
 
-def _followed(now: Place, told: _Told, links: Links, named: bool) -> tuple[Any, Any]:
+def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> tuple[Any, Any]:
     """Returns the field with things moved as spectra say, from low frequencies to high ones, and its parameters. Paths are
     traced again on the way, and materials named, if they are.
 
     Args:
         now: with the paths of the transmitters of `links`.
-        told: what their spectra say.
+        heard: what their spectra say.
         links: of which paths are traced.
         named: whether materials are named.
     """
-    data, config, frequency = told.data, told.config, np.asarray(told.data.links.query.frequency_hz)[told.spectra]
+    data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
     for highest in np.unique(frequency):
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _traced(now.field.moved(motion), now.params, links, data), none
-            now = told.named(now, 1) if named else now
+            now = heard.named(now, 1) if named else now
             traced_at = float(highest)
         now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
-        pool = told.spectra[frequency <= highest * (1 + 1e-6)]
+        pool = heard.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, known = config.geometry_snapshots, (motion, covariance, widths)
-            motion, covariance = adjust(now.field, now.params, now.cache, *known, data, pool, count, told.rng)
+            motion, covariance = adjust(now.field, now.params, now.cache, *known, data, pool, count, heard.rng)
         else:
             count = config.geometry_steps
-            params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, told.rng)
+            params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
             now = dataclasses.replace(now, params=params)
     return now.field.moved(motion), now.params
 
@@ -161,17 +160,17 @@ def _widths(motion: Motion, shift: float) -> Motion:
     return Motion(**{name: jnp.full_like(getattr(motion, name), width) for name, width in far.items()})
 
 
-def _judged(place: Place, moved: list[Place], told: _Told) -> tuple[Place, GeometryReport]:
+def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, GeometryReport]:
     """Returns the best place, with its uncertainty. A moved one has to be surely better at what counts in the end, spectra: the
     likelihood of snapshots forgives a wrong mesh that is doubted enough."""
-    spectra = told.rng.choice(told.spectra, min(told.config.spectra, len(told.spectra)), replace=False)
-    as_it_was, *others = (told.guessed(one, "spectra") for one in (place, *moved))
+    spectra = heard.rng.choice(heard.spectra, min(heard.config.spectra, len(heard.spectra)), replace=False)
+    as_it_was, *others = (heard.guessed(one, "spectra") for one in (place, *moved))
     before, *after = (
-        make_scores(one.field, one.cache, told.data, jnp.asarray(spectra), "spectra")([one.params])[0]
+        Told(one.field, one.cache, heard.data, spectra).scores(compared="spectra")([one.params])[0]
         for one in (as_it_was, *others)
     )
     best = int(np.argmin([own.mean() for own in after]))
-    kept = surely_better(before - after[best], np.asarray(told.data.links.tx_index)[spectra], SURE)
+    kept = surely_better(before - after[best], np.asarray(heard.data.links.tx_index)[spectra], SURE)
     sizes = _sizes(others[best].field.motion)
     report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes)
     return others[best] if kept else as_it_was, report

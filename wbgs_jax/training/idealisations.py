@@ -9,12 +9,9 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from jaxtyping import Int
-
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.training.materials import search_materials
-from wbgs_jax.training.scores import Scores, surely_better
+from wbgs_jax.training.scores import Told, surely_better
+from wbgs_jax.training.thicknesses import search_slabs
 
 SURE = 3.0
 """As many standard errors over transmitters as a gain has to be sure by (`surely_better`)."""
@@ -32,21 +29,17 @@ class Idealisation:
     """Whether nature's is taken."""
 
 
-def search_idealisations(
-    params: Any,
-    score: Scores,
-    tx_index: Int[np.ndarray, " n"],
-    config: SearchConfig,
-) -> tuple[Any, dict[str, Idealisation]]:
+def search_idealisations(params: Any, told: Told, config: SearchConfig) -> tuple[Any, dict[str, Idealisation]]:
     """Returns parameters without the idealisations that spectra surely contradict; materials are named anew before walls are
     said to be thick."""
-    once, found = dataclasses.replace(config, rounds=1), {}
+    once, found, count = dataclasses.replace(config, rounds=1), {}, config.ideal_spectra
+    score, tx_index = told.scores(count), told.tx_index(count)
     for name in ("curved", "thick"):
         if float(getattr(params, name)):
             continue
         natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # training gives every array away once
         if name == "thick":
-            natural, _ = search_materials(natural, score, once)
+            natural, _ = search_slabs(natural, told, once, count)
         before, after = score([params, natural])
         dropped = surely_better(before - after, tx_index, SURE)
         found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)

@@ -9,7 +9,7 @@ look. Training goes on from there.
 """
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,8 @@ class SearchReport:
     """The same with the materials that were taken."""
     taken: dict[int, str]
     """Materials, and the entry that each of them got."""
+    thickness_mm: dict[int, float] = field(default_factory=dict)
+    """Thicknesses that were found for materials whose thickness the scene does not say."""
 
 
 def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[Any, SearchReport]:
@@ -59,7 +61,9 @@ def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[
     count = len(params.materials.slope)
     for turn in range(config.rounds * count):
         material = turn % count
-        entries = [dataclasses.replace(params, materials=m) for m in _entries(params.materials, material)]
+        entries = [
+            dataclasses.replace(params, materials=with_entry(params.materials, material, name)) for name in ITU_MATERIALS
+        ]
         likely = np.argsort(score(entries, config.glance).mean(1))[:SHORTLIST]
         candidates = [params, *(entries[i] for i in likely)]
         scores = score(candidates)
@@ -81,14 +85,12 @@ def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], e
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def _entries(materials: Any, material: int) -> list[Any]:
-    """Returns copies in which one material is one of ITU-R P.2040."""
-    return [
-        dataclasses.replace(
-            materials,
-            log_susceptibility=materials.log_susceptibility.at[material].set(np.log(permittivity - 1)),
-            log_conductivity=materials.log_conductivity.at[material].set(np.log(c)),
-            slope=materials.slope.at[material].set(d),
-        )
-        for permittivity, c, d in ITU_MATERIALS.values()
-    ]
+def with_entry(materials: Any, material: int, name: str) -> Any:
+    """Returns a copy in which one material is an entry of ITU-R P.2040; its thickness stays."""
+    permittivity, c, d = ITU_MATERIALS[name]
+    return dataclasses.replace(
+        materials,
+        log_susceptibility=materials.log_susceptibility.at[material].set(np.log(permittivity - 1)),
+        log_conductivity=materials.log_conductivity.at[material].set(np.log(c)),
+        slope=materials.slope.at[material].set(d),
+    )

@@ -2,6 +2,7 @@
 searches before a training, and the choices after it, compare."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -49,6 +50,30 @@ def make_scores(
         return np.asarray(_score(field, structure, differ, leaves, cache, data, spectra[:first], compared))
 
     return score
+
+
+@dataclass(frozen=True)
+class Told:
+    """Some training spectra of one receiver, and what they say of a field with the paths of their transmitters."""
+
+    field: Any
+    cache: Any
+    data: TrainingData
+    spectra: Int[np.ndarray, " n"]
+    """In the order in which they are looked at."""
+
+    def scores(self, count: int | None = None, compared: Compared = "snapshots", highest_hz: float = np.inf) -> Scores:
+        """Returns the function that scores candidates on the first of those up to a frequency."""
+        own = self.spectra[self.frequency_hz() <= highest_hz * (1 + 1e-6)][:count]
+        return make_scores(self.field, self.cache, self.data, jnp.asarray(own, jnp.int32), compared)
+
+    def frequency_hz(self) -> Float[np.ndarray, " n"]:
+        """Returns their frequencies."""
+        return np.asarray(self.data.links.query.frequency_hz)[self.spectra]
+
+    def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
+        """Returns the transmitters of the first of them."""
+        return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
 
 
 @partial(jax.jit, static_argnames=("structure", "differ", "compared"))

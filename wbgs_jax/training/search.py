@@ -8,20 +8,17 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.controls import Context, Edit
-from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.geometry import Place, learn_geometry
 from wbgs_jax.training.idealisations import search_idealisations
-from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
-from wbgs_jax.training.scores import Compared, Scores, make_scores
+from wbgs_jax.training.scores import Told
+from wbgs_jax.training.thicknesses import search_slabs
 
 SWEEPS = 2
 """Times that antennas are searched anew after materials are named, at most."""
@@ -54,60 +51,40 @@ class Search:
         config, data, cache = self.config, context.data, context.cache
         spectra = rng.choice(context.train, min(config.spectra, len(context.train)), replace=False)
         report: dict[str, Any] = {}
-        look = _Look(field, cache, data, spectra, config)
+        told = Told(field, cache, data, spectra)
         if config.antenna_rounds:
-            params, _ = look.antennas(params, report)
+            params, _ = self._antennas(params, told, report)
         if config.rounds:
-            params, named = search_materials(params, look.scores(), config)
+            params, named = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             for _ in range(SWEEPS):
-                params = look.idealisations(params, report)
-                params, changed = look.antennas(params, report) if config.antenna_rounds else (params, False)
+                params = self._idealisations(params, told, report)
+                params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
-                params, _ = search_materials(params, look.scores(config.ideal_spectra), config)
-            _, guessed = search_placement(params, look.scores(config.placement_spectra, "covariances"))
+                params, _ = search_slabs(params, told, config, config.ideal_spectra)
+            _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng)
                 report["geometry"] = dataclasses.asdict(moved)
                 params, field, cache = place.params, place.field, place.cache
-                look = dataclasses.replace(look, field=field, cache=cache)
-            params, guessed = search_placement(params, look.scores(config.placement_spectra, "spectra"))
+                told = Told(field, cache, data, spectra)
+            params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
             report["placement"] = dataclasses.asdict(guessed)
         return Edit(params, (), None, report, field, cache)
 
-
-@dataclass(frozen=True)
-class _Look:
-    """A look at some training spectra."""
-
-    field: Field
-    cache: Any
-    data: TrainingData
-    spectra: Int[np.ndarray, " n"]
-    config: SearchConfig
-
-    def scores(self, count: int | None = None, compared: Compared = "snapshots") -> Scores:
-        """Returns the function that scores candidates on the first of them."""
-        return make_scores(self.field, self.cache, self.data, jnp.asarray(self.spectra[:count], jnp.int32), compared)
-
-    def tx_index(self, count: int) -> Int[np.ndarray, " k"]:
-        """Returns the transmitters of the first of them."""
-        return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
-
-    def antennas(self, params: Any, report: dict[str, Any]) -> tuple[Any, bool]:
+    def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
         """Returns parameters with the antennas that are found, and whether there are any."""
-        count, known = self.config.antenna_spectra, bool(np.any(np.asarray(self.data.receivers.pattern_exponents) != 0))
-        params, found = search_antennas(params, self.scores(count), self.tx_index(count), self.config, known)
+        count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
+        params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
         before = report.get("antennas", dataclasses.asdict(found))
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
         return params, bool(found.taken)
 
-    def idealisations(self, params: Any, report: dict[str, Any]) -> Any:
+    def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
         """Returns parameters without the idealisations that spectra contradict."""
-        count = self.config.ideal_spectra
-        params, found = search_idealisations(params, self.scores(count), self.tx_index(count), self.config)
+        params, found = search_idealisations(params, told, self.config)
         named = {name: dataclasses.asdict(one) for name, one in found.items()}
         report["idealisations"] = report.get("idealisations", {}) | named
         return params

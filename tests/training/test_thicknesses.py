@@ -1,0 +1,97 @@
+"""Thicknesses that a scene does not say are found with the materials; those that it says, or that fit, are left alone."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_settings
+from wave_runs import PARTS, places, run_in, snapshots
+
+from wbgs_jax.training.materials import ITU_MATERIALS, search_materials
+from wbgs_jax.training.scores import Told
+from wbgs_jax.training.thicknesses import frequencies_to_look_at, search_slabs
+
+N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
+SETTINGS = tiny_settings(
+    "wave",
+    field={
+        "specular_tried": 128,
+        "specular_kept": 64,
+        "diffracted_tried": 1,
+        "diffracted_kept": 1,
+        "mirror_areas": (0.0,),
+    },
+    search={"spectra": 60, "rounds": 2, "antenna_rounds": 0, "thickness_spectra": 60},
+)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A run of which no thickness is known, before its first step."""
+    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(N_TX), FREQUENCIES)
+    run.field = dataclasses.replace(run.field, known_thickness=jnp.zeros(len(PARTS)))
+    return run
+
+
+def of(params, names, metres):
+    permittivity, c, d = jnp.asarray([ITU_MATERIALS[name] for name in names], jnp.float32).T
+    materials = dataclasses.replace(
+        params.materials,
+        log_susceptibility=jnp.log(permittivity - 1),
+        log_conductivity=jnp.log(c),
+        slope=d,
+        log_thickness=jnp.log(jnp.asarray(metres, jnp.float32)),
+    )
+    return dataclasses.replace(params, materials=materials)
+
+
+def told(room, truth, field=None):
+    plan = room.field.plan(truth, room.dataset.receiver(), cache=room.cache)
+    data = dataclasses.replace(room.data, snapshots=snapshots(truth, plan, room.cache, room.data.links))
+    return Told(field or room.field, room.cache, data, np.asarray(room.dataset.train))
+
+
+def test_they_are_found_with_the_materials(room, rng):
+    names = rng.choice(["concrete", "brick", "plasterboard", "wood", "glass"], len(PARTS))
+    metres = rng.uniform(0.01, 0.3, len(PARTS))
+    start = room.field.init(jax.random.key(0))
+    heard = told(room, of(start, names, metres))
+    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    alone, _ = search_materials(start, heard.scores(60), SETTINGS.search)
+    left, without = heard.scores()([found, alone]).mean(1)
+    assert left < without - 0.5
+    optical = [m * np.sqrt(ITU_MATERIALS[name][0]) for m, name in zip(metres, names, strict=True)]
+    materials = found.materials
+    reached = np.exp(np.asarray(materials.log_thickness)) * np.sqrt(1 + np.exp(np.asarray(materials.log_susceptibility)))
+    assert np.median(np.abs(reached / optical - 1)) < 0.02
+    assert set(report.thickness_mm) == set(range(len(PARTS)))
+
+
+def test_what_fits_stays(room, rng):
+    """Walls of the thickness that is taken where nothing is said."""
+    names = rng.choice(["concrete", "plasterboard", "wood", "glass"], len(PARTS))
+    start = room.field.init(jax.random.key(0))
+    heard = told(room, of(start, names, [SETTINGS.field.thickness] * len(PARTS)))
+    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    assert not report.thickness_mm
+    np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
+
+
+def test_a_known_thickness_is_not_searched(room, rng):
+    start = room.field.init(jax.random.key(0))
+    metres = rng.uniform(0.01, 0.3, len(PARTS))
+    known = dataclasses.replace(room.field, known_thickness=jnp.full(len(PARTS), 0.1))
+    heard = told(room, of(start, ["wood"] * len(PARTS), metres), known)
+    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    assert not report.thickness_mm
+    np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
+
+
+def test_frequencies_stand_apart_and_are_believed():
+    of_data = np.repeat([1.0, 2.4, 2.5, 5.0, 5.2, 28.0, 60.0, 61.0], 3) * 1e9
+    np.testing.assert_allclose(frequencies_to_look_at(of_data, np.inf), np.array([2.5, 5.2, 28.0, 61.0]) * 1e9)
+    np.testing.assert_allclose(frequencies_to_look_at(of_data, 30e9), np.array([2.5, 5.2, 28.0]) * 1e9)
+    np.testing.assert_allclose(frequencies_to_look_at(of_data, 1e9), [2.5e9])  # one look there is in any case
+    assert frequencies_to_look_at(np.full(4, 3e9), np.inf) == [3e9]
