@@ -58,8 +58,8 @@ def rectangle(corner, first, second) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
-def facets_of(*parts, material=None, most=None) -> Facets:
-    return facets_from_mesh(mesh_of(*parts, material=material), most)
+def facets_of(*parts, material=None) -> Facets:
+    return facets_from_mesh(mesh_of(*parts, material=material))
 
 
 def edges_of(*parts, material=None) -> Edges:

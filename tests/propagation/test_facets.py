@@ -145,11 +145,6 @@ def test_one_object_of_two_materials_is_two_bodies():
     assert edges_of_facets(facets).length.size == 8  # the four around the lid are gone
 
 
-def test_the_largest_facets_are_kept():
-    facets = facets_of(box((0, 0, 0), (1, 2, 3)), most=2)
-    np.testing.assert_allclose(areas(facets), [6, 6])
-
-
 @pytest.mark.parametrize("shift", [0.0, 1e-7])
 def test_corners_that_hardly_differ_are_one(shift):
     first, second = rectangle((0, 0, 0), (1, 0, 0), (0, 1, 0)), rectangle((1 + shift, 0, 0), (1, 0, 0), (0, 1, 0))

@@ -35,11 +35,12 @@ from wbgs_jax.fields.wave_channel import (
 )
 from wbgs_jax.fields.wave_settings import PRESETS, WaveConfig
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
-from wbgs_jax.propagation.facets import Facets, facets_from_mesh
+from wbgs_jax.propagation.facets import Facets
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.motion import Motion, still
 from wbgs_jax.propagation.paths import MAX_FACETS, TracedPaths, trace_paths
+from wbgs_jax.propagation.simplify import facets_that_fit
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import turned
@@ -245,7 +246,7 @@ class WaveField(Field):
 def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
     """Returns the field of a mesh: its facets and edges are found on the host."""
     config = config or WaveConfig()
-    facets = facets_from_mesh(mesh, config.max_facets)
+    facets = facets_that_fit(mesh, config.max_facets)
     edges = edges_of_facets(facets)
     movers = int(facets.mover.max()) + 1
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)

@@ -58,8 +58,8 @@ class Outline:
     """Metres."""
 
 
-def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
-    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first, at most `most` of them."""
+def facets_from_mesh(mesh: Mesh) -> Facets:
+    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first."""
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
     triangles, material = index[np.asarray(mesh.faces)], np.asarray(mesh.material)
     body = _bodies(triangles, np.asarray(mesh.part), material)
@@ -76,7 +76,7 @@ def facets_from_mesh(mesh: Mesh, most: int | None = None) -> Facets:
     rows = [polygon + polygon[-1:] * (CORNERS - len(polygon)) for polygon in polygons]
     corners = points[np.array(rows, int).reshape(-1, CORNERS)]
     normals, sizes = _polygon_normals(corners)
-    order = np.argsort(-sizes, kind="stable")[:most]
+    order = np.argsort(-sizes, kind="stable")
     owner = np.array(first, int)[order]
     offset = np.sum(normals[order] * corners[order].mean(1), -1)
     _, hangs_with = np.unique(mover[owner], return_inverse=True)
