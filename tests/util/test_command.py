@@ -1,5 +1,7 @@
 """What command lines share: errors as one line and an exit code, options that are looked at first."""
 
+import warnings
+
 import pytest
 
 from wbgs_jax._util.command import option_value, run_command, say
@@ -26,6 +28,13 @@ def test_what_stops_a_command_is_one_line_and_an_exit_code(capsys, error, code, 
 def test_mistakes_of_the_program_are_not_hidden():
     with pytest.raises(ZeroDivisionError):
         run_command(lambda: 1 / 0)
+
+
+def test_warnings_are_notes(monkeypatch):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)  # put back afterwards
+    run_command(lambda: None)
+    assert warnings.formatwarning("the mesh was simplified", UserWarning, "mesh.py", 3) == "note: the mesh was simplified\n"
+    assert "mesh.py:3" in warnings.formatwarning("soon gone", DeprecationWarning, "mesh.py", 3)
 
 
 def test_lines_for_people_leave_stdout_alone(capsys):

@@ -1,6 +1,7 @@
 """What all command lines share: how errors become one line and an exit code, and lines for people."""
 
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -8,9 +9,13 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 
+_as_python_has_it = warnings.formatwarning
+
 
 def run_command(main: Callable[[], None]) -> None:
-    """Runs a command line's `main`; a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130."""
+    """Runs a command line's `main`; a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130, and a
+    `UserWarning` a line that begins with "note:"."""
+    warnings.formatwarning = _note
     try:
         main()
     except UserError as error:
@@ -19,6 +24,13 @@ def run_command(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _note(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    """Returns what is printed of a warning."""
+    if category is UserWarning:
+        return f"note: {message}\n"
+    return _as_python_has_it(message, category, filename, lineno, line)
 
 
 def say(line: str) -> None:
