@@ -8,7 +8,7 @@ import trimesh
 from rooms import box, mesh_of, rectangle
 
 from wbgs_jax.propagation.facets import areas, facets_from_mesh
-from wbgs_jax.propagation.simplify import decimated, distances, facets_that_fit, simplified, welded
+from wbgs_jax.propagation.simplify import decimated, distance_from, distances, facets_that_fit, simplified, welded
 
 
 def fine(part, times):
@@ -86,6 +86,16 @@ def test_distances_are_those_of_parallel_planes(rng):
     height = rng.uniform(0.01, 1)
     low, high = (np.asarray(rectangle((0, 0, z), (2, 0, 0), (0, 3, 0)).triangles) for z in (0, height))
     np.testing.assert_allclose(distances(low, high, 0), height, rtol=1e-12)
+
+
+def test_distances_are_those_of_trimesh(rng):
+    near, far = rng.normal(size=(20, 3, 3)), rng.normal(size=(30, 3, 3))
+    mesh = trimesh.Trimesh(far.reshape(-1, 3), np.arange(90).reshape(-1, 3), process=False)
+    points = near.reshape(-1, 3)
+    expected = [
+        np.linalg.norm(trimesh.triangles.closest_point(mesh.triangles, np.tile(p, (30, 1))) - p, axis=1).min() for p in points
+    ]
+    np.testing.assert_allclose([distance_from(p, far) for p in points], expected, atol=1e-12)
 
 
 def test_what_fits_is_not_simplified():

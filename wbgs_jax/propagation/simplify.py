@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 
@@ -167,13 +166,19 @@ def distances(corners: Float[np.ndarray, "t 3 3"], others: Float[np.ndarray, "f 
     rng = np.random.default_rng(seed)
     one = corners[rng.choice(len(corners), PROBES, p=area / area.sum())]
     probes = np.sum(one * rng.dirichlet(np.ones(3), PROBES)[..., None], 1)
-    return np.array([_from(probe, others) for probe in probes])
+    return np.array([distance_from(probe, others) for probe in probes])
 
 
-def _from(point: Float[np.ndarray, "3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
-    """Returns how far a point is from the nearest of some triangles."""
-    nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(point, (len(triangles), 3)))
-    return float(np.sqrt(np.min(np.sum((nearest - point) ** 2, -1))))
+def distance_from(point: Float[np.ndarray, "3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
+    """Returns how far a point is from the nearest of some triangles: from its plane if it stands over it, else from a side."""
+    along = np.roll(triangles, -1, 1) - triangles
+    arm = point - triangles
+    share = np.sum(arm * along, -1) / np.maximum(np.sum(along**2, -1), 1e-30)
+    to_sides = np.linalg.norm(arm - np.clip(share, 0, 1)[..., None] * along, axis=-1).min(1)
+    normal, twice = _unit(np.cross(along[:, 0], along[:, 1]))
+    over = (np.sum(np.cross(along, arm) * normal[:, None], -1) >= 0).all(1) & (twice > 0)
+    height = np.abs(np.sum(arm[:, 0] * normal, -1))
+    return float(np.where(over, height, to_sides).min())
 
 
 @dataclass(frozen=True)
