@@ -68,8 +68,10 @@ class SearchConfig:
     """Training spectra that are looked at."""
     glance: int = 24
     """The first of them, by which the materials of the list are narrowed down to a few."""
-    thickness_spectra: int = 96
-    """Training spectra up to a frequency that are looked at for thicknesses which the scene does not say."""
+    thickness_spectra: int = 160
+    """Training spectra up to a frequency that are looked at for thicknesses which the scene does not say ..."""
+    thickness_glance: int = 48
+    """... and the first of them, by which slabs are narrowed down to a few."""
     sure: float = 2.0
     """Standard errors by which what has been learned must fit better than every known material to be kept."""
     antenna_rounds: int = 2

@@ -25,6 +25,7 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.adjustment import adjust
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.descent import descend
+from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Compared, Told, surely_better
 from wbgs_jax.training.thicknesses import search_slabs
@@ -88,11 +89,15 @@ class _Heard:
         """Returns what they say of a place, in an order drawn anew."""
         return Told(now.field, now.cache, self.data, self.rng.permutation(self.spectra))
 
-    def named(self, now: Place, rounds: int, compared: Compared = "covariances") -> Place:
-        """Names the materials: as far as places are believed, or as if all of them were known."""
+    def named(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
+        """Names the materials: as far as places are believed, or as if all of them were known; with the thicknesses that the
+        scene does not say, or in those that they have."""
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
-        once = dataclasses.replace(self.config, rounds=rounds)
-        params, _ = search_slabs(now.params, self.told(now), once, count, compared)
+        once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
+        if sized:
+            params, _ = search_slabs(now.params, told, once, count, compared)
+        else:
+            params, _ = search_materials(now.params, told.scores(count, compared), once)
         return dataclasses.replace(now, params=params)
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
@@ -112,11 +117,11 @@ def learn_geometry(
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
     heard, all_heard = _Heard(data, own, config, rng), _Heard(data, train, config, rng)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
-    start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds)
+    start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds, sized=True)
     field, params = _followed(start, heard, links, named=True)
     now = _traced(field, _fresh(params, place.params), data.links, data)
     now = all_heard.named(all_heard.guessed(now), 1)
-    moved = [now, all_heard.named(now, config.rounds, "snapshots")]
+    moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
     if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
         field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, named=False)
         moved.append(all_heard.named(_traced(field, params, data.links, data), 1, "snapshots"))

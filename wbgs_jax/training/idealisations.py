@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.scores import Told, surely_better
-from wbgs_jax.training.thicknesses import search_slabs
 
 SURE = 3.0
 """As many standard errors over transmitters as a gain has to be sure by (`surely_better`)."""
@@ -39,7 +39,7 @@ def search_idealisations(params: Any, told: Told, config: SearchConfig) -> tuple
             continue
         natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # training gives every array away once
         if name == "thick":
-            natural, _ = search_slabs(natural, told, once, count)
+            natural, _ = search_materials(natural, score, once)
         before, after = score([params, natural])
         dropped = surely_better(before - after, tx_index, SURE)
         found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)

@@ -16,6 +16,7 @@ from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.controls import Context, Edit
 from wbgs_jax.training.geometry import Place, learn_geometry
 from wbgs_jax.training.idealisations import search_idealisations
+from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Told
 from wbgs_jax.training.thicknesses import search_slabs
@@ -49,7 +50,7 @@ class Search:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field with its
         surfaces moved if the mesh is doubtful."""
         config, data, cache = self.config, context.data, context.cache
-        spectra = rng.choice(context.train, min(config.spectra, len(context.train)), replace=False)
+        spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
         told = Told(field, cache, data, spectra)
         if config.antenna_rounds:
@@ -62,7 +63,7 @@ class Search:
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
-                params, _ = search_slabs(params, told, config, config.ideal_spectra)
+                params, _ = search_materials(params, told.scores(config.ideal_spectra), config)
             _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:

@@ -8,8 +8,7 @@ than materials alone, of the thickness that they had.
 """
 
 import dataclasses
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,9 +32,13 @@ APART = 1.25
 BELIEVED = 0.1
 """Wavelengths: where surfaces may stand further off (standard deviation), phases tell nothing of thicknesses."""
 SHORTLIST = 8
-"""Candidates that are looked at closely: the best at a first glance."""
+"""Slabs that are looked at closely: the best at a first glance."""
+ONCE_MORE = 60
+"""Slabs that are tried again when all materials have been looked at once: the best at a first glance then ..."""
+ENTRIES = 6
+"""... and entries of the list that are tried at higher frequencies: those of the best of them."""
 BLOCK = 32
-"""Candidates that are scored at once; so many, always, that nothing is compiled twice."""
+"""Slabs that are scored at once; so many, always, that nothing is compiled twice."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
 
@@ -56,7 +59,8 @@ def search_slabs(
     named, report = search_materials(params, score, config)
     if not unknown.any():
         return named, report
-    sized, anew = search_materials(_sized(params, unknown, told, config, compared), score, config)
+    once = dataclasses.replace(config, rounds=1)
+    sized, anew = search_materials(_sized(params, unknown, told, config, compared), score, once)
     before, after = score([named, sized])
     if not surely_better(before - after, told.tx_index(count), SURE):
         return named, report
@@ -67,13 +71,19 @@ def search_slabs(
 
 def _sized(params: Any, unknown: Bool[np.ndarray, " m"], told: Told, config: SearchConfig, compared: Compared) -> Any:
     """Returns parameters with materials and thicknesses as spectra of ever higher frequencies say."""
-    spread = float(jnp.exp(jnp.median(params.placement)))
-    before = None
-    for frequency_hz in frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread):
+    materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
+    first, *others = frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
+    likely, score = {m: _all_slabs(first) for m in materials}, told.scores(config.thickness_spectra, compared, first)
+    for _ in range(2):
+        for material in materials:
+            params, likely[material] = _best(params, material, likely[material], score, config.thickness_glance)
+    before = first
+    for frequency_hz in others:
         score = told.scores(config.thickness_spectra, compared, frequency_hz)
-        for material in [*np.flatnonzero(unknown)] * (1 if before else 2):
-            candidates = [params, *_candidates(params, int(material), frequency_hz, before)]
-            params = _best(candidates, score, config.glance)
+        for material in materials:
+            entries = list(dict.fromkeys(slab.entry for slab in likely[material]))[:ENTRIES]
+            near = _slabs_near(params.materials, material, entries, frequency_hz, before)
+            params, _ = _best(params, material, near, score, config.thickness_glance)
         before = frequency_hz
     return params
 
@@ -88,33 +98,53 @@ def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: f
     return [first, *(one for one in others if one <= believed_hz)]
 
 
-def _candidates(params: Any, material: int, frequency_hz: float, before_hz: float | None) -> Iterator[Any]:
-    """Yields parameters in which one material is an entry of the list, of some thickness."""
-    present = params.materials
-    optical = float(jnp.exp(present.log_thickness[material]) * jnp.sqrt(1 + jnp.exp(present.log_susceptibility[material])))
-    for name, (permittivity, _, _) in ITU_MATERIALS.items():
-        wavelength = SPEED_OF_LIGHT / frequency_hz / np.sqrt(permittivity)
-        if before_hz is None:
-            thicknesses = np.concatenate([SHEETS, np.arange(0.02, THICKEST, FIRST_STEP * wavelength)[:MOST]])
-        else:
-            around = int(np.ceil(frequency_hz / before_hz))
-            thicknesses = optical / np.sqrt(permittivity) + STEP * wavelength * np.arange(-around, around + 1)
-        entry = with_entry(present, material, name)
-        for metres in np.unique(np.clip(thicknesses, THINNEST, THICKEST)):
-            yield dataclasses.replace(params, materials=_of_thickness(entry, material, metres))
+class _Slab(NamedTuple):
+    entry: str
+    metres: float
 
 
-def _of_thickness(materials: Any, material: int, metres: float) -> Any:
-    return dataclasses.replace(materials, log_thickness=materials.log_thickness.at[material].set(np.log(metres)))
+def _all_slabs(frequency_hz: float) -> list[_Slab]:
+    """Returns all entries of the list in all thicknesses that differ at a frequency."""
+    found = []
+    for name in ITU_MATERIALS:
+        steps = np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(name, frequency_hz))[:MOST]
+        found += [_Slab(name, float(metres)) for metres in (*SHEETS, *steps)]
+    return found
 
 
-def _best(candidates: list[Any], score: Scores, glance: int) -> Any:
-    """Returns the best candidate; the first one, where it makes no difference."""
+def _slabs_near(materials: Any, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[_Slab]:
+    """Returns entries in thicknesses that could not be told from the present one at the frequency before."""
+    optical = float(jnp.exp(materials.log_thickness[material]) * jnp.sqrt(1 + jnp.exp(materials.log_susceptibility[material])))
+    around, found = int(np.ceil(frequency_hz / before_hz)), []
+    for name in entries:
+        steps = STEP * _wavelength(name, frequency_hz) * np.arange(-around, around + 1)
+        metres = np.clip(optical / np.sqrt(ITU_MATERIALS[name][0]) + steps, THINNEST, THICKEST)
+        found += [_Slab(name, float(one)) for one in np.unique(metres)]
+    return found
+
+
+def _wavelength(entry: str, frequency_hz: float) -> float:
+    """Returns metres, in the material."""
+    return SPEED_OF_LIGHT / frequency_hz / float(np.sqrt(ITU_MATERIALS[entry][0]))
+
+
+def _best(params: Any, material: int, slabs: list[_Slab], score: Scores, glance: int) -> tuple[Any, list[_Slab]]:
+    """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
+    better; and the likely ones of them, the best first."""
+    candidates = [_made_of(params, material, slab) for slab in slabs]
     first = np.concatenate([_scores(candidates[i : i + BLOCK], score, glance) for i in range(0, len(candidates), BLOCK)])
+    order = np.argsort(first)
+    likely = [slabs[i] for i in order[:ONCE_MORE]]
     if np.ptp(first) < UNSEEN:
-        return candidates[0]
-    close = [candidates[0], *(candidates[i] for i in np.argsort(first)[:SHORTLIST])]
-    return close[int(np.argmin(score(close).mean(1)))]
+        return params, likely
+    close = [params, *(candidates[i] for i in order[:SHORTLIST])]
+    return close[int(np.argmin(score(close).mean(1)))], likely
+
+
+def _made_of(params: Any, material: int, slab: _Slab) -> Any:
+    materials = with_entry(params.materials, material, slab.entry)
+    thickness = materials.log_thickness.at[material].set(np.log(slab.metres))
+    return dataclasses.replace(params, materials=dataclasses.replace(materials, log_thickness=thickness))
 
 
 def _scores(candidates: list[Any], score: Scores, glance: int) -> Float[np.ndarray, " k"]:
