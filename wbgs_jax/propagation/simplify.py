@@ -30,9 +30,9 @@ TURNED = 0.2
 """Cosine of the largest angle that a triangle is turned by at once."""
 AT_ONCE = 0.5
 """Share of the vertices, the cheapest, that may go at once."""
-FINE = 50_000
+FINE = 300_000
 """Triangles: meshes of more are simplified before coplanar ones are merged, which takes longer."""
-LEFT_OUT = 0.02
+LEFT_OUT = 0.1
 """Share of the surface that may be left out, as its smallest facets, before the mesh is simplified instead."""
 TRIES = 4
 PROBES = 1000
