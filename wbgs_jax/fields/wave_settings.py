@@ -12,7 +12,7 @@ class WaveConfig:
     """Settings of the coherent field."""
 
     max_facets: int = 3000
-    """Planar pieces of the mesh, at most: the smallest are left out, or the mesh is simplified where those are a tenth of it."""
+    """Planar pieces of the mesh, at most: the smallest are left out, or the mesh simplified where those are a tenth of it."""
     mirror_areas: tuple[float, ...] = (0.0, 0.05, 1.0)
     """Square metres: the smallest facet in a chain of 1, 2 and 3 reflections."""
     mirror_area_after_edge: float = 0.5
