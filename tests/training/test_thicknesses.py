@@ -9,7 +9,7 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.training.materials import ITU_MATERIALS, search_materials
+from wbgs_jax.training.materials import ITU_MATERIALS, SearchReport, search_materials
 from wbgs_jax.training.scores import Told
 from wbgs_jax.training.thicknesses import frequencies_to_look_at, search_slabs
 
@@ -87,6 +87,17 @@ def test_a_known_thickness_is_not_searched(room, rng):
     found, report = search_slabs(start, heard, SETTINGS.search, 60)
     assert not report.thickness_mm
     np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
+
+
+def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
+    start = room.field.init(jax.random.key(0))
+    heard = told(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
+    heard = dataclasses.replace(heard, data=dataclasses.replace(heard.data, snapshots=None))
+    nothing = SearchReport(0.0, 0.0, {})
+    monkeypatch.setattr("wbgs_jax.training.thicknesses.search_materials", lambda params, *_: (params, nothing))
+    monkeypatch.setattr("wbgs_jax.training.thicknesses._sized", lambda *_: pytest.fail("searched"))
+    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    assert found is start and report is nothing
 
 
 def test_frequencies_stand_apart_and_are_believed():

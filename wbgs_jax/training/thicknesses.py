@@ -46,7 +46,9 @@ SURE = 2.0
 def search_slabs(
     params: Any, told: Told, config: SearchConfig, count: int, compared: Compared = "snapshots"
 ) -> tuple[Any, SearchReport]:
-    """Returns parameters with the materials, and their thicknesses where the scene does not say, that explain spectra best.
+    """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say.
+
+    Thicknesses are searched where snapshots are known; pictures alone keep those of `params`.
 
     Args:
         params: with `materials`, one of them for each of the field's thicknesses.
@@ -57,7 +59,7 @@ def search_slabs(
     """
     score, unknown = told.scores(count, compared), np.asarray(told.field.known_thickness) == 0
     named, report = search_materials(params, score, config)
-    if not unknown.any():
+    if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
         return named, report
     once = dataclasses.replace(config, rounds=1)
     sized, anew = search_materials(_sized(params, unknown, told, config, compared), score, once)
