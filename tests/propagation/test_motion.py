@@ -12,7 +12,15 @@ from rooms import box, facets_of, room, search_of, trace
 from wbgs_jax.propagation.edges import edges_of_facets
 from wbgs_jax.propagation.facets import moved
 from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient, length_jacobian, still
+from wbgs_jax.propagation.motion import (
+    Motion,
+    coherence,
+    length_changes,
+    length_gradient,
+    length_jacobian,
+    path_coherence,
+    still,
+)
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
@@ -116,6 +124,27 @@ def test_coherence_is_the_mean_of_phases_over_places(rng):
     np.testing.assert_allclose(found, (phases.T @ phases.conj() / len(places)).real, atol=0.02)
     assert np.asarray(found)[~np.eye(5, dtype=bool)].min() < 0.6
     np.testing.assert_allclose(np.diag(found), 1, atol=1e-4)
+
+
+def test_what_paths_share_says_what_their_gradients_say(rng):
+    """Values, and gradients with respect to how far everything may stand from its place."""
+    search, wavenumber = search_of(PARTS, RX), jnp.float32(300.0)
+    paths = trace(search, TX)
+    spread = jnp.asarray(rng.uniform(1e-4, 3e-3, len(PARTS) + 1), jnp.float32)
+    alive = np.concatenate([paths.specular.alive, paths.diffracted.alive])
+    weight = jnp.asarray(rng.normal(size=(len(alive), len(alive))) * (alive[:, None] & alive), jnp.float32)
+
+    def by_gradients(spread):
+        gradient = [length_gradient(some, search, len(PARTS)) for some in (paths.specular, paths.diffracted)]
+        return coherence(jnp.concatenate(gradient), spread, wavenumber)
+
+    def by_bends(spread):
+        return path_coherence(paths, search, spread, wavenumber)
+
+    np.testing.assert_allclose(by_bends(spread)[alive][:, alive], by_gradients(spread)[alive][:, alive], atol=1e-4)
+    found, expected = (jax.grad(lambda s, of=of: jnp.sum(weight * of(s)))(spread) for of in (by_bends, by_gradients))
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0
 
 
 def test_paths_off_the_same_wall_stay_coherent_and_a_common_length_is_none():

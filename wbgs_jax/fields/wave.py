@@ -33,13 +33,13 @@ from wbgs_jax.fields.wave_channel import (
     phase_blind_pas,
     slabs_at,
 )
-from wbgs_jax.fields.wave_settings import PRESETS, WaveConfig
+from wbgs_jax.fields.wave_settings import MAX_FACETS, PRESETS, WaveConfig
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
 from wbgs_jax.propagation.facets import Facets
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.motion import Motion, still
-from wbgs_jax.propagation.paths import MAX_FACETS, TracedPaths, trace_paths
+from wbgs_jax.propagation.paths import TracedPaths, trace_paths
 from wbgs_jax.propagation.simplify import facets_that_fit
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals

@@ -20,7 +20,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.wave_settings import WaveConfig
 from wbgs_jax.propagation.image_method import Search
-from wbgs_jax.propagation.motion import Motion, coherence, length_changes, length_gradient
+from wbgs_jax.propagation.motion import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
@@ -130,13 +130,12 @@ def path_covariances(
 ) -> tuple[Complex[Array, "b elements elements"], Float[Array, " b"]]:
     """Returns the mean products y y^H of the snapshots of B transmitters over the places where surfaces may stand
     (`WaveParams.placement`), scaled to a trace of 1; and the mean power that an element receives."""
-    movers, spread = params.placement.shape[0] - 1, jnp.exp(params.placement)
+    spread = jnp.exp(params.placement)
 
     def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
         strongest = jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude))), FAINTEST)
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
-        gradient = jnp.concatenate([length_gradient(some, plan.search, movers) for some in (paths.specular, paths.diffracted)])
-        left = coherence(gradient, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
+        left = path_coherence(paths, plan.search, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
         covariance = covariance_from_paths(arrived, plan.receiver, f, left)
         trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
         return covariance / trace, trace / len(covariance) * strongest**2

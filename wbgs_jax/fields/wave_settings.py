@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from wbgs_jax.config import PRESETS as COMMON
 from wbgs_jax.config import SearchConfig, Settings
 
+MAX_FACETS = 100_000
+"""As many as anybody has tried; each is a mirror, and shades all others."""
+
 
 @dataclass(frozen=True)
 class WaveConfig:

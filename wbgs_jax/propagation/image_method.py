@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.propagation.crossings import planes_of
 from wbgs_jax.propagation.edges import Edges
 from wbgs_jax.propagation.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
 
@@ -21,6 +22,10 @@ SIDE = 1e-4
 """Metres: points nearer to a plane than this are on neither side."""
 SLACK = 0.05
 """Metres by which facets are widened, so that rounding loses no chain."""
+NO_LENGTH = 1e-12
+"""Square metres: twice the smallest triangle of an image and a side that bounds a beam."""
+BEAMS_AT_ONCE = 64
+"""Few enough for a CPU's cache."""
 
 
 @pytree
@@ -57,6 +62,8 @@ class Search:
     """World frame, metres."""
     facets: Facets
     outline: Outline
+    planes: Float[AnyArray, "5 4 p"]
+    """Of the facets and their sides, as legs are cut with them (`crossings.planes_of`)."""
     edges: Edges
     chains: tuple[Chains, ...]
     """Of orders 1, 2, ..."""
@@ -89,6 +96,7 @@ def make_search(
         rx,
         facets,
         outline_of(facets),
+        planes_of(facets),
         edges,
         receiver_chains(facets, rx, mirror_areas),
         diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge),
@@ -146,56 +154,58 @@ def diffracted_chains(
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
     start, end = edges.start, edges.start + edges.direction * edges.length[:, None]
     segment = np.stack([start, end, end, end], 1)
-    after, images = [np.zeros((0, 2), int)], [np.zeros((0, 3))]
-    for facet in np.flatnonzero(area >= after_area):
-        height = normal[facet] @ rx - offset[facet]
-        if abs(height) > SIDE:
-            image = rx - 2 * height * normal[facet]
-            seen = np.flatnonzero(_in_beam(image, rx, facet, segment, corners, normal, offset, slack))
-            after.append(np.stack([np.full(len(seen), facet), seen], 1))
-            images.append(np.broadcast_to(image, (len(seen), 3)))
+    mirrors = np.flatnonzero(area >= after_area)
+    height = normal[mirrors] @ rx - offset[mirrors]
+    image = rx - 2 * height[:, None] * normal[mirrors]
+    seen = _seen(image, np.broadcast_to(rx, image.shape), mirrors, segment, corners, normal, offset, slack)
+    place, edge = np.nonzero(seen & (np.abs(height) > SIDE)[:, None])
+    after = np.stack([mirrors[place], edge], 1)
     mirrors = np.flatnonzero(area >= before_area)
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)
-    return DiffractedChains(np.concatenate(after).astype(np.int32), np.concatenate(images), before.astype(np.int32))
+    return DiffractedChains(after.astype(np.int32), image[place], before.astype(np.int32))
 
 
 def _prepend(facet, image, candidates, corners, normal, offset, slack):
     """Returns every chain with every facet in front of it that its beam reaches: facets and images."""
-    grown_facet = [np.zeros((0, facet.shape[1] + 1), np.int64)]
-    grown_image = [np.zeros((0, image.shape[1] + 1, 3))]
-    for chain, images in zip(facet, image, strict=True):
-        source = images[0]
-        height = normal[candidates] @ source - offset[candidates]
-        visible = candidates[np.abs(height) > SIDE]
-        if len(chain):
-            visible = visible[visible != chain[0]]
-            visible = visible[_in_beam(source, images[1], chain[0], corners[visible], corners, normal, offset, slack)]
-        mirrored = source - 2 * (normal[visible] @ source - offset[visible])[:, None] * normal[visible]
-        grown_facet.append(np.concatenate([visible[:, None], np.broadcast_to(chain, (len(visible), len(chain)))], 1))
-        grown_image.append(np.concatenate([mirrored[:, None], np.broadcast_to(images, (len(visible), *images.shape))], 1))
-    return np.concatenate(grown_facet), np.concatenate(grown_image)
+    source = image[:, 0]
+    height = source @ normal[candidates].T - offset[candidates]  # (chains, candidates)
+    visible = np.abs(height) > SIDE
+    if facet.shape[1]:
+        visible &= candidates != facet[:, :1]
+        visible &= _seen(source, image[:, 1], facet[:, 0], corners[candidates], corners, normal, offset, slack)
+    chain, place = np.nonzero(visible)
+    mirror = candidates[place]
+    mirrored = source[chain] - 2 * height[chain, place, None] * normal[mirror]
+    return np.column_stack([mirror, facet[chain]]), np.concatenate([mirrored[:, None], image[chain]], 1)
 
 
-def _in_beam(source, before, window, candidates, corners, normal, offset, slack):
-    """Returns which candidates (four corners each) are not wholly outside the beam from the image `source` through a facet.
+def _seen(source, before, window, candidates, corners, normal, offset, slack):
+    """Returns which candidates (four corners each) are not wholly outside the beams from images through facets.
 
-    The beam is on the side of the facet `window` where `before`, which `source` is the mirror image of, lies, and inside the
+    A beam is on the side of its facet `window` where `before`, which `source` is the mirror image of, lies, and inside the
     planes through the source and the window's sides.
     """
-    centre = corners[window].mean(0)
-    planes, distances = [], []
-    side = np.sign(normal[window] @ before - offset[window])
-    planes.append(side * normal[window])
-    distances.append(side * offset[window])
-    for i in range(CORNERS):
-        a, b = corners[window][i], corners[window][(i + 1) % CORNERS]
-        across = np.cross(a - source, b - source)
-        length = np.linalg.norm(across)
-        if length < 1e-12:
-            continue
-        across = across / length
-        across = across if across @ (centre - source) > 0 else -across
-        planes.append(across)
-        distances.append(across @ source)
-    height = candidates @ np.array(planes).T - np.array(distances)  # (candidates, 4, planes)
-    return (height.max(1) > np.array([SIDE] + [-slack] * (len(planes) - 1))).all(-1)
+    planes, distances = _beams(source, before, window, corners, normal, offset)
+    lowest = np.array([SIDE] + [-slack] * CORNERS, np.float32)[:, None]
+    points = candidates.swapaxes(0, 1).reshape(-1, 3).astype(np.float32)
+    seen = np.zeros((len(source), len(candidates)), bool)
+    for start in range(0, len(source), BEAMS_AT_ONCE):
+        some = slice(start, start + BEAMS_AT_ONCE)
+        height = planes[some].astype(np.float32) @ points.T - distances[some, :, None].astype(np.float32)
+        highest = height.reshape(*height.shape[:2], CORNERS, -1).max(-2)
+        seen[some] = (highest > lowest).all(1)
+    return seen
+
+
+def _beams(source, before, window, corners, normal, offset):
+    """Returns unit normals into beams (beams, 5, 3) and offsets of the planes that bound them; 0 and -1 for a side of no
+    length."""
+    own, first = normal[window], corners[window]
+    side = np.sign(np.sum(own * before, -1) - offset[window])
+    across = np.cross(first - source[:, None], np.roll(first, -1, 1) - source[:, None])
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    inward = np.sign(np.sum(across * (first.mean(1) - source)[:, None], -1, keepdims=True))
+    across = np.where(length > NO_LENGTH, across * np.where(inward > 0, 1, -1) / np.maximum(length, NO_LENGTH), 0)
+    distance = np.where(length[..., 0] > NO_LENGTH, np.sum(across * source[:, None], -1), -1)
+    planes = np.concatenate([(side[:, None] * own)[:, None], across], 1)
+    return planes, np.concatenate([(side * offset[window])[:, None], distance], 1)

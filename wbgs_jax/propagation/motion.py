@@ -14,6 +14,8 @@ Where the shifts of all movers are unknown, independent and normal with standard
 product of two amplitudes loses exp(-k^2 Var(dL_i - dL_j) / 2): the spectrum is that of partially coherent waves.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -21,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.propagation.facets import AnyArray, centres
 from wbgs_jax.propagation.image_method import Search
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, Paths
+from wbgs_jax.propagation.paths import DIFFRACTED, MAX_ORDER, REFLECTED, Paths, TracedPaths
 from wbgs_jax.propagation.transport import last_leg, legs_of
 from wbgs_jax.radio.array import EXACT
 
@@ -89,6 +91,60 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
     variance = jnp.sum(phase**2, -1)
     both = jnp.matmul(phase, phase.T, precision=EXACT)
     return jnp.exp(-0.5 * jnp.maximum(variance[:, None] + variance - 2 * both, 0))
+
+
+def path_coherence(
+    paths: TracedPaths, search: Search, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
+) -> Float[Array, "k k"]:
+    """Returns the `coherence` of all paths of one transmitter, the specular ones first, at a cost that does not grow with the
+    number of movers: a path has its mirrors and edges, and no others.
+
+    Args:
+        paths: of one transmitter.
+        search: that they were found in.
+        spread: standard deviation of the place of every mover and, last, of the transmitter along each axis, metres.
+        wavenumber: radians a metre.
+    """
+    specular, diffracted = _bends(paths.specular, search, MAX_ORDER), _bends(paths.diffracted, search, MAX_ORDER - 1)
+    variance = (wavenumber * spread) ** 2
+    mixed = _shared(specular, diffracted, variance)
+    rows = [[_shared(specular, specular, variance), mixed], [mixed.T, _shared(diffracted, diffracted, variance)]]
+    both = jnp.block(rows)
+    own = jnp.diagonal(both)
+    return jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
+
+
+class _Bends(NamedTuple):
+    """Where K paths are reflected or diffracted, at most V times each."""
+
+    turn: Float[Array, "v k 3"]
+    """By how much the direction turns there; 0 where there is nothing."""
+    mover: Int[Array, "v k"]
+    departing: Float[Array, "k 3"]
+    """Against the direction in which the wave leaves the transmitter."""
+
+
+def _bends(paths: Paths, search: Search, most: int) -> _Bends:
+    """Returns where paths bend, leg by leg: what they pass through turns nothing."""
+    turn, mover = _turns(paths, search)
+    here = jnp.any(turn != 0, -1) & (paths.interaction_leg == jnp.arange(most)[:, None, None])
+    found = (jnp.sum(jnp.where(here[..., None], turn, 0), -2), jnp.sum(jnp.where(here, mover, 0), -1))
+    return _Bends(*found, -legs_of(paths).direction[:, 0])
+
+
+def _shared(first: _Bends, second: _Bends, variance: Float[Array, " places"]) -> Float[Array, "k l"]:
+    """Returns the covariance of the phases of K paths with those of L others. Written out over bends and components, so that
+    nothing of more than K L numbers is ever stored."""
+    total = variance[-1] * _products(first.departing, second.departing)
+    for turn, mover in zip(first.turn, first.mover, strict=True):
+        weighted = turn * variance[mover][:, None]
+        for other, its in zip(second.turn, second.mover, strict=True):
+            total += jnp.where(mover[:, None] == its, _products(weighted, other), 0)
+    return total
+
+
+def _products(a: Float[Array, "k 3"], b: Float[Array, "l 3"]) -> Float[Array, "k l"]:
+    return a[:, None, 0] * b[:, 0] + a[:, None, 1] * b[:, 1] + a[:, None, 2] * b[:, 2]
 
 
 def _arms(paths: Paths, search: Search, mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k 5 3"]:

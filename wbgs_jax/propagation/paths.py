@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.propagation.crossings import NEAR, WORD, counted, crossed, crossing_share, first_of
 from wbgs_jax.propagation.edges import Edges
-from wbgs_jax.propagation.facets import CORNERS, AnyArray, Outline
+from wbgs_jax.propagation.facets import AnyArray, Outline
 from wbgs_jax.propagation.image_method import Chains, Search
 from wbgs_jax.radio.array import EXACT
 
@@ -23,15 +24,10 @@ MAX_ORDER = 3
 """Reflections and diffractions a path may have."""
 MAX_INTERACTIONS = 5
 """Facets and edges a path may interact with; what has crossed more of them is worth next to nothing."""
-NEAR = 1e-3
-"""Metres: a leg does not cross the facets within this distance of its ends (those that mirror it)."""
 NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
 """Types of interaction."""
-INDICES, PLACES = 2**12, 2**17
-"""An interaction's key holds the index of a facet or vertex (less than `INDICES`) and its place, in parts of a leg."""
-MAX_FACETS = INDICES - MAX_ORDER
-"""More cannot be told apart by their keys."""
-NO_KEY = jnp.uint32(0xFFFFFFFF)
+BEHIND = 1e-6
+"""Share of a leg by which it crosses a facet after its beginning, at least: what is met there comes first."""
 CUT_AT_ONCE = 32
 """Paths: few enough for a CPU's cache."""
 THROUGH = 0.5
@@ -98,13 +94,19 @@ def trace_paths(
 
 def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths without diffraction, line of sight included, of at most `tried` candidates."""
-    parts = [_direct(tx, search.receiver_position), *(_mirrored(tx, search, chain) for chain in search.chains)]
+    mirrored = (_promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
+    parts = [_direct(tx, search.receiver_position), *mirrored]
     return _select(parts, search, tried, kept, MAX_ORDER + 1)
 
 
 def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
-    parts = [_diffracted_only(tx, search), _diffracted_then_mirrored(tx, search), _mirrored_then_diffracted(tx, search)]
+    pairs = search.diffracted
+    parts = [
+        _diffracted_only(tx, search),
+        _promising(lambda some: _diffracted_then_mirrored(tx, search, *some), (pairs.after, pairs.after_image), tried),
+        _promising(lambda some: _mirrored_then_diffracted(tx, search, some), pairs.before, tried),
+    ]
     return _select(parts, search, tried, kept, 3)
 
 
@@ -115,19 +117,19 @@ def _diffracted_only(tx, search: Search) -> Candidates:
     return _candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
-def _diffracted_then_mirrored(tx, search: Search) -> Candidates:
+def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
     """Returns one candidate a pair of an edge and a mirror behind it."""
-    facet, edge = jnp.moveaxis(search.diffracted.after, -1, 0)
-    point, strength = _diffracted(tx, search.diffracted.after_image, edge, search.edges)
-    mirror, valid = _on_mirror(point, search.diffracted.after_image, search.facets.normal[facet], search.facets.offset[facet])
+    facet, edge = jnp.moveaxis(pairs, -1, 0)
+    point, strength = _diffracted(tx, image, edge, search.edges)
+    mirror, valid = _on_mirror(point, image, search.facets.normal[facet], search.facets.offset[facet])
     strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
     vertices = [(point, edge, DIFFRACTED), (mirror, facet, REFLECTED)]
     return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
 
 
-def _mirrored_then_diffracted(tx, search: Search) -> Candidates:
+def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
     """Returns one candidate a pair of an edge and a mirror in front of it."""
-    facet, edge = jnp.moveaxis(search.diffracted.before, -1, 0)
+    facet, edge = jnp.moveaxis(pairs, -1, 0)
     normal, offset = search.facets.normal[facet], search.facets.offset[facet]
     image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
     point, strength = _diffracted(image, search.receiver_position, edge, search.edges)
@@ -213,11 +215,20 @@ def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs
     """Returns the best paths that are left of the best candidates when these have been cut with all facets."""
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
-    crossed = _of_living(lambda c: jnp.isfinite(_crossings(c.points[: legs + 1], search)).sum(), found)
-    whole = crossed + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
-    found = _best(found, jnp.where(whole, found.score * THROUGH**crossed, 0), kept)
-    facet, types, leg = _of_living(lambda c: _cut(c, search, legs), found)  # takes longer than to count
-    return Paths(found.points, facet, types, leg, found.score > 0)
+    cut = _of_living(lambda c: crossed(c.points[: legs + 1], search.planes), found)
+    crossings = jnp.sum(counted(cut), -1)
+    whole = crossings + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
+    score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
+    found = jax.tree.map(lambda leaf: leaf[best], found)
+    facet, types, leg = jax.vmap(lambda path, words: _in_order(path, words, search))(found, cut[best])
+    return Paths(found.points, facet, types, leg, score > 0)
+
+
+def _promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
+    """Returns the best candidates of a kind. All are scored, and the best built again: points are most of the work."""
+    score = build(rows).score
+    best = jax.lax.top_k(score, min(most, score.size))[1]
+    return build(jax.tree.map(lambda leaf: leaf[best], rows))
 
 
 def _best(candidates: Candidates, score: Float[Array, " c"], most: int) -> Candidates:
@@ -242,44 +253,15 @@ def _in_blocks(leaf: Array, blocks: int) -> Array:
     return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
 
 
-def _cut(candidate: Candidates, search: Search, legs: int):
+def _in_order(candidate: Candidates, cut: UInt32[Array, "legs words"], search: Search):
     """Returns the interactions of one path in order: facet or edge, type, leg."""
-    # The place of an interaction is leg + share of the leg; a reflection or diffraction ends its leg. Place and index share an
-    # integer, so that plain minima find both: sorting or arg-minima take ten times as long on a CPU.
-    crossing = _crossings(candidate.points[: legs + 1], search) + jnp.arange(legs)[:, None]
-    n = crossing.shape[1]
-    vertex = jnp.where(candidate.interaction_type != NONE, jnp.arange(MAX_ORDER) + 1.0, jnp.inf)
-    keys = jnp.concatenate([_key(crossing, jnp.arange(n)).reshape(-1), _key(vertex, n + jnp.arange(MAX_ORDER))])
-
-    def next_key(last, _):
-        following = jnp.min(jnp.where(keys > last, keys, NO_KEY))
-        return following, following
-
-    _, key = jax.lax.scan(next_key, jnp.zeros((), jnp.uint32), length=MAX_INTERACTIONS)  # unrolled, each finds all keys again
-    index, there = (key % INDICES).astype(jnp.int32), key < NO_KEY
-    leg = jnp.ceil((key // INDICES) / PLACES).astype(jnp.int32) - 1
-    slot = index - n
-    facet = jnp.where(slot < 0, index, candidate.interaction_facet[slot])
-    types = jnp.where(slot < 0, TRANSMITTED, candidate.interaction_type[slot])
-    return jnp.where(there, facet, 0), jnp.where(there, types, NONE), jnp.where(there, leg, 0)
-
-
-def _key(place: Float[Array, "*n"], index: Int[Array, " _"]) -> UInt32[Array, "*n"]:
-    """Returns place and index of an interaction as one integer that sorts by place; `NO_KEY` where the place is infinite."""
-    key = (place * PLACES).astype(jnp.uint32) * INDICES + index.astype(jnp.uint32)
-    return jnp.where(jnp.isfinite(place), key, NO_KEY)
-
-
-def _crossings(points: Float[Array, "p 3"], search: Search) -> Float[Array, "legs f"]:
-    """Returns after which share of a leg a facet is crossed; infinite if it is not."""
-    normal, outline = search.facets.normal, search.outline
-    height = jnp.matmul(points, normal.T, precision=EXACT) - search.facets.offset
-    start, end = height[:-1], height[1:]
-    share = start / jnp.where(start == end, 1, start - end)
-    length = jnp.linalg.norm(points[1:] - points[:-1], axis=-1, keepdims=True)
-    near = NEAR / jnp.maximum(length, NEAR)
-    inside = (share > near) & (share < 1 - near)
-    for i in range(CORNERS):
-        depth = jnp.matmul(points, outline.inward[:, i].T, precision=EXACT) - outline.offset[:, i]
-        inside &= depth[:-1] + share * (depth[1:] - depth[:-1]) >= 0
-    return jnp.where(inside, jnp.clip(share, 2 / PLACES, 1 - 2 / PLACES), jnp.inf)
+    number, crosses = first_of(cut.reshape(-1), MAX_INTERACTIONS)
+    leg, facet = jnp.divmod(number, cut.shape[1] * WORD)
+    share = crossing_share(candidate.points[leg], candidate.points[leg + 1], facet, search.planes)
+    vertex, types = jnp.arange(MAX_ORDER), candidate.interaction_type
+    crossing = jnp.where(crosses, leg + jnp.clip(share, BEHIND, 1), jnp.inf)
+    order = jnp.argsort(jnp.concatenate([crossing, jnp.where(types != NONE, vertex + 1.0, jnp.inf)]))[:MAX_INTERACTIONS]
+    interactions = jnp.where(crosses, TRANSMITTED, NONE), types
+    facets = jnp.where(crosses, facet, 0), candidate.interaction_facet
+    types, facet, leg = (jnp.concatenate(both)[order] for both in (interactions, facets, (leg, vertex)))
+    return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, leg, 0)

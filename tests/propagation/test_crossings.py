@@ -1,0 +1,103 @@
+"""What legs cross, against double precision and division, one facet at a time."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rooms import box, facets_of, room, search_of, trace
+
+from wbgs_jax.propagation.crossings import NEAR, WORD, counted, crossed, crossing_share, first_of, planes_of
+from wbgs_jax.propagation.facets import Facets, outline_of
+from wbgs_jax.propagation.paths import NONE, TRANSMITTED
+
+
+def random_facets(rng, count) -> Facets:
+    """Triangles and parallelograms anywhere."""
+    origin, a, b = rng.uniform(-1, 1, (3, count, 3))
+    quads = np.stack([origin, origin + a, origin + a + b, origin + b], 1)
+    quads[::2, 3] = quads[::2, 2]  # a triangle repeats its last corner
+    normal = np.cross(a, b)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    number = np.arange(count)
+    return Facets(quads, normal, np.sum(normal * origin, -1), number, number, number)
+
+
+def shares(facets, start, end):
+    """After which share of a leg it crosses every facet, infinite where it does not, and how many metres decide that."""
+    outline = outline_of(facets)
+    here, there = (facets.normal @ p - facets.offset for p in (start, end))
+    share = here / (here - there)
+    point = start + share[:, None] * (end - start)
+    depth = np.einsum("fed,fd->fe", outline.inward, point) - outline.offset
+    ends = np.minimum(share, 1 - share) * np.linalg.norm(end - start) - NEAR
+    inside = (depth >= 0).all(-1) & (ends > 0)
+    margin = np.minimum(np.abs(np.where(outline.inward.any(-1), depth, np.inf)).min(-1), np.abs(ends))
+    return np.where(inside, share, np.inf), margin
+
+
+def test_bits_say_what_division_says(rng):
+    facets = random_facets(rng, 77)
+    points = rng.uniform(-2, 2, (60, 3))
+    words = np.asarray(crossed(jnp.asarray(points, jnp.float32), jnp.asarray(planes_of(facets), jnp.float32)))
+    assert words.shape == (59, 3) and words.dtype == np.uint32
+    bits = (words[:, :, None] >> np.arange(WORD, dtype=np.uint32) & 1).reshape(len(words), -1).astype(bool)
+    assert not bits[:, 77:].any()
+    met = 0
+    for leg, (start, end) in enumerate(itertools.pairwise(points)):
+        share, margin = shares(facets, start, end)
+        clear = margin > 1e-5
+        np.testing.assert_array_equal(bits[leg, :77][clear], np.isfinite(share)[clear])
+        met += np.isfinite(share).sum()
+        for facet in np.flatnonzero(np.isfinite(share)):
+            args = (jnp.asarray(x, jnp.float32) for x in (start, end))
+            found = crossing_share(*args, jnp.int32(facet), jnp.asarray(planes_of(facets), jnp.float32))
+            np.testing.assert_allclose(found, share[facet], atol=1e-4)
+    assert met > 50
+    np.testing.assert_array_equal(counted(jnp.asarray(words)), bits.sum(-1))
+
+
+def test_a_facet_at_the_end_of_a_leg_is_not_crossed():
+    facets = facets_of(box((0, 0, 0), (1, 1, 1)))
+    planes = jnp.asarray(planes_of(facets), jnp.float32)
+    for short, expected in ((0.5 * NEAR, 0), (2 * NEAR, 1)):
+        legs = jnp.array([[0.5, 0.4, 3.0], [0.5, 0.4, 1 - short]], jnp.float32)
+        assert counted(crossed(legs, planes)).tolist() == [expected]
+
+
+def test_the_first_bits_come_in_order(rng):
+    bits = rng.random(4 * WORD) < 0.1
+    bits[[0, 31, 32, 127]] = True
+    words = np.packbits(bits, bitorder="little").view(np.uint32)
+    expected = np.flatnonzero(bits)
+    for most in (1, 3, 64):
+        number, there = first_of(jnp.asarray(words), most)
+        assert there.tolist() == [True] * min(most, len(expected)) + [False] * (most - len(expected))
+        np.testing.assert_array_equal(np.asarray(number)[np.asarray(there)], expected[:most])
+        assert not np.asarray(number)[~np.asarray(there)].any()
+
+
+def test_paths_cross_what_brute_force_finds_in_that_order(rng):
+    """Every path of a furnished room, leg by leg."""
+    parts = [*room(), *(box(low, low + rng.uniform(0.3, 0.9, 3)) for low in rng.uniform(0.3, (4.5, 2.5, 1.2), (12, 3)))]
+    tx, rx = rng.uniform(0.2, (5.5, 3.5, 2.4), (2, 3))
+    facets = facets_of(*parts)
+    met = 0
+    for paths in jax.tree.leaves(trace(search_of(parts, rx), tx), is_leaf=lambda leaf: hasattr(leaf, "alive")):
+        paths = jax.tree.map(np.asarray, paths)
+        for k in np.flatnonzero(paths.alive):
+            crossings, clear = [], True
+            for leg, (start, end) in enumerate(itertools.pairwise(paths.points[k])):
+                if np.linalg.norm(end - start) > 0:
+                    share, margin = shares(facets, start.astype(float), end.astype(float))
+                    clear &= bool((margin > 1e-4).all())
+                    crossings += [(leg + share[f], f) for f in np.flatnonzero(np.isfinite(share))]
+            places = np.sort([place for place, _ in crossings])
+            if not clear or (np.diff(places) < 1e-4).any():
+                continue  # rounding decides
+            through = paths.interaction_type[k] == TRANSMITTED
+            assert paths.interaction_facet[k][through].tolist() == [f for _, f in sorted(crossings)]
+            leg = paths.interaction_leg[k][paths.interaction_type[k] != NONE]
+            assert (np.diff(leg) >= 0).all() and paths.interaction_leg[k][through].tolist() == [int(p) for p in places]
+            met += len(crossings)
+    assert met > 20
