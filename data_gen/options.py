@@ -10,7 +10,7 @@ import numpy as np
 
 from data_gen.jobs import Job
 from data_gen.materials import check_material_frequencies
-from data_gen.own_scene import own_scene
+from data_gen.own_scene import own_scene, parse_point
 from data_gen.scenes import SceneSpec, get_scene
 from data_gen.scenes.base import FREQUENCIES_21_HZ
 from data_gen.settings import ArraySettings, Solver, SolverSettings
@@ -34,7 +34,7 @@ class SceneOptions:
     materials: Path | None = None
     """Own scene: materials of its objects (.toml)."""
     rx: str | None = None
-    """Own scene: position of the receiver, x,y,z in metres."""
+    """Position of the receiver, x,y,z in metres; a numbered scene has one of its own unless given."""
     tx_grid: str | None = None
     """Own scene: transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z."""
     up: Literal["y", "z"] | None = None
@@ -59,11 +59,10 @@ class SceneOptions:
         return spec if self.rx_orientation is None else dataclasses.replace(spec, rx_orientation=_unit(self.rx_orientation))
 
     def _numbered_spec(self) -> SceneSpec:
-        if self.materials or self.rx or self.tx_grid or self.up or self.scale != 1:
-            raise UserError(
-                "--materials, --rx, --tx-grid, --up and --scale are for a scene of your own; give its file with --scene"
-            )
-        return get_scene(int(self.scene))
+        if self.materials or self.tx_grid or self.up or self.scale != 1:
+            raise UserError("--materials, --tx-grid, --up and --scale are for a scene of your own; give its file with --scene")
+        spec = get_scene(int(self.scene))
+        return spec if self.rx is None else dataclasses.replace(spec, rx_position=parse_point(self.rx, "--rx"))
 
     def _own_spec(self, frequencies_hz: tuple[float, ...]) -> SceneSpec:
         if self.rx is None or self.tx_grid is None:
@@ -120,7 +119,7 @@ class Options(SceneOptions):
             return Path(f"{Path(self.scene).stem}.npz")
         usual = Options()
         same = (
-            "frequencies", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "solver", "scattering",
+            "frequencies", "rx", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "solver", "scattering",
             "seed", "ceilings",
         )  # fmt: skip
         if any(getattr(self, name) != getattr(usual, name) for name in same):

@@ -80,7 +80,7 @@ def own_scene(
     Raises:
         UserError: anything about the file, the materials, the frequencies, the receiver or the transmitters is wrong.
     """
-    position, candidates = _point(rx, "--rx"), _transmitters(tx_grid)
+    position, candidates = parse_point(rx, "--rx"), _transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
     objects = read_objects(file, up, scale)
     _check_size(file, objects)
@@ -210,7 +210,8 @@ def _thickness(value: Any, where: str) -> float:
     return float(value)
 
 
-def _point(text: str, option: str) -> Vec3:
+def parse_point(text: str, option: str) -> Vec3:
+    """Returns metres from "x,y,z"; anything else is a `UserError`."""
     try:
         x, y, z = (float(word) for word in text.split(","))
     except ValueError:
@@ -226,7 +227,7 @@ def _transmitters(text: str) -> Float[np.ndarray, "candidates 3"]:
     corners = text.split(":")
     if len(corners) != 3:
         raise UserError(f"--tx-grid is {text!r}; give x0,y0,z0:x1,y1,z1:nx,ny,nz or a .csv file with the header x,y,z")
-    low, high, numbers = (_point(corner, "--tx-grid") for corner in corners)
+    low, high, numbers = (parse_point(corner, "--tx-grid") for corner in corners)
     if not all(value >= 1 and value == int(value) for value in numbers) or np.prod(numbers) > MAX_TX:
         raise UserError(f"--tx-grid has {corners[2]!r} for nx,ny,nz; give whole numbers, at most {MAX_TX} points in all")
     nx, ny, nz = (int(value) for value in numbers)

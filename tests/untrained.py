@@ -13,6 +13,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.wave import WaveField
 from wbgs_jax.fields.wideband import WidebandField, WidebandParams
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.run_folder import RunConfig, TrainedField, write_config
@@ -47,6 +48,19 @@ def make_run(folder: Path) -> Path:
     write_config(folder, run_config(scene))
     metadata = {"limits": None, "seconds": 1.0}
     checkpoint.save(folder / "checkpoints", STEP, State(make_params()), make_field(), metadata, keep=1)
+    return folder
+
+
+def make_coherent_run(folder: Path) -> Path:
+    """The same of the coherent field."""
+    scene = folder.with_suffix(".npz")
+    save_scene(scene, tiny_scene())
+    settings = tiny_settings("wave", field={"specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8})
+    config = RunConfig(str(scene), "wave", "smoke", 0, None, settings)
+    write_config(folder, config)
+    field = WaveField.make(settings.field, DatasetScene(config.dataset()), 0)
+    state = State(field.init(jax.random.key(0)))
+    checkpoint.save(folder / "checkpoints", STEP, state, field, {"limits": None, "seconds": 1.0}, keep=1)
     return folder
 
 

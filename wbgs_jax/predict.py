@@ -7,44 +7,46 @@ wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --out elsewhere.npz
 wbgs-jax predict --run RUN --export field.zip
 """
 
-import wbgs_jax._util.quiet
 
 # isort: split
 
-import dataclasses
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-import wbgs_jax
 from wbgs_jax._util.command import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, write_csv
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.inference.answers import (
+    check_frequencies,
+    doubts,
+    frequencies,
+    link_words,
+    point_words,
+    receiver_at,
+    source_of,
+    write_answer,
+)
 from wbgs_jax.inference.confidence import LEVEL, expect_many
 from wbgs_jax.inference.export import export_field
 from wbgs_jax.inference.links import as_rows, ask_mimo, ask_paths, ask_response
 from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import at_receiver, observe_queries, trained_band
+from wbgs_jax.inference.predictor import at_receiver, observe_queries
 from wbgs_jax.inference.quantities import ask_channel
 from wbgs_jax.radio.array import planar_array
 from wbgs_jax.training.run_folder import TrainedField, load_trained
-from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver, make_query
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, Receiver, make_query
 
 SHOWN = 12
 """Spectra in a picture."""
-SHORTEST = 1e-3
-"""Of quaternions that are taken."""
 SUFFIXES = {"out": ".npz", "picture": ".png", "export": ".zip"}
 What = Literal[
     "spectra",
@@ -70,7 +72,7 @@ class Command:
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
     ghz: tuple[float, ...] = ()
-    """Frequencies, 1 to 100; every transmitter is asked at every one of them."""
+    """Frequencies, 1 to 100, and from 0.3 for fields with paths; every transmitter is asked at every one of them."""
     rx: str = ""
     """Another receiver than the trained one: x,y,z in metres, or x,y,z,w,i,j,k with the quaternion that turns its array into
     the world frame. Array and pattern stay. Only fields with paths know others."""
@@ -106,29 +108,6 @@ class Spectra:
     """Expected SSIM of every answer, and the ends of its interval; None where a run does not know how sure it is."""
 
 
-def receiver_at(word: str, like: Receiver) -> Receiver:
-    """Returns a receiver from "x,y,z" or "x,y,z,w,i,j,k", otherwise like another; anything else is a `UserError`."""
-    if not word:
-        return like
-    try:
-        values = np.array([float(part) for part in word.split(",")])
-    except ValueError:
-        values = np.zeros(0)
-    turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
-    if len(values) not in (3, 7) or not np.isfinite(values).all() or not SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST:
-        raise UserError(f"--rx {word} is no receiver; give x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
-    unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
-    return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
-
-
-def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, " freq"]:
-    """Returns hertz; outside the band of the model is a `UserError`."""
-    low, high = MIN_FREQUENCY_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
-    if wrong := [f for f in ghz if not low <= f <= high]:
-        raise UserError(f"--ghz {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
-    return np.array(ghz) * 1e9
-
-
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
     for name, suffix in SUFFIXES.items():
@@ -147,30 +126,6 @@ def check(command: Command) -> None:
         raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
     if command.what != "spectra" and (command.picture or (asks and not command.out)):
         raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
-
-
-def doubts(
-    dataset: Dataset,
-    rx: Float[np.ndarray, "3"],
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-) -> list[str]:
-    """Returns why some of the answers should not be trusted: one line each."""
-    (low, high), band = DatasetScene(dataset).box, trained_band(dataset)
-    box = f"the box of {dataset.name}, {_point(low)} to {_point(high)}"
-    places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
-    lines = [f"{end} {_point(place)} lies outside {box}" for end, place in places if ((place < low) | (place > high)).any()]
-    trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
-    lines += [f"{f / 1e9:g} GHz lies outside {trained}" for f in frequencies_hz if not band[0] <= f <= band[1]]
-    return lines
-
-
-def _point(position: Float[np.ndarray, "3"]) -> str:
-    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
-
-
-def _link(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
-    return f"TX {_point(tx_position)} at {frequency_hz / 1e9:g} GHz"
 
 
 def ask(
@@ -199,7 +154,7 @@ def sureness(spectra: Spectra) -> list[str]:
     for (tx, frequency), (ssim, low, high) in zip(
         np.ndindex(spectra.expected.shape[:2]), spectra.expected.reshape(-1, 3), strict=True
     ):
-        where = _link(spectra.tx_positions[tx], float(spectra.frequencies_hz[frequency]))
+        where = link_words(spectra.tx_positions[tx], float(spectra.frequencies_hz[frequency]))
         lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
     return lines[:SHOWN]
 
@@ -218,18 +173,21 @@ def ask_for(
         velocities = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
         return ask_paths(trained, dataset, *asked, *velocities)
     if command.what == "frequency-response":
-        _check_band(frequencies_hz, 1e6 * command.band_mhz)
         return ask_response(trained, *asked, 1e6 * command.band_mhz, command.points)
     if command.what == "mimo":
         return ask_mimo(trained, *asked, planar_array(*_array(command.tx_array)))
     return ask_channel(command.what, trained, dataset, *asked)
 
 
-def _check_band(frequencies_hz: Float[np.ndarray, " freq"], band_hz: float) -> None:
-    for edge in (frequencies_hz.min() - band_hz / 2, frequencies_hz.max() + band_hz / 2):
-        if not MIN_FREQUENCY_HZ <= edge <= MAX_FREQUENCY_HZ:
-            span = f"{MIN_FREQUENCY_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
-            raise UserError(f"--band-mhz {band_hz / 1e6:g} reaches {edge / 1e9:g} GHz; the model knows {span}")
+def lowest_asked(command: Command, frequencies_hz: Float[np.ndarray, " freq"]) -> float:
+    """Returns the lowest frequency (hertz) that is asked for; a band that reaches beyond what fields know is a `UserError`."""
+    half = 0.5e6 * command.band_mhz if command.what == "frequency-response" else 0.0
+    lowest, highest = float(frequencies_hz.min() - half), float(frequencies_hz.max() + half)
+    if lowest < LOWEST_OF_PATHS_HZ or highest > MAX_FREQUENCY_HZ:
+        edge = lowest if lowest < LOWEST_OF_PATHS_HZ else highest
+        span = f"{LOWEST_OF_PATHS_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
+        raise UserError(f"--band-mhz {2e-6 * half:g} reaches {edge / 1e9:g} GHz; the model knows {span}")
+    return lowest
 
 
 def _velocities(command: Command) -> dict[str, str]:
@@ -251,24 +209,11 @@ def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
         return []
     lines = []
     for place, power in np.ndenumerate(answer["power_db"]):
-        where = _link(answer["tx_positions"][place[0]], float(answer["frequencies_hz"][place[1]]))
+        where = link_words(answer["tx_positions"][place[0]], float(answer["frequencies_hz"][place[1]]))
         expected, within = (answer[name][place] for name in ("expected_error_db", "within_db"))
         sure = f"expected {expected:.1f} dB off, {100 * LEVEL:.0f} % within {within:.1f} dB"
         lines.append(f"{where}: {power:.1f} dB of the transmitted power; {sure}")
     return lines[:SHOWN]
-
-
-def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> None:
-    """Writes the answer's arrays that are known, and where they come from as JSON text in `meta`."""
-    known = {name: value for name, value in arrays.items() if value is not None}
-    with atomic_write(path) as stream:
-        np.savez_compressed(stream, **known, meta=np.array(json.dumps(source)))
-
-
-def _source(trained: TrainedField, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
-    asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
-    origin = {"scene": dataset.name, "field": trained.config.field, "step": trained.step, "version": wbgs_jax.__version__}
-    return origin | {"receiver": asked}
 
 
 def draw(spectra: Spectra) -> Figure:
@@ -284,7 +229,9 @@ def draw(spectra: Spectra) -> Figure:
             continue
         tx, frequency = divmod(i, len(spectra.frequencies_hz))
         shown = axis.imshow(images[i], vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
-        axis.set_title(f"{spectra.frequencies_hz[frequency] / 1e9:g} GHz, TX {_point(spectra.tx_positions[tx])}", fontsize=9)
+        axis.set_title(
+            f"{spectra.frequencies_hz[frequency] / 1e9:g} GHz, TX {point_words(spectra.tx_positions[tx])}", fontsize=9
+        )
         axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
     figure.supxlabel("azimuth [deg]", fontsize=9)
     figure.supylabel("zenith [deg]", fontsize=9)
@@ -307,8 +254,9 @@ def main(arguments: list[str] | None = None) -> None:
         return
     receiver = receiver_at(command.rx, dataset.receiver())
     trained = at_receiver(trained, receiver, dataset)
+    check_frequencies(trained, lowest_asked(command, frequencies_hz))
     for line in doubts(dataset, np.asarray(receiver.position), tx_positions, frequencies_hz):
-        say(f"warning: {line}; the field was not trained there")
+        say(f"warning: {line}")
     if command.what != "spectra":
         assert command.out is not None, "checked"
         answer = ask_for(command, trained, dataset, receiver, tx_positions, frequencies_hz)
@@ -317,14 +265,14 @@ def main(arguments: list[str] | None = None) -> None:
         if command.out.suffix == ".csv":
             write_csv(command.out, as_rows(answer))
         else:
-            write_answer(command.out, answer, _source(trained, dataset, receiver))
+            write_answer(command.out, answer, source_of(trained, dataset, receiver))
         say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
         return
     spectra = ask(trained, receiver, tx_positions, frequencies_hz)
     for line in sureness(spectra):
         say(line)
     if command.out:
-        write_answer(command.out, vars(spectra), _source(trained, dataset, receiver))
+        write_answer(command.out, vars(spectra), source_of(trained, dataset, receiver))
         say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
     if command.picture:
         with atomic_write(command.picture) as stream:

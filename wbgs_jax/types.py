@@ -22,6 +22,8 @@ SurfaceSampling = Literal["solid_angle", "area"]
 """How points are spread: evenly over the receiver's directions, or over the area of the surface."""
 MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 1e9, 100e9
 """The band of the paper."""
+LOWEST_OF_PATHS_HZ = 0.3e9
+"""Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms."""
 LOWEST_FREQUENCY_HZ = 1e6
 """Smaller numbers are gigahertz or megahertz by mistake."""
 LARGEST_COORDINATE_M = 1e5

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 from commands import call
 from PIL import Image
-from synthetic import tiny_scene, tiny_settings
+from synthetic import tiny_scene
 from toys import RippleConfig, RippleField, registered, toy_settings
-from untrained import State, make_run
+from untrained import State, make_coherent_run, make_run
 
 from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import Observation
-from wbgs_jax.fields.wave import WaveField
 from wbgs_jax.inference.confidence import PowerConfidence, write_confidence
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.training import checkpoint
@@ -79,8 +77,8 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         (["--tx", "1,2", "--ghz", "28", "--out", "OUT/a.npz"], ["--tx 1,2 "]),
         (["--tx", "1,2,x", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,x"]),
         (["--tx", "1,2,nan", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,nan"]),
-        (["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"], ["0.9", "1 to 100 GHz"]),
-        (["--tx", INSIDE[0], "--ghz", "28e9", "--out", "OUT/a.npz"], ["2.8e+10", "1 to 100 GHz"]),
+        (["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"], ["from 1 GHz on, not at 0.9 GHz", "wave or hybrid"]),
+        (["--tx", INSIDE[0], "--ghz", "28e9", "--out", "OUT/a.npz"], ["2.8e+10", "0.3 to 100 GHz"]),
         (["--tx", INSIDE[0], "--ghz", "nan", "--out", "OUT/a.npz"], ["nan"]),
         ([*ASK, "--out", "OUT/a.csv"], ["--out", ".npz"]),
         ([*ASK, "--picture", "OUT/a.jpg"], ["--picture", ".png"]),
@@ -188,16 +186,18 @@ def test_numbers_are_written_and_not_drawn(run, tmp_path, arguments, words):
 @pytest.fixture(scope="module")
 def coherent(tmp_path_factory):
     """A run of the coherent field, untrained."""
-    folder = tmp_path_factory.mktemp("runs") / "coherent"
-    scene = folder.with_suffix(".npz")
-    save_scene(scene, tiny_scene())
-    settings = tiny_settings("wave", field={"specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8})
-    config = RunConfig(str(scene), "wave", "smoke", 0, None, settings)
-    write_config(folder, config)
-    field = WaveField.make(settings.field, DatasetScene(config.dataset()), 0)
-    state = State(field.init(jax.random.key(0)))
-    checkpoint.save(folder / "checkpoints", 3, state, field, {"limits": None, "seconds": 1.0}, keep=1)
-    return folder
+    return make_coherent_run(tmp_path_factory.mktemp("runs") / "coherent")
+
+
+def test_below_the_band_only_paths_answer(coherent, tmp_path):
+    out = tmp_path / "low.npz"
+    result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.4, "--what", "power", "--out", out)
+    assert result.code == 0
+    assert [line for line in result.lines if line.startswith("warning: 0.4 GHz lies below 1 GHz: rays")]
+    with np.load(out) as answer:
+        assert -80 < answer["power_db"][0, 0] < 0
+    result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.2, "--out", out)
+    assert result.code == 2 and "0.3 to 100 GHz" in result.err
 
 
 def test_the_whole_channel(coherent, tmp_path):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from wbgs_jax.evaluation.beams import FAINTEST_DB, RINGS, SECTORS, angle_error_deg, beam_loss_db, codebook, plane_normal
+from wbgs_jax.evaluation.beams import FAINTEST_DB, angle_error_deg, beam_loss_db, plane_normal
 from wbgs_jax.radio.array import pas_directions, planar_array
+from wbgs_jax.radio.codebook import RINGS, SECTORS, codebook
 
 
 def spot(row, column, width=200.0):

@@ -1,14 +1,11 @@
 """What a link engineer loses by trusting a predicted spectrum: the wrong direction, the wrong beam."""
 
-import functools
-
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH, pas_directions
+from wbgs_jax.radio.array import pas_directions
+from wbgs_jax.radio.codebook import codebook
 
-RINGS, SECTORS = 4, 16
-"""The codebook: beams on four rings of equal zenith angle, sixteen on each."""
 FLAT = 1e-4
 """Of an array's size: how far the elements of a planar one may stand out."""
 FAINTEST_DB = -60.0
@@ -55,11 +52,3 @@ def beam_loss_db(
     best = heard.max(1).astype(np.float64)
     ratio = np.where(best > 0, used / np.where(best > 0, best, 1), 1)
     return -20 * np.log10(np.maximum(ratio, 10 ** (FAINTEST_DB / 20)))
-
-
-@functools.cache
-def codebook() -> Int[np.ndarray, " beams"]:
-    """Returns the pixels, in row-major order, that the codebook's beams point at."""
-    rows = (np.arange(RINGS) + 0.5) * (PAS_HEIGHT - 1) / RINGS
-    columns = np.arange(SECTORS) * (PAS_WIDTH - 1) / SECTORS
-    return (rows.round().astype(int)[:, None] * PAS_WIDTH + columns.round().astype(int)).reshape(-1)

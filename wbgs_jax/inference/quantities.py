@@ -1,6 +1,7 @@
 """Quantities of the channel that a trained field is asked for, beside spectra: snapshots, powers, gains, spreads."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,11 +14,14 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import PowerConfidence, expected_power
-from wbgs_jax.inference.predictor import Trained, check_power, observe_queries
+from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
 from wbgs_jax.types import Query, Receiver, make_query
+
+OfArrivals = Callable[[channel.Arrivals, Receiver, Any], Any]
+"""(arrivals of one link, receiver, frequency_hz) -> a quantity of it."""
 
 
 def ask_channel(
@@ -51,22 +55,29 @@ def ask_channel(
     if function is None:
         found = observe_queries(trained, receiver, query, name)
     else:
-        plan, measure = trained.field.plan(trained.params, receiver), jax.jit(function)
-        found = np.array([_measured(trained, plan, one, receiver, measure) for one in _each(query)])
+        found = _measured(trained, trained.field.plan(trained.params, receiver), query, receiver, function)
     values = found.reshape(len(tx_positions), len(frequencies_hz), *found.shape[1:])
     asked = {"tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
     sure = trained.power_confidence if what == "power" else None
     return {name: values} | asked | ({} if sure is None else expected_errors(sure, values, receiver, **asked))
 
 
-def _each(query: Query) -> list[Query]:
-    return [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], query) for i in range(len(query.frequency_hz))]
+def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, function: OfArrivals) -> np.ndarray:
+    """Returns what follows from the arrivals of queries, in blocks of one shape: one compilation."""
+    count, parts = len(query.frequency_hz), []
+    size = min(BLOCK, count)
+    for start in range(0, count, size):
+        index = np.minimum(np.arange(start, start + size), count - 1)  # the last query fills the last block up
+        block = jax.tree.map(lambda leaf, index=index: leaf[index], query)
+        found = _of_arrivals(trained.field, trained.params, plan, receiver, block, function)
+        parts.append(np.asarray(found)[: count - start])
+    return np.concatenate(parts)
 
 
-def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, measure: Callable[..., Any]) -> np.ndarray:
-    """Returns what follows from the arrivals of one query."""
-    found = _arrivals(trained.field, trained.params, plan, query)
-    return np.asarray(measure(jax.tree.map(lambda leaf: leaf[0], found), receiver, query.frequency_hz[0]))
+@partial(jax.jit, static_argnames=("function",))
+def _of_arrivals(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfArrivals) -> Any:
+    arrivals = field.arrivals(params, plan, query)
+    return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
 
 
 def expected_errors(
@@ -85,11 +96,6 @@ def expected_errors(
     }
 
 
-@jax.jit
-def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> channel.Arrivals:
-    return field.arrivals(params, plan, query)
-
-
 def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_hz: Any) -> Any:
     y = snapshots_from_paths(arrivals, receiver, frequency_hz)
     directions = jnp.asarray(pas_directions(), jnp.float32)
@@ -98,7 +104,7 @@ def _beamforming_gain(arrivals: channel.Arrivals, receiver: Receiver, frequency_
     )
 
 
-CHANNEL: dict[str, tuple[str, Callable[[channel.Arrivals, Receiver, Any], Any] | None]] = {
+CHANNEL: dict[str, tuple[str, OfArrivals | None]] = {
     "snapshot": ("snapshots", None),
     "power": ("power_db", None),
     "beamforming-gain": ("beamforming_gain_db", _beamforming_gain),

@@ -1,0 +1,124 @@
+"""`wbgs-jax map`: the same answers as `wbgs-jax predict` gives place by place, pictures, and what cannot be asked."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from commands import assert_error_for_people, call
+from PIL import Image
+from synthetic import tiny_dataset
+from untrained import make_coherent_run, make_run
+
+from wbgs_jax import map as map_command
+from wbgs_jax import predict as predict_command
+from wbgs_jax.inference.floor import BEST_BEAM, cut_at, pieces, plane_over
+from wbgs_jax.radio.codebook import codebook
+
+AREA = ["--area", "-1,0:1,1", "--height", "1.3"]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return {"wave": make_coherent_run(folder / "wave"), "wideband": make_run(folder / "wideband")}
+
+
+def ask(runs, field, *arguments):
+    return call(map_command.main, "--run", runs[field], *arguments)
+
+
+@pytest.mark.parametrize("ghz", [(28,), (2.4, 28, 60)])
+@pytest.mark.parametrize("what", ["power", "k-factor", "delay-spread", "angular-spread"])
+def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
+    out, points = tmp_path / "map.npz", tmp_path / "points.npz"
+    result = ask(runs, "wave", "--ghz", *ghz, "--what", what, *AREA, "--step", 0.5, "--out", out)
+    assert result.code == 0, result.err
+    with np.load(out) as found:
+        xs, ys, height = found["xs"], found["ys"], float(found["height"])
+        name = map_command.LOOKS[what].name
+        values = found[name]
+        assert values.shape[:3] == (len(ghz), 2, 4) and height == 1.3
+        np.testing.assert_allclose(xs, [-0.75, -0.25, 0.25, 0.75])
+        assert json.loads(str(found["meta"]))["what"] == what
+    places = [f"{x},{y},{height}" for y in ys for x in xs]
+    result = call(predict_command.main, "--run", runs["wave"], "--tx", *places, "--ghz", *ghz, "--what", what, "--out", points)
+    assert result.code == 0, result.err
+    with np.load(points) as found:
+        expected = np.moveaxis(found[name], 1, 0).reshape(values.shape)
+    np.testing.assert_allclose(values, expected, rtol=2e-4, atol=1e-3 if what != "delay-spread" else 1e-12)
+    assert np.ptp(values) > 0
+
+
+def test_best_beams_are_those_of_the_spectra(runs, tmp_path):
+    out, points = tmp_path / "map.npz", tmp_path / "points.npz"
+    assert ask(runs, "wideband", "--ghz", 28, "--what", BEST_BEAM, *AREA, "--step", 0.5, "--out", out).code == 0
+    with np.load(out) as found:
+        beams, xs, ys = found["best_beam"], found["xs"], found["ys"]
+        azimuth, zenith = found["beam_azimuth_deg"], found["beam_zenith_deg"]
+    places = [f"{x},{y},1.3" for y in ys for x in xs]
+    assert call(predict_command.main, "--run", runs["wideband"], "--tx", *places, "--ghz", 28, "--out", points).code == 0
+    with np.load(points) as found:
+        heard = found["pas"].reshape(len(places), -1)[:, codebook()]
+    np.testing.assert_array_equal(beams.ravel(), heard.argmax(1))
+    assert azimuth.shape == zenith.shape == (len(codebook()),) and np.abs(azimuth).max() <= 180 and zenith.max() < 90
+
+
+def test_the_picture_shows_maps_and_walls(runs, tmp_path):
+    picture = tmp_path / "new" / "map.png"
+    result = ask(runs, "wave", "--ghz", 2.4, 28, "--step", 0.4, "--picture", picture)
+    assert result.code == 0 and result.err.splitlines()[-1] == f"picture: {picture}"
+    with Image.open(picture) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert np.ptp(pixels, -1).max() > 80 and pixels.std() > 20
+
+
+def test_another_receiver_has_another_map(runs, tmp_path):
+    maps = []
+    for name, rx in (("own", []), ("other", ["--rx", "0.5,0.5,1.5"])):
+        out = tmp_path / f"{name}.npz"
+        assert ask(runs, "wave", "--ghz", 28, *AREA, *rx, "--step", 0.5, "--out", out).code == 0
+        with np.load(out) as found:
+            maps.append(found["power_db"])
+    assert np.abs(maps[1] - maps[0]).max() > 1
+
+
+@pytest.mark.parametrize(
+    ("field", "arguments", "words"),
+    [
+        ("wave", ["--ghz", "28"], ["nothing to do", "--picture"]),
+        ("wave", ["--ghz", "28", "--out", "OUT/a.csv"], ["--out", ".npz"]),
+        ("wave", ["--ghz", "28", "--picture", "OUT/a.svg"], [".png"]),
+        ("wave", ["--ghz", "0.1", "--out", "OUT/a.npz"], ["0.3 to 100 GHz"]),
+        ("wave", ["--ghz", "28", "--step", "0", "--out", "OUT/a.npz"], ["--step 0"]),
+        ("wave", ["--ghz", "28", "--step", "1e-4", "--out", "OUT/a.npz"], ["1,000,000 places"]),
+        ("wave", ["--ghz", "28", "--height", "nan", "--out", "OUT/a.npz"], ["--height nan"]),
+        ("wave", ["--ghz", "28", "--area", "0,0:0,1", "--out", "OUT/a.npz"], ["--area 0,0:0,1 is no rectangle"]),
+        ("wave", ["--ghz", "28", "--area", "0,0:x,1", "--out", "OUT/a.npz"], ["is no rectangle"]),
+        ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["no k-factor", "wave"]),
+        ("wideband", ["--ghz", "0.5", "--out", "OUT/a.npz"], ["from 1 GHz on"]),
+    ],
+)
+def test_what_cannot_be_mapped(runs, tmp_path, field, arguments, words):
+    assert_error_for_people(ask(runs, field, *(word.replace("OUT", str(tmp_path)) for word in arguments)), *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_planes_are_filled_with_squares(rng):
+    low, size, step = rng.uniform(-5, 5, 2), rng.uniform(0.3, 4, 2), rng.uniform(0.05, 0.6)
+    plane = plane_over(low, low + size, 1.0, step)
+    for places, start, length in zip((plane.xs, plane.ys), low, size, strict=True):
+        spacing = length / len(places)
+        np.testing.assert_allclose(places, start + (np.arange(len(places)) + 0.5) * spacing)
+        assert len(places) == 1 or 0.66 * step < spacing < 1.51 * step
+    assert pieces(plane, np.ones(3)) == math.ceil(len(plane.positions()) / (512 // 3))
+
+
+def test_walls_are_cut_where_the_plane_meets_them():
+    dataset = tiny_dataset()
+    corners = dataset.vertices[dataset.faces]
+    height = float(np.median(dataset.vertices[:, 2])) + 0.1
+    lines = cut_at(dataset, height)
+    cuts = (corners[..., 2].min(1) < height) & (corners[..., 2].max(1) > height)
+    assert len(lines) == cuts.sum() > 0
+    assert (lines.reshape(-1, 2) >= dataset.vertices[:, :2].min(0) - 1e-6).all()

@@ -1,0 +1,104 @@
+"""What the commands share that ask a trained field: where and at which frequencies, what is doubtful there, and files."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+import wbgs_jax
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.inference.predictor import Trained, trained_band
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
+
+SHORTEST = 1e-3
+"""Of quaternions that are taken."""
+
+
+def receiver_at(word: str, like: Receiver) -> Receiver:
+    """Returns a receiver from "x,y,z" or "x,y,z,w,i,j,k", otherwise like another; anything else is a `UserError`."""
+    if not word:
+        return like
+    try:
+        values = np.array([float(part) for part in word.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
+    if len(values) not in (3, 7) or not np.isfinite(values).all() or not SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST:
+        raise UserError(f"--rx {word} is no receiver; give x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
+    unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
+    return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
+
+
+def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, " freq"]:
+    """Returns hertz; what no field answers is a `UserError`."""
+    low, high = LOWEST_OF_PATHS_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
+    if wrong := [f for f in ghz if not low <= f <= high]:
+        raise UserError(f"--ghz {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
+    return np.array(ghz) * 1e9
+
+
+def check_frequencies(trained: Trained, lowest_hz: float) -> None:
+    """Raises a `UserError` where a field is asked below the band of the model, and knows no paths, which hold there too."""
+    if lowest_hz < MIN_FREQUENCY_HZ and "paths" not in trained.field.known():
+        raise UserError(
+            f"the {trained.field.name} field of this run answers from {MIN_FREQUENCY_HZ / 1e9:g} GHz on, not at "
+            f"{lowest_hz / 1e9:g} GHz; below, only fields with paths do (--field wave or hybrid, on data with a mesh)"
+        )
+
+
+def doubts(
+    dataset: Dataset,
+    rx: Float[np.ndarray, "3"],
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+) -> list[str]:
+    """Returns why some of the answers should not be trusted: one line each."""
+    (low, high), band = DatasetScene(dataset).box, trained_band(dataset)
+    box = f"the box of {dataset.name}, {point_words(low)} to {point_words(high)}"
+    places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
+    lines = [
+        f"{end} {point_words(place)} lies outside {box}; the field was not trained there"
+        for end, place in places
+        if ((place < low) | (place > high)).any()
+    ]
+    for f in frequencies_hz:
+        if f < MIN_FREQUENCY_HZ:
+            lines.append(
+                f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
+                "badly what is not many wavelengths large"
+            )
+        elif not band[0] <= f <= band[1]:
+            trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
+            lines.append(f"{f / 1e9:g} GHz lies outside {trained}; the field was not trained there")
+    return lines
+
+
+def point_words(position: Float[np.ndarray, "3"]) -> str:
+    """Returns "(x, y, z) m"."""
+    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
+
+
+def link_words(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
+    """Returns how a line names a link."""
+    return f"TX {point_words(tx_position)} at {frequency_hz / 1e9:g} GHz"
+
+
+def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> None:
+    """Writes the answer's arrays that are known, and where they come from as JSON text in `meta`."""
+    known = {name: value for name, value in arrays.items() if value is not None}
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **known, meta=np.array(json.dumps(source)))
+
+
+def source_of(trained: Trained, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
+    """Returns where an answer comes from: scene, field, step, version, and the receiver that was asked."""
+    asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
+    origin = {name: value for name, value in trained.origin().items() if name in ("field", "step")}
+    return {"scene": dataset.name, "version": wbgs_jax.__version__, "receiver": asked} | origin
