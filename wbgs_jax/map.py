@@ -27,6 +27,7 @@ from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at, source_of, write_answer
 from wbgs_jax.inference.floor import Plane, ask_plane, cut_at, pieces, plane_over
 from wbgs_jax.inference.predictor import at_receiver
+from wbgs_jax.radio.channel import NOT_HEARD_DB
 from wbgs_jax.training.run_folder import load_trained
 
 MOST_PLACES = 1_000_000
@@ -143,12 +144,14 @@ def _drawn(look: Look, answer: dict[str, np.ndarray]) -> Float[np.ndarray, "freq
     values = answer[look.name]
     if look.name == "best_beam":
         return answer["beam_azimuth_deg"][values]
-    return look.scale * (values[..., 0] if values.ndim > 3 else values)
+    heard = values > NOT_HEARD_DB if look.name == "power_db" else np.ones(values.shape, bool)
+    drawn = look.scale * np.where(heard, values, np.nan)
+    return drawn[..., 0] if drawn.ndim > 3 else drawn
 
 
 def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
     """Returns limits of the colours that leave out the extreme hundredths."""
-    low, high = np.quantile(values, [0.01, 0.99])
+    low, high = np.nanquantile(values, [0.01, 0.99])
     return {"vmin": float(low), "vmax": float(high)}
 
 

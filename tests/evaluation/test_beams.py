@@ -1,11 +1,12 @@
 """Angle errors and beam losses against closed forms and a search through all beams."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from wbgs_jax.evaluation.beams import FAINTEST_DB, angle_error_deg, beam_loss_db, plane_normal
-from wbgs_jax.radio.array import pas_directions, planar_array
-from wbgs_jax.radio.codebook import RINGS, SECTORS, codebook
+from wbgs_jax.radio.array import pas_directions, planar_array, snapshot_to_pas
+from wbgs_jax.radio.codebook import RINGS, SECTORS, best_beams, codebook
 
 
 def spot(row, column, width=200.0):
@@ -35,6 +36,18 @@ def test_the_codebook_covers_the_hemisphere():
     assert len(beams) == len(set(codebook())) == RINGS * SECTORS
     nearest = (pas_directions().reshape(-1, 3) @ beams.T).max(1)
     assert np.degrees(np.arccos(nearest.min())) < np.hypot(90 / RINGS / 2, 180 / SECTORS) + 1
+
+
+def test_of_two_beams_that_hear_alike_the_one_ahead_is_best(rng):
+    """A planar array hears a wave from the front at the back too."""
+    array, beams = planar_array(), pas_directions().reshape(-1, 3)[codebook()]
+    azimuth, zenith = rng.uniform(-1.2, 1.2, 40), rng.uniform(0.5, 1.4, 40)
+    waves = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
+    snapshots = np.exp(2j * np.pi * waves @ array.T)
+    best = best_beams(np.asarray(snapshot_to_pas(jnp.asarray(snapshots, jnp.complex64), jnp.asarray(array, jnp.float32))))
+    heard = np.abs(np.exp(-2j * np.pi * beams @ array.T) @ snapshots.T)
+    np.testing.assert_allclose(heard[best, np.arange(40)], heard.max(0), rtol=0.051)
+    assert (beams[best, 0] > -1e-6).all()
 
 
 @pytest.mark.parametrize("tried", [1, 3])

@@ -5,8 +5,10 @@ import functools
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH, pas_directions
 
+ALIKE = 0.05
+"""Share by which the amplitudes of beams ahead and behind may differ: pixels are not quite symmetric."""
 RINGS, SECTORS = 4, 16
 """Beams on four rings of equal zenith angle, sixteen on each."""
 
@@ -20,5 +22,11 @@ def codebook() -> Int[np.ndarray, " beams"]:
 
 
 def best_beams(spectra: Float[np.ndarray, "n 90 360"]) -> Int[np.ndarray, " n"]:
-    """Returns which beam hears most in every spectrum."""
-    return spectra.reshape(len(spectra), -1)[:, codebook()].argmax(1)
+    """Returns which beam hears most in every spectrum. A planar array in the local y-z plane hears the same ahead and behind:
+    there the beam ahead, at local +x, where directional elements look."""
+    heard = spectra.reshape(len(spectra), -1)[:, codebook()]
+    best = heard.argmax(1)
+    ring, sector = np.divmod(best, SECTORS)
+    twin = ring * SECTORS + (SECTORS // 2 - sector) % SECTORS
+    ahead, row = pas_directions().reshape(-1, 3)[codebook(), 0], np.arange(len(heard))
+    return np.where((heard[row, twin] >= (1 - ALIKE) * heard[row, best]) & (ahead[twin] > ahead[best]), twin, best)
