@@ -71,6 +71,11 @@ class Simulator:
         self._scene = _load(spec, self.array, settings)
         self._tracers = _tracers(self._scene, spec, settings)
 
+    @property
+    def scene(self) -> rt.Scene:
+        """What the simulator holds."""
+        return self._scene
+
     def paths(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]) -> list[list[TxPaths]]:
         """Returns all paths from every transmitter (world frame, metres) to the receiver: by frequency, then by transmitter.
 

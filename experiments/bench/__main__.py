@@ -1,6 +1,6 @@
 """Measure this machine: renderer, training, queries, memory, time to quality.
 
-    python -m experiments.bench [--only renderer training queries memory quality] [--quick] [--gate] [--update]
+    python -m experiments.bench [--only renderer training queries rays memory quality] [--quick] [--gate] [--update]
 
 Competitors run interleaved in one process; the figures that compare machines are ratios, absolute times belong to the device
 named in the file. A whole run writes experiments/results/bench_<device>.json, the baseline of the next one. A run of some
@@ -20,7 +20,7 @@ import jax
 import tyro
 from rich.console import Console
 
-from experiments.bench import gate, quality, queries, renderer, training
+from experiments.bench import gate, quality, queries, rays, renderer, training
 from experiments.bench.timing import Effort, Report
 from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.errors import UserError
@@ -28,11 +28,12 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import device_name, environment
 
 RESULTS = Path(__file__).parents[1] / "results"
-Part = Literal["renderer", "training", "queries", "memory", "quality"]
+Part = Literal["renderer", "training", "queries", "rays", "memory", "quality"]
 PARTS: dict[Part, Callable[[Report, Effort], None]] = {
     "renderer": renderer.measure,
     "training": training.measure,
     "queries": queries.measure,
+    "rays": rays.measure,
     "memory": renderer.measure_memory,
     "quality": quality.measure,
 }

@@ -1,13 +1,14 @@
 """What is no series: laws of the frequency against what they are exact for, trained fields with and without neighbours."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 from synthetic import tiny_dataset, tiny_scene, tiny_settings
-from untrained import make_run
+from untrained import make_coherent_run, make_run
 
-from experiments import frequency_account, neighbours_account
+from experiments import frequency_account, neighbours_account, receivers_account
 from experiments.bench.main_job import measure
 from experiments.frequency_account import LAWS, polynomial
 from wbgs_jax.config import changed
@@ -57,6 +58,22 @@ def test_a_run_without_neighbours_scores_the_same_twice(tmp_path, monkeypatch):
     (scores,) = (value for value in json.loads((tmp_path / "neighbours.json").read_text()).values() if isinstance(value, dict))
     assert scores["alone"] == scores["asked"] and scores["neighbours"] == 0
     assert 0 < scores["nearest_tx"]["median_ssim"] < 1
+
+
+def test_receivers_that_were_never_heard(tmp_path, monkeypatch):
+    """The same receiver under another name scores as it does at home; what was trained is left out there."""
+    run = make_coherent_run(tmp_path / "box")
+    save_scene(tmp_path / "box_rx2.npz", dataclasses.replace(tiny_scene(), name="box_rx2"))
+    away = dataclasses.replace(tiny_scene(), name="box_rx3", rx_position=tiny_scene().rx_position + np.array([0.4, 0.1, 0.0]))
+    save_scene(tmp_path / "box_rx3.npz", away)
+    monkeypatch.setenv("WBGS_DATA", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["receivers_account", str(run), "--out", str(tmp_path)])
+    receivers_account.main()
+    scores = json.loads((tmp_path / "receivers.json").read_text())["box"]
+    assert scores.keys() == {"own", "rx2", "rx3"} and all(0 < place["ready_s"] < 60 for place in scores.values())
+    assert scores["rx2"]["new"] == scores["own"]["new"] == scores["own"]["test"]
+    assert scores["rx3"]["new"]["median_ssim"] != scores["own"]["new"]["median_ssim"]
+    assert scores["rx3"]["new"]["n"] == scores["own"]["test"]["n"] > 0
 
 
 def test_the_main_job_is_timed_against_another(tmp_path):

@@ -1,0 +1,154 @@
+"""The coherent field's paths: how long a receiver, a transmitter and a query take, how that grows, and beside other tracers."""
+
+import dataclasses
+import functools
+import importlib.util
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from experiments.bench import tracers
+from experiments.bench.timing import Effort, Report, interleaved, timed
+from wbgs_jax._util.command import say
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import wave
+from wbgs_jax.fields.wave import WaveConfig
+from wbgs_jax.fields.wave_settings import MAX_FACETS
+from wbgs_jax.types import Mesh, make_query, make_receiver
+
+SCENES, RIVAL_SCENES = ("2", "3", "4", "5"), ("1", "2")
+BLOCK_TX = 16
+FACETS = (500, 3_000, 10_000, 30_000, MAX_FACETS)
+HALL = np.array([30.0, 30.0, 4.0])
+"""Metres: the hall whose furniture makes the facets."""
+CROWD = 4
+"""Transmitters that are traced in the hall."""
+RIVAL_TX = 4
+RIVAL_CONFIG = WaveConfig(
+    mirror_areas=(0.0, 0.0), specular_tried=1024, specular_kept=512, diffracted_tried=8, diffracted_kept=8
+)
+"""Two reflections off facets of any size, as the others are asked for; what passes through walls cannot be left out."""
+
+
+def measure(report: Report, effort: Effort) -> None:
+    """All of it."""
+    for number in SCENES[:1] if effort.quick else SCENES:
+        _measure_scene(report, effort, number)
+    for facets in FACETS[:1] if effort.quick else FACETS:
+        _measure_hall(report, effort, facets)
+    for number in RIVAL_SCENES[:1] if effort.quick else RIVAL_SCENES:
+        _measure_rivals(report, effort, number)
+
+
+@jax.jit
+def answer(params: Any, plan: Any, paths: Any, place: Any, frequency_hz: Float[jax.Array, " b"]) -> Any:
+    """Returns spectra, snapshots and powers of transmitters whose paths are known."""
+    return wave.observe(params, plan, jax.tree.map(lambda leaf: leaf[place], paths), frequency_hz)
+
+
+trace = jax.jit(wave.trace)
+
+
+def _measure_scene(report: Report, effort: Effort, number: str) -> None:
+    """A released scene by its own numbers: everything that does not depend on the query is planned."""
+    say(f"rays: scene {number}")
+    dataset = load_dataset(number)
+    field = wave.make_field(DatasetScene(dataset).mesh())
+    params, receiver = tracers.known_params(field, dataset), dataset.receiver()
+    plan = field.plan(params, receiver)
+    some, tens = dataset.query(first_links(dataset, BLOCK_TX)).tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
+
+    def block() -> Any:
+        paths = trace(plan, some)
+        return [answer(params, plan, paths, jnp.full(len(tens), one), tens) for one in range(len(some))]
+
+    def single() -> Any:
+        return answer(params, plan, trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
+
+    ready, traced = (lambda: field.plan(params, receiver)), (lambda: trace(plan, some))
+    seconds = interleaved({"receiver": ready, "trace": traced, "block": block, "single": single}, effort)
+    report.add_time(f"rays_scene{number}_receiver_ready", seconds["receiver"])
+    report.add_time(f"rays_scene{number}_transmitter", seconds["trace"] / len(some))
+    report.add_time(f"rays_scene{number}_spectrum_in_blocks", seconds["block"] / len(some) / len(tens))
+    report.add_time(f"rays_scene{number}_query_of_{len(tens)}_frequencies", seconds["single"])
+
+
+def _measure_hall(report: Report, effort: Effort, facets: int) -> None:
+    """A hall full of boxes: how work grows with the number of facets."""
+    say(f"rays: a hall of {facets} facets")
+    rng = np.random.default_rng([effort.seed, facets])
+    field = wave.make_field(hall(facets, rng), WaveConfig(max_facets=MAX_FACETS))
+    receiver, params = make_receiver(HALL * [0.1, 0.5, 0.9]), field.init(jax.random.key(0))
+    plans: list[Any] = []
+    ready = timed(lambda: plans.append(field.plan(params, receiver)))
+    plan, tx = plans[0], rng.uniform(HALL * [0.1, 0.1, 0.8], HALL * 0.95, (CROWD, 3))
+    query = make_query(tx, 28e9)
+    compiled = trace.lower(plan, query.tx_position).compile()
+    every = jnp.arange(CROWD)
+    calls = {"query": lambda: answer(params, plan, compiled(plan, query.tx_position), every, query.frequency_hz)}
+    seconds = interleaved(calls, dataclasses.replace(effort, repeats=3))["query"] / CROWD
+    report.add(f"rays_{facets}_facets_receiver_ready", ready, "s", "lower")
+    report.add_sample(f"rays_{facets}_facets_queries_per_s", 1 / seconds, "1/s", "higher")
+    analysis = compiled.memory_analysis()
+    assert analysis is not None, "every backend with XLA knows"
+    report.add(f"rays_{facets}_facets_temporaries", analysis.temp_size_in_bytes / 1e9, "GB", "lower")
+
+
+def hall(facets: int, rng: np.random.Generator) -> Mesh:
+    """Returns a hall with as many boxes, in rows, as make so many facets."""
+    boxes = (facets - 6) // 6
+    side = int(np.ceil(np.sqrt(boxes)))
+    pitch = (HALL[:2] - 2) / side
+    parts = [trimesh.creation.box(bounds=[np.zeros(3), HALL])]
+    for place in range(boxes):
+        low = np.array([*(1 + pitch * divmod(place, side)), rng.uniform(0.05, 0.7 * HALL[2])])
+        size = np.array([*(0.4 * pitch), rng.uniform(0.1, 0.8)])
+        parts.append(trimesh.creation.box(bounds=[low, low + size]))
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + 8 * i for i, part in enumerate(parts)])
+    part = np.repeat(np.arange(len(parts)), 12)
+    arrays = (jnp.asarray(faces, jnp.int32), jnp.asarray(part, jnp.int32), jnp.zeros(len(faces), jnp.int32))
+    return Mesh(jnp.asarray(vertices, jnp.float32), *arrays, jnp.array([0.02], jnp.float32))
+
+
+def _measure_rivals(report: Report, effort: Effort, number: str) -> None:
+    """Other tracers at equal transmitters, receiver and orders, and how far they agree path by path."""
+    dataset = load_dataset(number)
+    asked = np.asarray(dataset.query(first_links(dataset, RIVAL_TX)).tx_position, np.float64), frequencies_of(dataset)
+    ours = tracers.Ours(dataset, RIVAL_CONFIG)
+    for name, (module, make) in tracers.RIVALS.items():
+        if importlib.util.find_spec(module) is None:
+            report.skip(f"rays_scene{number}_{name}", f"{module} is not installed; pip install {module}")
+            continue
+        say(f"rays: scene {number} beside {name}")
+        _measure_rival(report, effort, f"rays_scene{number}_{name}", ours, make(dataset, number), asked)
+
+
+def _measure_rival(report: Report, effort: Effort, label: str, ours: Any, rival: Any, asked: tuple[Any, Any]) -> None:
+    """One of them: what a transmitter takes at all frequencies, both in turn, and what both find."""
+    sides = {"ours": functools.partial(ours.fields, *asked), "theirs": functools.partial(rival.fields, *asked)}
+    seconds = interleaved(sides, dataclasses.replace(effort, repeats=min(effort.repeats, 5)))
+    report.add_sample(f"{label}_ratio", seconds["theirs"] / seconds["ours"], "x", "higher")
+    for side in sides:
+        report.add_time(f"{label}_transmitter_{side}", seconds[side] / len(asked[0]))
+    report.add(f"{label}_set_up_ours", ours.set_up_s, "s", "lower")
+    report.add(f"{label}_set_up_theirs", rival.set_up_s, "s", "lower")
+    for what, (value, unit, better) in tracers.compare(ours.paths(*asked), rival.paths(*asked)).items():
+        report.add(f"{label}_{what}", value, unit, better)
+
+
+def first_links(dataset: Dataset, count: int) -> np.ndarray:
+    """Returns a link each of some training transmitters, far apart in the list."""
+    _, first = np.unique(dataset.tx_index[dataset.train], return_index=True)
+    return dataset.train[first[np.linspace(0, len(first) - 1, count).round().astype(int)]]
+
+
+def frequencies_of(dataset: Dataset) -> Float[np.ndarray, " freq"]:
+    """Returns the frequencies of a data set, hertz."""
+    return np.unique(dataset.frequencies_hz)
