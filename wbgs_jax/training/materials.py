@@ -33,6 +33,20 @@ ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     "metal": (1.01, 1e7, 0.0),
 }
 """ITU-R P.2040-3, table 3 (metal has permittivity 1 there; log(eps_r - 1) is what is stored)."""
+USUAL_M: dict[str, float] = {
+    "concrete": 0.2,
+    "brick": 0.115,
+    "plasterboard": 0.0125,
+    "wood": 0.02,
+    "glass": 0.006,
+    "ceiling board": 0.015,
+    "chipboard": 0.018,
+    "plywood": 0.015,
+    "marble": 0.02,
+    "floorboard": 0.02,
+    "metal": 0.002,
+}
+"""Metres: how thick walls, boards and panes of each are sold or built; where to begin when a scene does not say."""
 UNSEEN = 1e-6
 """A material that changes the scores by less is in no path of the spectra, and stays what it is."""
 
@@ -55,14 +69,18 @@ class SearchReport:
     """Thicknesses that were found for materials whose thickness the scene does not say."""
 
 
-def search_materials(params: Any, score: Scores, config: SearchConfig) -> tuple[Any, SearchReport]:
-    """Returns parameters with the materials whose scores are best."""
+def search_materials(params: Any, score: Scores, config: SearchConfig, usual: bool = False) -> tuple[Any, SearchReport]:
+    """Returns parameters with the materials whose scores are best; with `usual`, those that change become as thick as is usual
+    (where the scene says how thick they are, that counts for nothing)."""
     before, taken, settled = np.zeros(0), dict[int, str](), 0
     count = len(params.materials.slope)
     for turn in range(config.rounds * count):
         material = turn % count
         entries = [
-            dataclasses.replace(params, materials=with_entry(params.materials, material, name)) for name in ITU_MATERIALS
+            dataclasses.replace(
+                params, materials=with_entry(params.materials, material, name, USUAL_M[name] if usual else None)
+            )
+            for name in ITU_MATERIALS
         ]
         likely = np.argsort(score(entries, config.glance).mean(1))[:SHORTLIST]
         candidates = [params, *(entries[i] for i in likely)]
@@ -85,11 +103,13 @@ def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], e
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def with_entry(materials: Any, material: int, name: str) -> Any:
-    """Returns a copy in which one material is an entry of ITU-R P.2040; its thickness stays."""
+def with_entry(materials: Any, material: int, name: str, metres: float | None = None) -> Any:
+    """Returns a copy in which one material is an entry of ITU-R P.2040, so many metres thick, or as thick as before."""
     permittivity, c, d = ITU_MATERIALS[name]
+    thickness = materials.log_thickness
     return dataclasses.replace(
         materials,
+        log_thickness=thickness if metres is None else thickness.at[material].set(np.log(metres)),
         log_susceptibility=materials.log_susceptibility.at[material].set(np.log(permittivity - 1)),
         log_conductivity=materials.log_conductivity.at[material].set(np.log(c)),
         slope=materials.slope.at[material].set(d),

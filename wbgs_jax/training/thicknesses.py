@@ -3,8 +3,8 @@
 What passes a slab, or comes back from its far side, has turned by its optical thickness, t sqrt(eps_r), in wavelengths. At low
 frequencies few thicknesses can be told from each other and one look at all of them is enough; every higher frequency then tells
 those apart that the ones before it left, just as surfaces are put in place (geometry.py). Entries of the list of materials are
-tried with the thickness that keeps the optical thickness as it is. What comes out is taken if it says spectra surely better
-than materials alone, of the thickness that they had.
+tried with the thickness that keeps the optical thickness as it is. Materials as thick as is usual are the beginning, and what
+comes out is taken if it says spectra surely better than those.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ def search_slabs(
 ) -> tuple[Any, SearchReport]:
     """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say.
 
-    Thicknesses are searched where snapshots are known; pictures alone keep those of `params`.
+    Thicknesses are searched where snapshots are known; to pictures alone materials are as thick as is usual.
 
     Args:
         params: with `materials`, one of them for each of the field's thicknesses.
@@ -58,11 +58,11 @@ def search_slabs(
         compared: of those.
     """
     score, unknown = told.scores(count, compared), np.asarray(told.field.known_thickness) == 0
-    named, report = search_materials(params, score, config)
+    named, report = search_materials(params, score, config, usual=bool(unknown.any()))
     if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
         return named, report
     once = dataclasses.replace(config, rounds=1)
-    sized, anew = search_materials(_sized(params, unknown, told, config, compared), score, once)
+    sized, anew = search_materials(_sized(named, unknown, told, config, compared), score, once)
     before, after = score([named, sized])
     if not surely_better(before - after, told.tx_index(count), SURE):
         return named, report
@@ -144,9 +144,7 @@ def _best(params: Any, material: int, slabs: list[_Slab], score: Scores, glance:
 
 
 def _made_of(params: Any, material: int, slab: _Slab) -> Any:
-    materials = with_entry(params.materials, material, slab.entry)
-    thickness = materials.log_thickness.at[material].set(np.log(slab.metres))
-    return dataclasses.replace(params, materials=dataclasses.replace(materials, log_thickness=thickness))
+    return dataclasses.replace(params, materials=with_entry(params.materials, material, *slab))
 
 
 def _scores(candidates: list[Any], score: Scores, glance: int) -> Float[np.ndarray, " k"]:
