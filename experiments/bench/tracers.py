@@ -251,19 +251,24 @@ def compare(ours: list[Found], theirs: list[Found]) -> dict[str, tuple[float, st
         own_match, other_match = _matches(own.length_m, other.length_m), _matches(other.length_m, own.length_m)
         both += [(own_match >= 0).sum(), (other_match >= 0).sum()]
         counts += [len(own_match), len(other_match)]
-        mutual = np.flatnonzero((own_match >= 0) & (other_match[own_match] == np.arange(len(own_match))))
+        mutual = np.flatnonzero(own_match >= 0)
+        mutual = mutual[other_match[own_match[mutual]] == mutual]
         a, b = own.amplitude[:, mutual], other.amplitude[:, own_match[mutual]]
         loudest = np.abs(a) >= FAINT * np.abs(a).max(1, keepdims=True, initial=0)
         amplitudes.append((np.abs(np.abs(a) - np.abs(b)) / np.maximum(np.abs(a), 1e-30))[loudest])
         delays.append(np.abs(own.length_m[mutual] - other.length_m[own_match[mutual]]) / SPEED_OF_LIGHT * 1e12)
-    amplitude, delay = np.concatenate(amplitudes), np.concatenate(delays)
-    return {
+    shares = {
         "found_of_ours": (float(both[0] / max(counts[0], 1)), "", "higher"),
         "ours_found_of": (float(both[1] / max(counts[1], 1)), "", "higher"),
+        "paths_compared": (float(sum(map(len, delays))), "", "higher"),
+    }
+    if not shares["paths_compared"][0]:
+        return shares
+    amplitude, delay = np.concatenate(amplitudes), np.concatenate(delays)
+    return shares | {
         "amplitude_median": (float(np.median(amplitude)), "", "lower"),
         "amplitude_90_percent": (float(np.quantile(amplitude, 0.9)), "", "lower"),
         "delay_largest": (float(delay.max()), "ps", "lower"),
-        "paths_compared": (float(len(delay)), "", "higher"),
     }
 
 
