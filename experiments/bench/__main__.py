@@ -28,6 +28,8 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import device_name, environment
 
 RESULTS = Path(__file__).parents[1] / "results"
+OF_A_PART = ("commit", "version", "jax", "cores", "load", "torch", "repeats")
+"""What a part's figures depend on besides the device: others may have been measured another day."""
 Part = Literal["renderer", "training", "queries", "rays", "memory", "quality"]
 PARTS: dict[Part, Callable[[Report, Effort], None]] = {
     "renderer": renderer.measure,
@@ -73,7 +75,8 @@ def measure(command: Command) -> dict[str, Any]:
         report, begin = Report(), time.perf_counter()
         PARTS[name](report, effort)
         metrics |= report.metrics
-        parts[name] = {"commit": here["commit"], "seconds": round(time.perf_counter() - begin), "skipped": report.skipped}
+        spent = {"seconds": round(time.perf_counter() - begin), "skipped": report.skipped}
+        parts[name] = {key: here[key] for key in OF_A_PART} | spent
     return {"metrics": metrics, "environment": here | {"parts": parts}}
 
 

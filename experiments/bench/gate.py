@@ -38,10 +38,11 @@ def check(metrics: Metrics, baseline: Metrics) -> None:
 
 
 def merge(result: dict[str, Any], baseline: dict[str, Any]) -> dict[str, Any]:
-    """A run of some parts, completed by the baseline's others; the environment's `parts` say where each comes from."""
+    """A run of some parts, completed by the baseline's others. The environment is that of the baseline's whole run; its `parts`
+    say where each comes from."""
     environment, old = result["environment"], baseline["environment"]
     parts = old.get("parts", {}) | environment["parts"]
-    return {"metrics": baseline["metrics"] | result["metrics"], "environment": environment | {"parts": parts}}
+    return {"metrics": baseline["metrics"] | result["metrics"], "environment": old | {"parts": parts}}
 
 
 def change(metric: dict[str, Any], baseline: dict[str, Any] | None) -> str:
