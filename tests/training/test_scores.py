@@ -26,7 +26,7 @@ def run(tmp_path_factory):
 
 def other_materials(params, rng):
     materials = params.materials
-    moved = materials.log_susceptibility + jnp.asarray(rng.normal(0, 0.3, materials.slope.shape), jnp.float32)
+    moved = materials.log_susceptibility + jnp.asarray(rng.normal(0, 1.0, materials.slope.shape), jnp.float32)
     return dataclasses.replace(params, materials=dataclasses.replace(materials, log_susceptibility=moved))
 
 

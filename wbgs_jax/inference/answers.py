@@ -14,6 +14,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.predictor import Trained, trained_band
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
 
@@ -47,9 +48,10 @@ def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, " freq"]:
 def check_frequencies(trained: Trained, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below the band of the model, and knows no paths, which hold there too."""
     if lowest_hz < MIN_FREQUENCY_HZ and "paths" not in trained.field.known():
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
         raise UserError(
             f"the {trained.field.name} field of this run answers from {MIN_FREQUENCY_HZ / 1e9:g} GHz on, not at "
-            f"{lowest_hz / 1e9:g} GHz; below, only fields with paths do (--field wave or hybrid, on data with a mesh)"
+            f"{lowest_hz / 1e9:g} GHz; below, only fields with paths do: train --field {able} on data with a mesh"
         )
 
 
