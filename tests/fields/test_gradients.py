@@ -130,14 +130,15 @@ def has(path, names):
     return any(name in jax.tree_util.keystr(path) for name in names)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
+def disagreements(rng, name):
+    """By leaf, what the gradient at a random point says and what finite differences say, where they do not agree."""
     kind = name.split()[0]
     arguments, weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
     (value, spectra), gradients = differentiated(name)(arguments, weights)
     pixels = np.asarray(spectra).reshape(2, -1)
     assert np.isfinite(float(value)) and (pixels.std(1) > 0.01 * pixels.mean(1)).all()  # a uniform picture would test nothing
     leaves, structure = jax.tree.flatten(arguments)
+    found = {}
     for i, (path, gradient) in enumerate(jax.tree_util.tree_leaves_with_path(gradients)):
         leaf, gradient, where = leaves[i], np.asarray(gradient), jax.tree_util.keystr(path)
         assert np.isfinite(gradient).all(), where
@@ -164,13 +165,18 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
             continue
         assert gradient.any(), where
         tolerance = RELATIVE * (abs(exact) + magnitude) + ROUNDING
-        found = []
-        for differences, step in [*((slope, s) for s in STEPS), *((slope_ahead, s * side) for s in STEPS for side in (1, -1))]:
-            found.append(differences(step))
-            if abs(found[-1] - exact) < tolerance:
-                break
-        else:
-            pytest.fail(f"{where}: {exact}, finite differences {found}")
+        tried = [*((slope, s) for s in STEPS), *((slope_ahead, s * side) for s in STEPS for side in (1, -1))]
+        if not any(abs(by(step) - exact) < tolerance for by, step in tried):
+            found[where] = f"{exact}, finite differences {[by(step) for by, step in tried]}"
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
+    """A wrong gradient is wrong everywhere; differences err where many kinks meet, and hardly at two points in turn."""
+    if found := disagreements(rng, name):
+        again = disagreements(rng, name)
+        assert not found.keys() & again.keys(), {where: (found[where], again[where]) for where in found.keys() & again.keys()}
 
 
 @pytest.mark.parametrize("name", ["wideband", "wrfgs"])
