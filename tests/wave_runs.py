@@ -22,16 +22,16 @@ def places(n_tx, margin=0.3):
     return np.random.default_rng(3).uniform(low, np.array([6.0, 4.0, 3.0]) - margin, (n_tx, 3))
 
 
-def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None) -> Run:
-    """The paths of all transmitters, and snapshots that mean nothing unless given (tx, 1, freq, 16)."""
+def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None, receivers=(RX,)) -> Run:
+    """The paths of all transmitters, and snapshots that mean nothing unless given (tx, rx, freq, 16)."""
     mesh, n_tx = mesh_of(*parts), len(tx_positions)
-    nothing = np.ones((n_tx, 1, len(frequencies_hz), 16), np.complex64)
+    nothing = np.ones((n_tx, len(receivers), len(frequencies_hz), 16), np.complex64)
     scene = dataclasses.replace(
-        tiny_scene(n_tx),
+        tiny_scene(n_tx, n_rx=len(receivers)),
         snapshots=nothing if snapshots is None else snapshots,
         tx_positions=tx_positions,
         frequencies_hz=frequencies_hz,
-        rx_position=np.array([RX]),
+        rx_position=np.array(receivers),
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
         face_part=np.asarray(mesh.part),
@@ -42,6 +42,5 @@ def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None
 
 @jax.jit
 def snapshots(params, plan, cache, links):
-    """What the coherent field says of links whose paths are prepared."""
-    paths = jax.tree.map(lambda leaf: leaf[links.tx_index], cache.paths)
-    return wave.path_snapshots(params, plan, paths, links.query.frequency_hz)
+    """What the coherent field says of links of one receiver whose paths are prepared."""
+    return wave.path_snapshots(params, plan, cache.of(links), links.query.frequency_hz)

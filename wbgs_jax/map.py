@@ -74,8 +74,8 @@ class Command:
     area: str = ""
     """Corners of the plane, x0,y0:x1,y1 in metres; by default all of the scene."""
     rx: str = ""
-    """Another receiver than the trained one: x,y,z in metres, or x,y,z,w,i,j,k with the quaternion that turns its array into
-    the world frame."""
+    """Another receiver than the first of the data: the number of one of them, x,y,z in metres, or x,y,z,w,i,j,k with the
+    quaternion that turns its array into the world frame."""
     out: Path | None = None
     """Write the maps to this .npz file: values (frequency, y, x)."""
     picture: Path | None = None
@@ -163,7 +163,7 @@ def main(arguments: list[str] | None = None) -> None:
     frequencies_hz = frequencies(command.ghz)
     trained = load_trained(command.run)
     dataset = trained.dataset()
-    plane, receiver = plane_of(command, dataset), receiver_at(command.rx, dataset.receiver())
+    plane, receiver = plane_of(command, dataset), receiver_at(command.rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
     check_frequencies(trained, float(frequencies_hz.min()))
     rx = np.asarray(receiver.position)

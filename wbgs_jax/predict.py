@@ -74,8 +74,9 @@ class Command:
     ghz: tuple[float, ...] = ()
     """Frequencies, 1 to 100, and from 0.3 for fields with paths; every transmitter is asked at every one of them."""
     rx: str = ""
-    """Another receiver than the trained one: x,y,z in metres, or x,y,z,w,i,j,k with the quaternion that turns its array into
-    the world frame. Array and pattern stay. Only fields with paths know others."""
+    """Another receiver than the first of the data: the number of one of them; or x,y,z in metres, or x,y,z,w,i,j,k with the
+    quaternion that turns its array into the world frame. Array and pattern stay. Only fields with paths know places that the
+    data do not have."""
     what: What = "spectra"
     """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
     tx_velocity: str = "0,0,0"
@@ -252,7 +253,7 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
     if not (command.out or command.picture):
         return
-    receiver = receiver_at(command.rx, dataset.receiver())
+    receiver = receiver_at(command.rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
     check_frequencies(trained, lowest_asked(command, frequencies_hz))
     for line in doubts(dataset, np.asarray(receiver.position), tx_positions, frequencies_hz):

@@ -18,6 +18,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import source_names
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.inference.confidence import write_confidence
@@ -35,7 +36,7 @@ class Command:
     """Train a radiance field on the spectra of one scene, and leave it in a run folder."""
 
     scene: str | None = None
-    """Released scene (1, 2, ...) or a scene file (.npz)."""
+    """Released scene (1, 2, ...) or a scene file (.npz); several of one room, seen by different receivers, as A,B."""
     data: str | None = None
     """Folder of the published layout (spectrum/*.png, tx_pos.csv, ...), instead of --scene."""
     out: Path | None = None
@@ -117,10 +118,9 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
     check(settings)
     get_field(command.field).check(settings.field)
     source = command.scene if command.data is None else command.data
-    if Path(str(source)).exists():
-        source = str(Path(str(source)).resolve())
+    names = [str(Path(name).resolve()) if Path(name).exists() else name for name in source_names(str(source))]
     return RunConfig(
-        source=str(source),
+        source=",".join(names),
         field=command.field,
         preset=command.preset,
         seed=command.seed,

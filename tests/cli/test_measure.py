@@ -75,13 +75,14 @@ def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
 
 
 def test_odd_rooms_and_receivers(tmp_path, rng):
-    """A receiver heard in one room alone, one never heard, and names of rooms that are markup."""
+    """A receiver heard in one room alone, one never heard, a square where nothing is, and names of rooms that are markup."""
     data = folder(tmp_path, rng, n=200)
     header, *lines = (data / "readings.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines]
     for row in rows:
         row[2] = "[/hall]" if row[2] == "west" else "[kitchen]"
         row[4], row[5] = (row[4] if row[2] == "[/hall]" else ""), ""
+        row[3:] = ["", "", ""] if max(float(row[0]), float(row[1])) < 1 else row[3:]
     (data / "readings.csv").write_text("\n".join([header, *(",".join(row) for row in rows)]))
     done = call(main, "--data", data, "--out", tmp_path / "scores.json")
     assert done.code == 0, done.err

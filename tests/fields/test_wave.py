@@ -142,12 +142,17 @@ def test_another_receiver_is_asked_as_if_it_were_the_only_one(folder, trained, t
     receiver stands goes with that one. At its own place the field is what it was."""
     receiver = trained.dataset().receiver()
     assert at_receiver(trained, receiver) is trained
-    shifted = dataclasses.replace(trained.field.motion, receiver=jnp.full(3, 0.05), receiver_turn=jnp.full(3, 0.1))
+    shift, turned = jnp.full((1, 3), 0.05), jnp.full((1, 3), 0.1)
+    shifted = dataclasses.replace(trained.field.motion, receiver=shift, receiver_turn=turned)
     moved = dataclasses.replace(trained, field=dataclasses.replace(trained.field, motion=shifted))
     rx, turn, tx = [1.5, 2.0, 1.0], [0.6, 0.0, 0.0, 0.8], [4.0, 1.2, 1.4]
     elsewhere = dataclasses.replace(receiver, position=jnp.array(rx), orientation=jnp.array(turn))
     there = at_receiver(moved, elsewhere)
-    assert not np.any(there.field.motion.receiver) and not np.any(there.field.motion.receiver_turn)
+    at_home, away = (there.field.plan(there.params, one).receiver for one in (receiver, elsewhere))
+    np.testing.assert_allclose(at_home.position, receiver.position + 0.05, rtol=1e-6)
+    assert np.linalg.norm(at_home.orientation - receiver.orientation) > 0.05
+    for own, said in zip(jax.tree.leaves(away), jax.tree.leaves(elsewhere), strict=True):
+        np.testing.assert_allclose(own, said, atol=1e-7)
     assert there.confidence is None and there.power_confidence is None and there.neighbours is None
     plan = trained.field.plan(trained.params, elsewhere)
     expected = np.asarray(jax.jit(wave.snapshots)(trained.params, plan, make_query([tx], [3e9])))
@@ -182,12 +187,24 @@ def test_without_surfaces_the_message_says_so(scene):
         make_mesh(points)
 
 
-def test_several_receivers_are_refused_by_name():
-    """Its mirror images are those of one receiver."""
+def test_links_of_several_receivers_are_rendered_as_those_of_each_alone():
+    """From one table of paths, in which every receiver has those of its own transmitters."""
     dataset = scene_dataset(tiny_scene(n_rx=3))
-    field = wave.make_field(make_mesh(dataset), WaveConfig(mirror_areas=(0.0,), **SMALL))
-    with pytest.raises(UserError, match="the wave field knows one receiver, and the data have 3"):
-        field.prepare(dataset.links(np.arange(4)), dataset.receivers)
+    field = wave.make_field(make_mesh(dataset), WaveConfig(mirror_areas=(0.0,), **SMALL), dataset.receivers.position)
+    params, index = field.init(jax.random.key(0)), np.flatnonzero((dataset.receiver_index != 1) | (dataset.tx_index < 4))
+    together = observe_links(field, params, dataset, index)
+    for number in range(3):
+        own, place = dataset.receiver(number), np.flatnonzero(dataset.receiver_index[index] == number)
+        plan = field.plan(params, own)
+        alone = jax.jit(WaveField.render)(field, params, plan, dataset.query(index[place]))
+        for one, other in (
+            (together.pas, alone.pas),
+            (together.snapshots, alone.snapshots),
+            (together.power_db, alone.power_db),
+        ):
+            np.testing.assert_allclose(one[place], other, atol=2e-3 * np.abs(other).max())
+    with pytest.raises(TypeError, match="traces no others"):
+        wave.trace(field.plan(params, own, cache=field.prepare(dataset.links(index), dataset.receivers)), jnp.ones((1, 3)))
 
 
 @pytest.mark.parametrize("parts", [SHEETS, pytest.param(PARTS, marks=pytest.mark.slow)], ids=["sheets", "edges"])

@@ -9,14 +9,14 @@ import pytest
 import wave_runs
 from jax.flatten_util import ravel_pytree
 from synthetic import tiny_settings
-from wave_runs import PARTS, places, run_in
+from wave_runs import PARTS, RX, places, run_in
 
-from wbgs_jax.fields import wave
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
 from wbgs_jax.propagation.motion import Motion, length_changes
 from wbgs_jax.training.adjustment import adjust, length_variances, normal_equations
 
-N_TX, FREQUENCIES = 8, np.array([1e9, 3e9])
+N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
+RECEIVERS = RX, (5.2, 2.9, 1.6)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8, "mirror_areas": (0.0,)},
@@ -26,11 +26,11 @@ WIDTHS = (2e-2, 1e-3, 1e-3, 2e-3)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Of 8 transmitters whose snapshots are those of the room as it is."""
-    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(N_TX, 0.4), FREQUENCIES)
-    plan = run.field.plan(run.state.params, run.dataset.receiver(), cache=run.cache)
-    seen = jax.jit(wave.WaveField.render_links)(run.field, run.state.params, plan, run.cache, run.data.links)
-    run.data = dataclasses.replace(run.data, snapshots=seen.snapshots)
+    """Of 6 transmitters whose snapshots, at two receivers, are those of the room as it is."""
+    folder = tmp_path_factory.mktemp("room")
+    run = run_in(PARTS, SETTINGS, folder, places(N_TX, 0.4), FREQUENCIES, receivers=RECEIVERS)
+    _, tree, links = parts_of(run, len(run.data.links.tx_index))
+    run.data = dataclasses.replace(run.data, snapshots=snapshots(ravel_pytree(run.field.motion)[0], tree, links))
     return run
 
 
@@ -46,20 +46,28 @@ def drawn(rng, run, size):
 
 @jax.jit
 def snapshots(flat, run_tree, links):
-    """Of the room with its things elsewhere, to first order."""
-    field, params, receiver, cache, nothing = run_tree
+    """Of the room with its things and receivers elsewhere, to first order."""
+    field, params, receivers, cache, nothing = run_tree
     motion = ravel_pytree(nothing)[1](flat)
-    return wave_runs.snapshots(params, field.displaced(field.plan(params, receiver, cache=cache), motion), cache, links)
+
+    def one(link):
+        number = link.receiver_index
+        plan = field.plan(params, jax.tree.map(lambda leaf: leaf[number], receivers), cache=cache)
+        of_one = jax.tree.map(lambda leaf: leaf[None], link)
+        return wave_runs.snapshots(params, field.displaced(plan, motion.of_receiver(number)), cache, of_one)[0]
+
+    return jax.vmap(one)(links)
 
 
 def parts_of(run, count):
     index = jnp.arange(count)
-    tree = run.field, run.state.params, run.dataset.receiver(), run.cache, run.field.motion
+    tree = run.field, run.state.params, run.dataset.receivers, run.cache, run.field.motion
     return index, tree, jax.tree.map(lambda leaf: leaf[index], run.data.links)
 
 
 def certain(run):
-    return jnp.zeros((N_TX, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
+    pairs = N_TX * len(RECEIVERS)
+    return jnp.zeros((pairs, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
 
 
 def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
@@ -98,11 +106,13 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
     flat, back = ravel_pytree(run.field.motion)
     number, width = rng.integers(flat.size), 3e-3
     root = jnp.zeros((flat.size, flat.size)).at[number, number].set(width)
-    found = np.asarray(length_variances(run.cache, root, len(run.field.motion.shift)))
+    found = np.asarray(length_variances(run.cache, root, len(run.field.motion.shift), len(RECEIVERS)))
     motion = back(jnp.zeros_like(flat).at[number].set(width))
     for k, name in enumerate(("specular", "diffracted")):
         paths = getattr(run.cache.paths, name)
-        changes = jax.vmap(lambda some: length_changes(some, run.cache.search, motion))(paths)
+        changes = jax.vmap(lambda some, number: length_changes(some, run.cache.surfaces, motion.of_receiver(number)))(
+            paths, run.cache.receiver_index
+        )
         own = found[:, : changes.shape[1]] if k == 0 else found[:, -changes.shape[1] :]
         alive = np.asarray(paths.alive)
         np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)

@@ -1,4 +1,4 @@
-"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout."""
+"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them."""
 
 import os
 from pathlib import Path
@@ -8,6 +8,7 @@ from jaxtyping import Bool
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset, Materials
+from wbgs_jax.data.join import join
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.types import Receiver, make_receiver, stack_receivers
@@ -21,7 +22,8 @@ RELEASED = Path(__file__).parent / "released"
 def load_dataset(
     source: str | int | Path, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2
 ) -> Dataset:
-    """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout.
+    """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
+    from several of one scene, with commas between them, as one data set of several receivers (`wbgs_jax.data.join`).
 
     `frequency_hz`, `seed` and `test_fraction` are for folders that do not say (`wbgs_jax.data.layout.load_layout`); scene
     files know their frequencies and their split.
@@ -34,12 +36,20 @@ def load_dataset(
     if (path := released_scenes().get(str(source))) is not None:
         return scene_dataset(load_scene(path))
     path = Path(str(source))
+    if len(names := source_names(source)) > 1:
+        return join([load_dataset(name, frequency_hz, seed, test_fraction) for name in names])
     if path.is_dir():
         return load_layout(path, frequency_hz=frequency_hz, seed=seed, test_fraction=test_fraction)
     if path.suffix == ".npz":
         return scene_dataset(load_scene(path))
     known = ", ".join(released_scenes()) or f"none in {_scene_folder()} (make them with `make data`)"
     raise UserError(f"there is no scene {str(source)!r}; give a released one ({known}), an .npz scene file or a folder")
+
+
+def source_names(source: str | int | Path) -> list[str]:
+    """Returns the names of the data sets that a name with commas stands for; a file or folder may have commas in its own."""
+    word = str(source)
+    return [word] if Path(word).exists() else [name for name in word.split(",") if name]
 
 
 def scene_dataset(scene: SceneFile) -> Dataset:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from skimage.metrics import structural_similarity
 
 from wbgs_jax._util.errors import UserError
@@ -84,8 +84,10 @@ def summarise(
     values: dict[str, Float[np.ndarray, " n"]],
     frequencies_hz: Float[np.ndarray, " n"],
     sight: Bool[np.ndarray, " n"] | None = None,
+    receiver: Int[np.ndarray, " n"] | None = None,
 ) -> dict[str, Any]:
-    """Returns the report of `score` from the figures of all spectra."""
+    """Returns the report of `score` from the figures of all spectra; of several receivers, where their numbers are given, with
+    the same figures in per_receiver."""
 
     def part(chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]:
         return _summary({name: value[chosen] for name, value in values.items()})
@@ -93,6 +95,8 @@ def summarise(
     report = _summary(values)
     if sight is not None:
         report |= {name: part(where) for name, where in (("in_sight", sight), ("out_of_sight", ~sight)) if where.any()}
+    if receiver is not None and len(numbers := np.unique(receiver)) > 1:
+        report["per_receiver"] = [{"receiver": int(number)} | part(receiver == number) for number in numbers]
     by_frequency = ((f, part(frequencies_hz == f)) for f in np.unique(frequencies_hz))
     return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | summary for f, summary in by_frequency]}
 

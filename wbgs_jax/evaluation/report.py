@@ -10,6 +10,7 @@ from rich.table import Table
 
 import wbgs_jax
 from wbgs_jax.config import to_dict
+from wbgs_jax.data.load import source_names
 from wbgs_jax.data.splits import VALIDATION
 
 
@@ -40,8 +41,8 @@ def provenance(trained: Any) -> dict[str, Any]:
 
 
 def _training_arguments(config: Any) -> list[str]:
-    source = Path(config.source)
-    data = ["--data", source.name] if source.is_dir() else ["--scene", source.name]
+    sources = [Path(name) for name in source_names(config.source)]
+    data = ["--data" if sources[0].is_dir() else "--scene", ",".join(path.name for path in sources)]
     if config.frequency_ghz is not None:
         data += ["--frequency-ghz", f"{config.frequency_ghz:g}"]
     if config.train_ghz:
@@ -122,6 +123,9 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
         parts = {"in sight of the receiver": report.get("in_sight"), "out of sight": report.get("out_of_sight")}
         seen = [f"{name} {part['median_ssim']:.3f} (n = {part['n']})" for name, part in parts.items() if part]
         lines += [f"SSIM {', '.join(seen)} (medians)"] if seen else []
+        if each := report.get("per_receiver"):
+            said = [f"{own['receiver']}: {own['median_ssim']:.3f} / {own['mean_ssim']:.3f}" for own in each]
+            lines.append(f"SSIM by receiver (median / mean): {', '.join(said)}")
         lines.append(
             f"strongest direction: {report['angle_error_deg']:.1f} degrees off (median); best predicted beam: "
             f"{report['beam_loss_db']:.2f} dB lost, best of three {report['beam_loss_top3_db']:.2f} dB (means)"

@@ -46,7 +46,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     truth, known = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
-    report |= metrics.summarise(figures, *known)
+    report |= metrics.summarise(figures, *known, dataset.receiver_index[index])
     repeats = repeatability(dataset.name, np.unique(known[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
     if seen.snapshots is not None and dataset.snapshots is not None:

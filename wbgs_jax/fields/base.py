@@ -218,14 +218,6 @@ def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any
     return field.render(params, field.plan(params, receiver, limits), query).pas
 
 
-def single_receiver(receivers: Receiver, name: str) -> Receiver:
-    """Returns the only receiver; more than one is a `UserError`."""
-    count = receivers.position.shape[0]
-    if count != 1:
-        raise UserError(f"the {name} field knows one receiver, and the data have {count}; choose one (--receiver 0)")
-    return jax.tree.map(lambda leaf: leaf[0], receivers)
-
-
 _FIELDS: dict[str, type[Field]] = {}
 
 

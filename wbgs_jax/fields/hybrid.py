@@ -5,7 +5,7 @@
 The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
 needs neither and blurs. Both are trained on the same batches; the share w, query by query, is what explains validation
 transmitters best (trust.py).
-Without a mesh, or with several receivers, of which the coherent field knows nothing, it is the splatting field by itself.
+Without a mesh it is the splatting field by itself.
 """
 
 import dataclasses
@@ -23,8 +23,9 @@ from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, Quantity, register
 from wbgs_jax.fields.losses import ssim
+from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import SHARES, Scored, Share, constant, features, learn_share, share_of
-from wbgs_jax.fields.wave import PreparedPaths, WaveConfig, WaveField
+from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
@@ -166,8 +167,9 @@ class HybridField(Field):
         """Returns the parameters with the shares of the coherent field that explain best what neither field was trained on."""
         if self.wave is None or not batches:
             return params, {}
-        plan = self.plan(params, batches[0].receiver, None, cache)
-        seen = [jax.tree.map(np.asarray, _scores(self, params, plan, cache, batch)) for batch in batches]
+        receivers = {_receiver_of(batch): batch.receiver for batch in batches}
+        plans = {number: self.plan(params, receiver, None, cache) for number, receiver in receivers.items()}
+        seen = [jax.tree.map(np.asarray, _scores(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
         told, *scores = (None if part[0] is None else np.concatenate(part) for part in zip(*seen, strict=True))
         assert told is not None
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
@@ -181,7 +183,7 @@ class HybridField(Field):
     def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
         """Returns every path of B queries: amplitudes, directions, lengths."""
         if self.wave is None:
-            raise UserError("this run knows no paths: its data had no mesh, or several receivers")
+            raise UserError("this run knows no paths: its data had no mesh")
         return self.wave.arrivals(params.wave, plan.wave, query)
 
     def limits(self, params: HybridParams, receivers: Receiver) -> Any:
@@ -226,13 +228,15 @@ class HybridField(Field):
 
 
 def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
-    """Returns the coherent field of a scene; None where there is no mesh that it could use, or more than one receiver."""
-    if scene.receivers.position.shape[0] > 1:
-        return None
+    """Returns the coherent field of a scene; None where there is no mesh that it could use."""
     try:
         return WaveField.make(config, scene, seed)
     except UserError:
         return None
+
+
+def _receiver_of(batch: Batch) -> int:
+    return int(batch.links.receiver_index[0])
 
 
 @jax.jit

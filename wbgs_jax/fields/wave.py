@@ -15,12 +15,13 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int, Key
+from jaxtyping import Array, Complex, Float, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register, single_receiver
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register
 from wbgs_jax.fields.losses import snapshot_losses
+from wbgs_jax.fields.prepared_paths import PreparedPaths, prepare_paths, trace
 from wbgs_jax.fields.wave_channel import (
     Materials,
     WaveParams,
@@ -39,7 +40,6 @@ from wbgs_jax.propagation.facets import Facets
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.motion import Motion, still
-from wbgs_jax.propagation.paths import TracedPaths, trace_paths
 from wbgs_jax.propagation.simplify import facets_that_fit
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
@@ -67,21 +67,8 @@ __all__ = [
     "trace",
 ]
 
-TRACED_AT_ONCE = 16
-"""Transmitters."""
-
-
-@pytree
-class PreparedPaths:
-    """A receiver's mirror images, and the paths of some transmitters."""
-
-    search: Search
-    beams: Beams | None
-    """Of its array; None where they differ from frequency to frequency."""
-    paths: TracedPaths
-    """Leading axis: transmitters."""
-    tx_index: Int[Array, " tx"]
-    """Numbers of the transmitters, ascending."""
+SAME_PLACE_M = 1e-3
+"""Distance of two receivers that are the same."""
 
 
 @register
@@ -95,8 +82,11 @@ class WaveField(Field):
     """Thickness of every material, metres; 0 where it is not known, and learned."""
     first_placement: Float[Array, " places"]
     """`WaveParams.placement` before training."""
+    receivers: Float[Array, "r 3"]
+    """Where the receivers of the data are said to stand, world frame, metres."""
     motion: Motion
-    """How far things stand from where the data say, as far as that has been found out; the facets are there already."""
+    """How far things and those receivers stand from where the data say, as far as that has been found out; the facets are
+    there already."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -114,7 +104,7 @@ class WaveField(Field):
     def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
         """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
         cls.check(config)
-        return make_field(scene.mesh(), config)
+        return make_field(scene.mesh(), config, scene.receivers.position)
 
     def init(self, key: Key[Array, ""]) -> WaveParams:
         """Returns parameters in which all materials are alike; nothing is random."""
@@ -133,13 +123,15 @@ class WaveField(Field):
         )
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
-        """Returns all mirror images of a receiver (host, unless they are prepared)."""
+        """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
         check_receiver(receiver)
-        search, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.search, cache.beams)
-        return WavePlan(search, _stands(receiver, self.motion), self.known_thickness, None, beams, self.config)
+        receiver = self._where_it_stands(receiver)
+        surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
+        return WavePlan(surfaces, receiver, self.known_thickness, None, beams, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
-        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found."""
+        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
+        shift and the turn of the plan's receiver alone."""
         orientation = turned(plan.receiver.orientation, jnp.asarray(motion.receiver_turn))
         return dataclasses.replace(plan, motion=motion, receiver=dataclasses.replace(plan.receiver, orientation=orientation))
 
@@ -151,19 +143,22 @@ class WaveField(Field):
                 "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
-        return make_search(self.facets, self.edges, np.asarray(receiver.position) + np.asarray(self.motion.receiver), *areas)
+        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
+
+    def _where_it_stands(self, receiver: Receiver) -> Receiver:
+        """Returns a receiver of the data where it has been found to stand; any other one as it is."""
+        if not len(self.receivers):
+            return receiver
+        away = jnp.linalg.norm(self.receivers - receiver.position, axis=-1)
+        own = jnp.argmin(away)
+        shift, turn = (
+            jnp.where(away[own] < SAME_PLACE_M, far[own], 0) for far in (self.motion.receiver, self.motion.receiver_turn)
+        )
+        return dataclasses.replace(receiver, position=receiver.position + shift, orientation=turned(receiver.orientation, turn))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
-        """Returns the paths of all transmitters of some links (host): geometry is not trained."""
-        receiver = single_receiver(receivers, self.name)
-        numbers, first = np.unique(np.asarray(links.tx_index), return_index=True)
-        positions, n = np.asarray(links.query.tx_position)[first], len(first)
-        planned, parts, size = self.plan(None, receiver), [], min(n, TRACED_AT_ONCE)
-        for start in range(0, n, size):
-            index = np.minimum(np.arange(start, start + size), n - 1)  # blocks of one shape: one compilation
-            parts.append(jax.tree.map(np.asarray, _trace(planned, jnp.asarray(positions[index]))))
-        paths = jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[:n]), *parts)
-        return PreparedPaths(planned.search, planned.beams, paths, jnp.asarray(numbers, jnp.int32))
+        """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
+        return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
     def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
         """Returns spectra, snapshots and received power of B queries."""
@@ -171,10 +166,8 @@ class WaveField(Field):
         return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
 
     def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
-        """Returns the same of links whose transmitters' paths are prepared."""
-        place = jnp.searchsorted(cache.tx_index, links.tx_index)
-        paths = jax.tree.map(lambda leaf: leaf[place], cache.paths)
-        return observe(params, plan, paths, links.query.frequency_hz)
+        """Returns the same of links of one receiver whose paths are prepared."""
+        return observe(params, plan, cache.of(links), links.query.frequency_hz)
 
     def loss(
         self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
@@ -201,11 +194,8 @@ class WaveField(Field):
         return dataclasses.replace(self, **{name: _to_device(place) for name, place in places.items()})
 
     def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
-        """Returns the field without what was found out about where its receiver stands."""
-        nothing = jnp.zeros(3)
-        return dataclasses.replace(
-            self, motion=dataclasses.replace(self.motion, receiver=nothing, receiver_turn=nothing)
-        ), params
+        """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""
+        return self, params
 
     def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns the corners of the facets where they stand now, and how far their movers were shifted."""
@@ -243,21 +233,22 @@ class WaveField(Field):
         )
 
 
-def make_field(mesh: Mesh, config: WaveConfig | None = None) -> WaveField:
-    """Returns the field of a mesh: its facets and edges are found on the host."""
+def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
+    """Returns the field of a mesh: its facets and edges are found on the host.
+
+    Args:
+        mesh: of the scene.
+        config: settings.
+        receivers: (r, 3), positions (world frame, metres) of those whose own place may be learned; none by default.
+    """
     config = config or WaveConfig()
     facets = facets_that_fit(mesh, config.max_facets)
     edges = edges_of_facets(facets)
     movers = int(facets.mover.max()) + 1
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
-    thickness, motion = jnp.asarray(mesh.thickness, jnp.float32), _to_device(still(movers))
-    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, motion, config)
-
-
-def _stands(receiver: Receiver, motion: Motion) -> Receiver:
-    """Returns the receiver where it has been found to stand."""
-    position, orientation = receiver.position + motion.receiver, turned(receiver.orientation, jnp.asarray(motion.receiver_turn))
-    return dataclasses.replace(receiver, position=position, orientation=orientation)
+    thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
+    motion = _to_device(still(movers, len(known)))
+    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, known, motion, config)
 
 
 def _beams(receiver: Receiver) -> Beams | None:
@@ -275,16 +266,6 @@ def _to_device(tree: Any) -> Any:
         return jnp.asarray(a, jnp.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else jnp.int32)
 
     return jax.tree.map(leaf, tree)
-
-
-def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
-    """Returns the paths of B transmitters; independent of frequency and materials."""
-    config = plan.config
-    sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
-    return jax.lax.map(lambda tx: trace_paths(plan.search, tx, *sizes), tx_position)
-
-
-_trace = jax.jit(trace)
 
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:

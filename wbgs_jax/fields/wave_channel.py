@@ -19,7 +19,7 @@ from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.wave_settings import WaveConfig
-from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.motion import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
@@ -82,11 +82,12 @@ class WaveParams:
 class WavePlan:
     """What is independent of the query: geometry alone. No parameter is frozen in it."""
 
-    search: Search
+    surfaces: Surfaces
+    """A `Search` of the receiver where paths have still to be found."""
     receiver: Receiver
     known_thickness: Float[Array, " m"]
     motion: Motion | None
-    """How far things stand from where paths were found, while that is being learned."""
+    """How far things, and this receiver, stand from where paths were found, while that is being learned."""
     beams: Beams | None
     """Of the array; None where they differ from frequency to frequency, or are traced."""
     config: WaveConfig = static()
@@ -135,7 +136,7 @@ def path_covariances(
     def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
         strongest = jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude))), FAINTEST)
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
-        left = path_coherence(paths, plan.search, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
+        left = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
         covariance = covariance_from_paths(arrived, plan.receiver, f, left)
         trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
         return covariance / trace, trace / len(covariance) * strongest**2
@@ -155,7 +156,7 @@ def phase_blind_pas(
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
     """Returns what every facet is made of at one frequency."""
-    m, material = params.materials, plan.search.facets.material
+    m, material = params.materials, plan.surfaces.facets.material
     sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
     thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
@@ -167,10 +168,10 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
     slabs, found = slabs_at(params, plan, frequency_hz), []
     for row, some in enumerate((paths.specular, paths.diffracted)):
         antennas = params.transmitter, params.element
-        one = arrivals(some, plan.search, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
+        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         if plan.motion is not None:
-            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.search, plan.motion)
+            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
             gain = gain * phasor(-turns)
         assert one.polarised is not None, "paths that were traced have it"
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))

@@ -22,17 +22,21 @@ SHORTEST = 1e-3
 """Of quaternions that are taken."""
 
 
-def receiver_at(word: str, like: Receiver) -> Receiver:
-    """Returns a receiver from "x,y,z" or "x,y,z,w,i,j,k", otherwise like another; anything else is a `UserError`."""
-    if not word:
-        return like
+def receiver_at(word: str, dataset: Dataset) -> Receiver:
+    """Returns a receiver of the data by its number (none: the first), or another one from "x,y,z" or "x,y,z,w,i,j,k", otherwise
+    like the first; anything else is a `UserError`."""
+    if not word or word.isdecimal():
+        return dataset.receiver(int(word or 0))
+    like = dataset.receiver()
     try:
         values = np.array([float(part) for part in word.split(",")])
     except ValueError:
         values = np.zeros(0)
     turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
     if len(values) not in (3, 7) or not np.isfinite(values).all() or not SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST:
-        raise UserError(f"--rx {word} is no receiver; give x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
+        raise UserError(
+            f"--rx {word} is no receiver; give its number in the data, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion"
+        )
     unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 

@@ -50,7 +50,7 @@ def scores(cells: Readings, walls: Walls) -> list[Score]:
     rooms = [room for room in dict.fromkeys(cells.rooms) if room]
     splits = [(f"room {room}", [np.array([own == room for own in cells.rooms])]) for room in rooms]
     splits.append((f"squares of {BLOCK:g} m", folds(cells)))
-    usable = [(name, parts) for name, parts in splits if _enough(parts, cells)]
+    usable = [(name, told) for name, parts in splits if (told := _usable(parts, cells))]
     if not usable:
         raise UserError(f"all powers lie within {BLOCK:g} m: nothing can be held out")
     return [_score(name, parts, cells, walls) for name, parts in usable]
@@ -63,10 +63,11 @@ def folds(cells: Readings) -> Parts:
     return [fold == number for number in np.unique(fold)]
 
 
-def _enough(parts: Parts, cells: Readings) -> bool:
-    """Returns whether powers are held out, and enough are left, in every part."""
+def _usable(parts: Parts, cells: Readings) -> Parts:
+    """Returns the parts in which something was heard; none of them, if one leaves too little to learn from."""
     heard = np.isfinite(cells.powers)
-    return all(heard[part].any() and heard[~part].sum() >= MIN_POWERS for part in parts)
+    told = [part for part in parts if heard[part].any()]
+    return told if all(heard[~part].sum() >= MIN_POWERS for part in told) else []
 
 
 def _score(name: str, parts: Parts, cells: Readings, walls: Walls) -> Score:

@@ -55,16 +55,22 @@ class DiffractedChains:
 
 
 @pytree
-class Search:
+class Surfaces:
+    """What waves meet, of every receiver: paths refer to them by number."""
+
+    facets: Facets
+    edges: Edges
+
+
+@pytree
+class Search(Surfaces):
     """What a receiver's paths are searched in: independent of the transmitter and of the frequency."""
 
     receiver_position: Float[AnyArray, "3"]
     """World frame, metres."""
-    facets: Facets
     outline: Outline
     planes: Float[AnyArray, "5 4 p"]
     """Of the facets and their sides, as legs are cut with them (`crossings.planes_of`)."""
-    edges: Edges
     chains: tuple[Chains, ...]
     """Of orders 1, 2, ..."""
     diffracted: DiffractedChains
@@ -93,11 +99,11 @@ def make_search(
     facets, edges = jax.tree.map(_on_host, (facets, edges))
     rx = np.asarray(receiver_position, np.float64)
     search = Search(
-        rx,
         facets,
+        edges,
+        rx,
         outline_of(facets),
         planes_of(facets),
-        edges,
         receiver_chains(facets, rx, mirror_areas),
         diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge),
     )

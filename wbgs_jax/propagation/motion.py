@@ -14,6 +14,7 @@ Where the shifts of all movers are unknown, independent and normal with standard
 product of two amplitudes loses exp(-k^2 Var(dL_i - dL_j) / 2): the spectrum is that of partially coherent waves.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.propagation.facets import AnyArray, centres
-from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.paths import DIFFRACTED, MAX_ORDER, REFLECTED, Paths, TracedPaths
 from wbgs_jax.propagation.transport import last_leg, legs_of
 from wbgs_jax.radio.array import EXACT
@@ -36,39 +37,43 @@ class Motion:
     """Of every mover of the facets, metres, ..."""
     turn: Float[AnyArray, "m 3"]
     """... and its rotation vector about its centre (`facets.centres`), radians."""
-    receiver: Float[AnyArray, "3"]
-    """Of the receiver, metres, ..."""
-    receiver_turn: Float[AnyArray, "3"]
-    """... and its rotation vector, radians."""
+    receiver: Float[AnyArray, "*r 3"]
+    """Of the receivers, metres, ..."""
+    receiver_turn: Float[AnyArray, "*r 3"]
+    """... and their rotation vectors, radians."""
+
+    def of_receiver(self, number: int | Int[Array, ""]) -> "Motion":
+        """Returns it as one of the receivers sees it, without the others'."""
+        return dataclasses.replace(self, receiver=self.receiver[number], receiver_turn=self.receiver_turn[number])
 
 
-def still(movers: int) -> Motion:
+def still(movers: int, receivers: int = 1) -> Motion:
     """Returns the motion of what stands where it is said to (float32)."""
-    none, nothing = np.zeros(3, np.float32), np.zeros((movers, 3), np.float32)
+    nothing, none = np.zeros((movers, 3), np.float32), np.zeros((receivers, 3), np.float32)
     return Motion(nothing, nothing, none, none)
 
 
-def length_changes(paths: Paths, search: Search, motion: Motion) -> Float[Array, " k"]:
-    """Returns by how much the K paths of one transmitter grow (metres) if things move by so much; turning the receiver changes
-    no length."""
-    turn, mover = _turns(paths, search)
-    arm = _arms(paths, search, mover, len(motion.shift))
+def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Array, " k"]:
+    """Returns by how much the K paths of one transmitter to one receiver grow (metres) if things and that receiver
+    (`Motion.of_receiver`) move by so much; turning the receiver changes no length."""
+    turn, mover = _turns(paths, surfaces)
+    arm = _arms(paths, surfaces, mover, len(motion.shift))
     own = jnp.asarray(motion.shift)[mover] + jnp.cross(jnp.asarray(motion.turn)[mover], arm)
     return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(_arriving(paths), motion.receiver, precision=EXACT)
 
 
-def length_jacobian(paths: Paths, search: Search, movers: int) -> Float[Array, "k numbers"]:
-    """Returns the derivative of `length_changes` with respect to all numbers of a motion, as `ravel_pytree` orders them."""
-    turn, mover = _turns(paths, search)
-    lever = jnp.cross(_arms(paths, search, mover, movers), turn)
+def length_jacobian(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k numbers"]:
+    """Returns the derivative of `length_changes` with respect to all numbers of its motion, as `ravel_pytree` orders them."""
+    turn, mover = _turns(paths, surfaces)
+    lever = jnp.cross(_arms(paths, surfaces, mover, movers), turn)
     own = [_by_mover(of, mover, movers).reshape(len(turn), -1) for of in (turn, lever)]
     return jnp.concatenate([*own, _arriving(paths), jnp.zeros((len(turn), 3))], 1)
 
 
-def length_gradient(paths: Paths, search: Search, movers: int) -> Float[Array, "k places 3"]:
+def length_gradient(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k places 3"]:
     """Returns the derivative of the K path lengths of one transmitter with respect to the shifts of all movers of the facets
     and, last, of the transmitter."""
-    turn, mover = _turns(paths, search)
+    turn, mover = _turns(paths, surfaces)
     departing = -legs_of(paths).direction[:, :1]
     return jnp.concatenate([_by_mover(turn, mover, movers), departing], 1)
 
@@ -94,18 +99,18 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
 
 
 def path_coherence(
-    paths: TracedPaths, search: Search, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
+    paths: TracedPaths, surfaces: Surfaces, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
 ) -> Float[Array, "k k"]:
     """Returns the `coherence` of all paths of one transmitter, the specular ones first, at a cost that does not grow with the
     number of movers: a path has its mirrors and edges, and no others.
 
     Args:
         paths: of one transmitter.
-        search: that they were found in.
+        surfaces: that they were found in.
         spread: standard deviation of the place of every mover and, last, of the transmitter along each axis, metres.
         wavenumber: radians a metre.
     """
-    specular, diffracted = _bends(paths.specular, search, MAX_ORDER), _bends(paths.diffracted, search, MAX_ORDER - 1)
+    specular, diffracted = _bends(paths.specular, surfaces, MAX_ORDER), _bends(paths.diffracted, surfaces, MAX_ORDER - 1)
     variance = (wavenumber * spread) ** 2
     mixed = _shared(specular, diffracted, variance)
     rows = [[_shared(specular, specular, variance), mixed], [mixed.T, _shared(diffracted, diffracted, variance)]]
@@ -124,9 +129,9 @@ class _Bends(NamedTuple):
     """Against the direction in which the wave leaves the transmitter."""
 
 
-def _bends(paths: Paths, search: Search, most: int) -> _Bends:
+def _bends(paths: Paths, surfaces: Surfaces, most: int) -> _Bends:
     """Returns where paths bend, leg by leg: what they pass through turns nothing."""
-    turn, mover = _turns(paths, search)
+    turn, mover = _turns(paths, surfaces)
     here = jnp.any(turn != 0, -1) & (paths.interaction_leg == jnp.arange(most)[:, None, None])
     found = (jnp.sum(jnp.where(here[..., None], turn, 0), -2), jnp.sum(jnp.where(here, mover, 0), -1))
     return _Bends(*found, -legs_of(paths).direction[:, 0])
@@ -147,11 +152,11 @@ def _products(a: Float[Array, "k 3"], b: Float[Array, "l 3"]) -> Float[Array, "k
     return a[:, None, 0] * b[:, 0] + a[:, None, 1] * b[:, 1] + a[:, None, 2] * b[:, 2]
 
 
-def _arms(paths: Paths, search: Search, mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k 5 3"]:
+def _arms(paths: Paths, surfaces: Surfaces, mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k 5 3"]:
     """Returns where paths meet what they interact with, seen from the centres that these turn about."""
     leg = jnp.minimum(paths.interaction_leg, paths.points.shape[1] - 2)
     point = jnp.take_along_axis(paths.points, leg[..., None] + 1, 1)
-    return point - centres(search.facets, movers)[mover]
+    return point - centres(surfaces.facets, movers)[mover]
 
 
 def _arriving(paths: Paths) -> Float[Array, "k 3"]:
@@ -159,7 +164,7 @@ def _arriving(paths: Paths) -> Float[Array, "k 3"]:
     return jnp.take_along_axis(legs_of(paths).direction, last_leg(paths)[:, None, None], 1)[:, 0]
 
 
-def _turns(paths: Paths, search: Search) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:
+def _turns(paths: Paths, surfaces: Surfaces) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:
     """Returns how paths turn at what they interact with, zero where they do not, and the mover that it belongs to."""
     direction = legs_of(paths).direction
     path, leg = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_leg, direction.shape[1] - 2)
@@ -167,6 +172,6 @@ def _turns(paths: Paths, search: Search) -> tuple[Float[Array, "k 5 3"], Int[Arr
     reflects, diffracts = paths.interaction_type == REFLECTED, paths.interaction_type == DIFFRACTED
     number = paths.interaction_facet
     facet = jnp.where(reflects, number, 0)
-    if search.edges.facet.shape[0]:
-        facet = jnp.where(diffracts, search.edges.facet[jnp.where(diffracts, number, 0)], facet)
-    return jnp.where((reflects | diffracts)[..., None], turn, 0), search.facets.mover[facet]
+    if surfaces.edges.facet.shape[0]:
+        facet = jnp.where(diffracts, surfaces.edges.facet[jnp.where(diffracts, number, 0)], facet)
+    return jnp.where((reflects | diffracts)[..., None], turn, 0), surfaces.facets.mover[facet]

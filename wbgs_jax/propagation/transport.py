@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax.propagation.edges import Edges
-from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
 from wbgs_jax.propagation.slab import Slabs, slab_coefficients
 from wbgs_jax.propagation.utd import wedge_coefficients
@@ -56,7 +56,7 @@ class _SlabInteractions(NamedTuple):
 
 def arrivals(
     paths: Paths,
-    search: Search,
+    surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
     receiver: Receiver,
@@ -68,7 +68,7 @@ def arrivals(
 
     Args:
         paths: of one transmitter (`paths.trace_paths`).
-        search: that the paths were found in: its facets and edges are what they refer to.
+        surfaces: that the paths were found in: its facets and edges are what they refer to.
         slabs: what the facets are made of at this frequency.
         frequency_hz: of the carrier.
         receiver: whose array stands where the paths end.
@@ -84,10 +84,10 @@ def arrivals(
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
     legs = legs_of(paths)
     field = antenna_field(transmitter, legs.direction[:, 0]).astype(slabs.permittivity.dtype)
-    interactions = _slab_interactions(paths, legs, search, slabs, frequency_hz)
+    interactions = _slab_interactions(paths, legs, surfaces, slabs, frequency_hz)
     active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
     if diffracted:
-        field, spreading = _over_edges(field, paths, legs, interactions, active, search.edges, slabs, frequency_hz)
+        field, spreading = _over_edges(field, paths, legs, interactions, active, surfaces.edges, slabs, frequency_hz)
     else:
         field, spreading = _through_slabs(field, interactions, active), 1 / legs.total
     last = last_leg(paths)
@@ -98,17 +98,17 @@ def arrivals(
     parts = jnp.stack([_dot(here, seen) for seen in (antenna_field(own, local), theta, jnp.cross(local, theta))], -1)
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
-    met = paths.interaction_type, _materials(paths, search)
+    met = paths.interaction_type, _materials(paths, surfaces)
     return Arrivals(amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:], *met)
 
 
-def _materials(paths: Paths, search: Search) -> Int[Array, "k 5"]:
+def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
     """Returns what paths meet is made of; -1 where they meet nothing."""
     kind, number = paths.interaction_type, paths.interaction_facet
     facet = jnp.where(kind == DIFFRACTED, 0, number)
-    if search.edges.facet.shape[0]:
-        facet = jnp.where(kind == DIFFRACTED, search.edges.facet[jnp.where(kind == DIFFRACTED, number, 0)], facet)
-    return jnp.where(kind == NONE, -1, search.facets.material[facet])
+    if surfaces.edges.facet.shape[0]:
+        facet = jnp.where(kind == DIFFRACTED, surfaces.edges.facet[jnp.where(kind == DIFFRACTED, number, 0)], facet)
+    return jnp.where(kind == NONE, -1, surfaces.facets.material[facet])
 
 
 def element_voltages(
@@ -207,12 +207,12 @@ def last_leg(paths: Paths) -> Int[Array, " k"]:
 
 
 def _slab_interactions(
-    paths: Paths, legs: Legs, search: Search, slabs: Slabs, frequency_hz: Float[Array, ""]
+    paths: Paths, legs: Legs, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
 ) -> _SlabInteractions:
     """Returns what the slabs of all paths do; nonsense where an interaction is none with a slab."""
     facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
     along = jnp.take_along_axis(legs.direction, paths.interaction_leg[..., None], 1)
-    normal, reflects = search.facets.normal[facet], paths.interaction_type == REFLECTED
+    normal, reflects = surfaces.facets.normal[facet], paths.interaction_type == REFLECTED
     cosine = _dot(along, normal)
     c = slab_coefficients(jnp.abs(cosine), slabs.permittivity[facet], slabs.thickness[facet], frequency_hz, slabs.air)
     across = _across(along, normal)

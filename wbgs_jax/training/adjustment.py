@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Inexact, Int
 
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.fields.wave_channel import arrivals_at
@@ -60,8 +60,8 @@ def adjust(
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
-        cache: paths of the transmitters of the pool.
-        motion: the one to start with.
+        cache: paths of the links of the pool.
+        motion: the one to start with, of all receivers.
         covariance: of all of its numbers (as `ravel_pytree` orders them) by lower frequencies, or by the prior.
         widths: standard deviations of the prior of the whole motion, that of the field included.
         data: with snapshots.
@@ -73,7 +73,7 @@ def adjust(
     start = np.asarray(ravel_pytree(field.motion)[0], np.float64)
     moves, stiffness = np.asarray(flat, np.float64), 1 / np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
     root = np.linalg.cholesky(covariance + TINY**2 * np.eye(len(moves)))
-    variance = length_variances(cache, jnp.asarray(root, jnp.float32), len(motion.shift))
+    variance = length_variances(cache, jnp.asarray(root, jnp.float32), len(motion.shift), len(motion.receiver))
     frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)
     for _ in range(ROUNDS):
@@ -93,16 +93,29 @@ def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
     return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
 
 
-@partial(jax.jit, static_argnames=("movers",))
-def length_variances(cache: Any, root: Float[Array, "p p"], movers: int) -> Float[Array, "tx k"]:
+@partial(jax.jit, static_argnames=("movers", "receivers"))
+def length_variances(cache: Any, root: Float[Array, "p p"], movers: int, receivers: int) -> Float[Array, "pairs k"]:
     """Returns the variances (square metres) of the lengths of all paths, from a square root of the covariance of the motion."""
-    return jax.lax.map(
-        lambda paths: jnp.sum(jnp.matmul(_jacobian(cache, paths, movers), root, precision=EXACT) ** 2, -1), cache.paths
-    )
+
+    def of_pair(pair: Any) -> Float[Array, " k"]:
+        paths, receiver = pair
+        lengths = _among_all(_jacobian(cache, paths, movers), receiver, receivers)
+        return jnp.sum(jnp.matmul(lengths, root, precision=EXACT) ** 2, -1)
+
+    variances: Float[Array, "pairs k"] = jax.lax.map(of_pair, (cache.paths, cache.receiver_index))
+    return variances
 
 
-def _jacobian(cache: Any, paths: Any, movers: int) -> Float[Array, "k p"]:
-    return jnp.concatenate([length_jacobian(some, cache.search, movers) for some in (paths.specular, paths.diffracted)])
+def _jacobian(cache: Any, paths: Any, movers: int) -> Float[Array, "k numbers"]:
+    return jnp.concatenate([length_jacobian(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)])
+
+
+def _among_all(own: Inexact[Array, "k numbers"], receiver: Int[Array, ""], receivers: int) -> Inexact[Array, "k p"]:
+    """Returns the derivative with respect to a motion of all receivers, from that of one of them: the others' are 0."""
+    places, shift, turn = own[:, :-6], own[:, -6:-3], own[:, -3:]
+    none = jnp.zeros((len(own), receivers, 3), own.dtype)
+    ends = [none.at[:, receiver].set(one).reshape(len(own), -1) for one in (shift, turn)]
+    return jnp.concatenate([places, *ends], 1)
 
 
 @jax.jit
@@ -113,7 +126,7 @@ def normal_equations(
     cache: Any,
     data: TrainingData,
     index: Int[Array, " n"],
-    variance: Float[Array, "tx k"],
+    variance: Float[Array, "pairs k"],
 ) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
     """Returns the matrix J^T W J and the vector J^T W r of some snapshots, a multiple of `AT_ONCE`: what is left of them is
     about r - J (a further motion), in units of its standard deviation."""
@@ -121,17 +134,18 @@ def normal_equations(
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))
         assert batch.snapshots is not None, "phases are what it looks at"
-        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), motion)
-        place, frequency = jnp.searchsorted(cache.tx_index, batch.links.tx_index[0]), batch.links.query.frequency_hz[0]
-        paths: Any = jax.tree.map(lambda leaf: leaf[place], cache.paths)
+        asked: Any = jax.tree.map(lambda leaf: leaf[0], batch.links)
+        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), motion.of_receiver(asked.receiver_index))
+        paths, frequency = cache.of(asked), asked.query.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
         arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
-        expected = jnp.exp(-0.5 * wavenumber**2 * variance[place])
+        expected = jnp.exp(-0.5 * wavenumber**2 * variance[cache.place(asked)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
         lengths = _jacobian(cache, paths, len(motion.shift)).astype(voltages.dtype)
         changes = -1j * wavenumber * jnp.matmul(voltages.T, lengths, precision=EXACT)
         changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))
+        changes = _among_all(changes, asked.receiver_index, len(motion.receiver))
         return _whitened(jnp.sum(voltages, 0), changes, batch.snapshots[0])
 
     def add(total: Any, links: Int[Array, " b"]) -> tuple[Any, None]:

@@ -49,15 +49,17 @@ def descend(
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
-        cache: paths of the transmitters of the pool.
-        motion: the one to start with.
+        cache: paths of the links of the pool.
+        motion: the one to start with, of all receivers.
         widths: standard deviations of the prior of the whole motion, that of the field included.
         data: with spectra.
         pool: links, up to the highest frequency that counts.
         count: steps.
         rng: draws their batches.
     """
-    batches = jnp.asarray(rng.choice(pool, (count, min(BATCH, len(pool)))), jnp.int32)
+    receiver = np.asarray(data.links.receiver_index)[pool]
+    owns = [pool[receiver == number] for number in rng.choice(receiver, count)]  # a batch is of one receiver
+    batches = jnp.asarray([rng.choice(own, min(BATCH, len(pool))) for own in owns], jnp.int32)
     wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.query.frequency_hz)[pool].max())
     rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN * 2 * np.pi / wavelength
     # The curvature of the normal prior, beside a loss that is a mean over so many numbers.
@@ -87,7 +89,8 @@ def _steps(
         params, metres = learned
         batch = data.batch(index, jax.random.key(0))
         motion = _by(metres, reach)
-        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), motion)
+        seen_from = motion.of_receiver(batch.links.receiver_index[0])
+        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), seen_from)
         seen = field.render_links(params, plan, cache, batch.links)
         loss, _ = compare(seen, batch)
         total = jax.tree.map(jnp.add, field.motion, motion)
@@ -115,7 +118,7 @@ def _reach(field: Any) -> Motion:
     facets, movers = field.facets, len(field.motion.shift)
     arms = jnp.linalg.norm(facets.corners - centres(facets, movers)[facets.mover][:, None], axis=-1)
     radius = jnp.full(movers, SHORTEST_ARM).at[facets.mover].max(jnp.max(arms, -1))
-    one = jnp.ones(3)
+    one = jnp.ones_like(field.motion.receiver)
     return Motion(jnp.ones((movers, 3)), jnp.broadcast_to(radius[:, None], (movers, 3)), one, one)
 
 

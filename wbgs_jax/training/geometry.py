@@ -61,7 +61,7 @@ class GeometryReport:
     largest_deg: float
     """... and by how much any of them was turned."""
     receiver_mm: float
-    """How far the receiver was moved ..."""
+    """How far the receiver, or that of several which was moved furthest, was moved ..."""
     receiver_deg: float
     """... and turned."""
 
@@ -188,8 +188,8 @@ def _sizes(motion: Motion) -> dict[str, float]:
         "typical_mm": float(1e3 * np.sqrt(np.mean(size.shift**2))),
         "largest_mm": float(1e3 * size.shift.max()),
         "largest_deg": float(np.rad2deg(size.turn.max())),
-        "receiver_mm": float(1e3 * size.receiver),
-        "receiver_deg": float(np.rad2deg(size.receiver_turn)),
+        "receiver_mm": float(1e3 * size.receiver.max()),
+        "receiver_deg": float(np.rad2deg(size.receiver_turn.max())),
     }
 
 

@@ -40,7 +40,7 @@ class RunConfig:
     """Everything that determines a run."""
 
     source: str
-    """Scene number, scene file or folder."""
+    """Scene number, scene file or folder; several with commas between them."""
     field: str
     preset: str
     seed: int

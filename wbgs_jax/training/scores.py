@@ -36,7 +36,7 @@ class Scores(Protocol):
 def make_scores(
     field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
 ) -> Scores:
-    """Returns the function that scores candidates on some spectra of one receiver. What leaves say that all candidates share
+    """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
@@ -54,7 +54,7 @@ def make_scores(
 
 @dataclass(frozen=True)
 class Told:
-    """Some training spectra of one receiver, and what they say of a field with the paths of their transmitters."""
+    """Some training spectra, and what they say of a field with the paths of their transmitters."""
 
     field: Any
     cache: Any
