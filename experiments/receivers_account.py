@@ -1,8 +1,9 @@
 """What a coherent field knows of receivers that it never heard: `python -m experiments.receivers_account RUN [RUN ...]`.
 
 Every run folder is one of `wbgs-jax train --field wave` on a released scene; scenes traced for other receivers of the same room
-are `<scene>_rx<number>.npz` beside it. Transmitters that were trained or validated are left out at all of them. Writes
-experiments/results/receivers.json; docs/wave.md quotes it.
+are `<scene>_rx<number>.npz` beside it. Transmitters that were trained or validated are left out at all of them. A run on
+several of them (`--scene 2,2_rx2,2_rx3`) is scored on the test transmitters of each. Adds its rows to the results in
+experiments/results/receivers.json; docs/wave.md quotes them.
 """
 
 import sys
@@ -19,11 +20,11 @@ from jaxtyping import Float, Int
 from experiments.results import FOLDER
 from wbgs_jax import load_trained
 from wbgs_jax._util.command import run_command
-from wbgs_jax._util.files import write_json
+from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset, released_scenes
 from wbgs_jax.evaluation.metrics import score
-from wbgs_jax.evaluation.report import environment
+from wbgs_jax.evaluation.report import provenance
 from wbgs_jax.inference.predictor import at_receiver, observe_queries
 from wbgs_jax.training.run_folder import TrainedField
 
@@ -54,6 +55,12 @@ def unseen(trained_on: Dataset, other: Dataset) -> Int[np.ndarray, " n"]:
     return np.flatnonzero([tuple(place) not in seen for place in places])
 
 
+def scores_alone(trained: TrainedField, home: Dataset) -> dict[str, Any]:
+    """Returns scores at the receiver that a field was trained for, and at those that it was not."""
+    others = {name.removeprefix(f"{home.name}_"): load_dataset(path) for name, path in others_of(home.name).items()}
+    return {name: scores_at(trained, home, data) for name, data in ({"own": home} | others).items()}
+
+
 def scores_at(trained: TrainedField, home: Dataset, other: Dataset) -> dict[str, Any]:
     """Returns scores at the first receiver of `other`: of transmitters that are new to the field, and of the test transmitters
     of `other`, which a field trained there is scored on; and the seconds until the first answer there could begin."""
@@ -69,6 +76,13 @@ def scores_at(trained: TrainedField, home: Dataset, other: Dataset) -> dict[str,
     return {"ready_s": ready} | {name: _scores(spectra[np.isin(both, index)], other, index) for name, index in parts.items()}
 
 
+def scores_together(trained: TrainedField, name: str) -> dict[str, Any]:
+    """Returns scores of a field that was trained on several data sets, on the test transmitters of one of them."""
+    one = load_dataset(released_scenes()[name.removeprefix("scene")])
+    spectra = np.asarray(observe_queries(trained, one.receiver(), one.query(one.test), "pas"))
+    return _scores(spectra, one, one.test) | {"trained_on": trained.dataset().name}
+
+
 def _scores(spectra: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any]:
     index = np.sort(index)
     found = score(spectra, np.asarray(dataset.pas(index)), dataset.frequencies_hz[index])
@@ -78,15 +92,16 @@ def _scores(spectra: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.receivers_account")
-    report: dict[str, Any] = {}
+    path = command.out / "receivers.json"
+    report: dict[str, Any] = read_json(path) if path.exists() else {}
     for run in command.runs:
         trained = load_trained(run)
         home = trained.dataset()
-        report[home.name] = {"own": scores_at(trained, home, home)}
-        for name, path in others_of(home.name).items():
-            report[home.name][name.removeprefix(f"{home.name}_")] = scores_at(trained, home, load_dataset(path))
-        print(home.name, report[home.name], file=sys.stderr)
-    write_json(command.out / "receivers.json", report | environment())
+        names = home.name.split("+")
+        found = scores_alone(trained, home) if len(names) == 1 else {name: scores_together(trained, name) for name in names}
+        report[home.name] = found | {"provenance": provenance(trained)}
+        print(home.name, found, file=sys.stderr)
+    write_json(path, report)
 
 
 if __name__ == "__main__":

@@ -51,10 +51,11 @@ def make_run(folder: Path) -> Path:
     return folder
 
 
-def make_coherent_run(folder: Path) -> Path:
-    """The same of the coherent field."""
-    scene = folder.with_suffix(".npz")
-    save_scene(scene, tiny_scene())
+def make_coherent_run(folder: Path, source: str = "") -> Path:
+    """The same of the coherent field, of other data if their names are given."""
+    scene = source or folder.with_suffix(".npz")
+    if not source:
+        save_scene(scene, tiny_scene())
     settings = tiny_settings("wave", field={"specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8})
     config = RunConfig(str(scene), "wave", "smoke", 0, None, settings)
     write_config(folder, config)

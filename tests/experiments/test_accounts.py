@@ -70,10 +70,21 @@ def test_receivers_that_were_never_heard(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["receivers_account", str(run), "--out", str(tmp_path)])
     receivers_account.main()
     scores = json.loads((tmp_path / "receivers.json").read_text())["box"]
+    assert scores.pop("provenance")["preset"] == "smoke"
     assert scores.keys() == {"own", "rx2", "rx3"} and all(0 < place["ready_s"] < 60 for place in scores.values())
     assert scores["rx2"]["new"] == scores["own"]["new"] == scores["own"]["test"]
     assert scores["rx3"]["new"]["median_ssim"] != scores["own"]["new"]["median_ssim"]
     assert scores["rx3"]["new"]["n"] == scores["own"]["test"]["n"] > 0
+    together = make_coherent_run(tmp_path / "together", f"{tmp_path}/box.npz,{tmp_path}/box_rx3.npz")
+    monkeypatch.setattr("sys.argv", ["receivers_account", str(together), "--out", str(tmp_path)])
+    monkeypatch.setattr(receivers_account, "released_scenes", lambda: {path.stem: path for path in tmp_path.glob("*.npz")})
+    receivers_account.main()
+    report = json.loads((tmp_path / "receivers.json").read_text())
+    assert report["box"]["own"] == scores["own"], "rows of other runs stay"
+    both = report["box+box_rx3"]
+    for name, alone in (("box", scores["own"]), ("box_rx3", scores["rx3"])):  # untrained alike
+        assert both[name]["median_ssim"] == pytest.approx(alone["test"]["median_ssim"], abs=1e-4)
+        assert both[name]["trained_on"] == "box+box_rx3"
 
 
 def test_the_main_job_is_timed_against_another(tmp_path):

@@ -14,6 +14,7 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.evaluation.power import calibrate_power
+from wbgs_jax.evaluation.score import expectations
 from wbgs_jax.inference.confidence import (
     FILE,
     MARGIN,
@@ -29,9 +30,10 @@ from wbgs_jax.inference.confidence import (
     read_power_confidence,
     write_confidence,
 )
+from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import observe_links, predict_spectra
 from wbgs_jax.training.confidence import POWER_SETS, SETS, fit, interval, learn_confidence, left_out, regress, upper_end
-from wbgs_jax.types import Query
+from wbgs_jax.types import Query, make_receiver
 
 
 def drawn(rng, n_tx, per_tx=5, slope=0.5, noise=0.3):
@@ -120,9 +122,29 @@ def test_it_is_learned_from_the_validation_part_alone(dataset):
     assert calibration(expected, scores)["coverage"] > 0.6
 
 
-def test_several_receivers_or_a_handful_of_spectra_say_nothing(dataset):
+def test_receivers_share_what_is_learned_and_are_asked_one_by_one():
+    field, params, dataset = make_field(), make_params(), hold_out_validation(tiny_dataset(30, n_rx=2))
+    learned, _ = learn_confidence(field, params, dataset, None)
+    assert learned is not None and learned.rx_position.shape == (2, 3)
+    own = [for_receiver(learned, dataset.receiver(number)) for number in range(2)]
+    for number, one in enumerate(own):
+        np.testing.assert_allclose(one.rx_position, dataset.receiver(number).position)
+        np.testing.assert_array_equal(one.weights, learned.weights)
+    assert for_receiver(learned, make_receiver([0.0, 0.0, 0.5])) is None
+    index = dataset.validation
+    pas = np.asarray(observe_links(field, params, dataset, index).pas)
+    expected = expectations(learned, dataset, index, pas, None)
+    for number, one in enumerate(own):
+        place = np.flatnonzero(dataset.receiver_index[index] == number)
+        asked = dataset.tx_positions[index[place]], dataset.frequencies_hz[index[place]]
+        for together, alone in zip(expected, expect_many(one, pas[place], *asked), strict=True):
+            np.testing.assert_allclose(together[place], alone, rtol=1e-6)
+    elsewhere = dataclasses.replace(dataset, receivers=jax.tree.map(lambda leaf: leaf + 0.5, dataset.receivers))
+    assert expectations(learned, elsewhere, index, pas, None) is None
+
+
+def test_a_handful_of_spectra_say_nothing(dataset):
     field, params = make_field(), make_params()
-    assert learn_confidence(field, params, hold_out_validation(tiny_dataset(12, n_rx=2)), None)[0] is None
     few = dataclasses.replace(dataset, validation=dataset.validation[:3])
     assert learn_confidence(field, params, few, None) == (None, None)
 
@@ -203,8 +225,8 @@ def test_expected_errors_of_powers_follow_their_formula(rng):
 def test_confidence_of_powers_is_learned_over_all_receivers(rng):
     dataset = hold_out_validation(tiny_dataset(40, n_rx=2))
     field, params = make_field(), make_params()
-    spectra, learned = learn_confidence(field, params, dataset, None)
-    assert spectra is None and learned.mean.shape == (POWER_SETS[-1],)
+    _, learned = learn_confidence(field, params, dataset, None)
+    assert learned.mean.shape == (POWER_SETS[-1],)
     heard = dataset.snapshots.copy()
     heard[dataset.test] = 1
     poisoned = dataclasses.replace(dataset, snapshots=heard)

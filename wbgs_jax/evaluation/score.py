@@ -18,7 +18,7 @@ from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.confidence import expect_many
+from wbgs_jax.inference.confidence import Confidence, Expected, expect_many
 from wbgs_jax.inference.neighbours import for_receiver
 from wbgs_jax.inference.predictor import BLOCK, Trained, observe, observe_links, render_pas
 from wbgs_jax.radio import channel
@@ -52,16 +52,35 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
-    confidence = for_receiver(trained.confidence, dataset.receiver())
-    if confidence and tested:
-        asked = dataset.tx_positions[index], dataset.frequencies_hz[index]
-        expected = expect_many(confidence, np.asarray(seen.pas), *asked, said)
+    if tested and (expected := expectations(trained.confidence, dataset, index, np.asarray(seen.pas), said)):
         report["confidence"] = calibration(expected, figures["ssim"])
     report |= time_queries(trained, dataset)
     report["baselines"] = {
         name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in baselines(dataset).items()
     }
     return report, np.asarray(seen.pas)
+
+
+def expectations(
+    confidence: Confidence | None,
+    dataset: Dataset,
+    index: Int[np.ndarray, " n"],
+    pas: Float[np.ndarray, "n 90 360"],
+    power_db: Float[np.ndarray, " n"] | None,
+) -> Expected | None:
+    """Returns what is expected of the answers to some links; None where nothing was learned of one of their receivers."""
+    receiver = dataset.receiver_index[index]
+    learned = {number: for_receiver(confidence, dataset.receiver(number)) for number in np.unique(receiver).tolist()}
+    if any(own is None for own in learned.values()):
+        return None
+    expected = Expected(*np.empty((3, len(index)), np.float32))
+    for number, of_one in learned.items():
+        own = np.flatnonzero(receiver == number)
+        asked = dataset.tx_positions[index[own]], dataset.frequencies_hz[index[own]]
+        found = expect_many(of_one, pas[own], *asked, None if power_db is None else power_db[own])
+        for column, values in zip(expected, found, strict=True):
+            column[own] = values
+    return expected
 
 
 def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, " n"]:

@@ -41,9 +41,10 @@ C = TypeVar("C", "Confidence", "PowerConfidence")
 
 @pytree
 class Confidence:
-    """What has been learned about the scores of one receiver's answers."""
+    """What has been learned about the scores of answers, over all receivers of the data alike."""
 
-    rx_position: Float[Array, "3"]
+    rx_position: Float[Array, "*r 3"]
+    """Of the receivers, metres; of one alone where answers are asked for (`neighbours.for_receiver`)."""
     tx_position: Float[Array, "m 3"]
     """Of the transmitters that were trained, metres."""
     mean: Float[Array, " k"]
@@ -98,7 +99,7 @@ class Expected(NamedTuple):
 def features(
     pas: Float[Array, "b 90 360"],
     query: Query,
-    rx_position: Float[Array, "3"],
+    rx_position: Float[Array, "*#b 3"],
     tx_position: Float[Array, "m 3"],
     power_db: Float[Array, " b"] | None = None,
 ) -> Float[Array, "b k"]:
@@ -141,7 +142,7 @@ def expected_ssim(
     """Returns what is expected of answers `pas` to B queries.
 
     Args:
-        confidence: what was learned.
+        confidence: what was learned, of the receiver that was asked.
         pas: the answers.
         query: what was asked.
         power_db: the received power that the field says beside them; where it is not given it counts as the usual one.

@@ -75,11 +75,14 @@ def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query:
 
 
 def for_receiver(learned: Any, receiver: Receiver) -> Any:
-    """Returns what was learned of a receiver (`Neighbours`, `Confidence`) if it is this one, else None (host)."""
+    """Returns what was learned of a receiver (`Neighbours`, `Confidence`), of several as of this one alone; None if it is none
+    of them (host)."""
     if learned is None:
         return None
-    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(learned.rx_position))
-    return learned if distance < SAME_PLACE_M else None
+    known = jnp.atleast_2d(learned.rx_position)
+    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(known), axis=-1)
+    near = int(distance.argmin())
+    return dataclasses.replace(learned, rx_position=known[near]) if distance[near] < SAME_PLACE_M else None
 
 
 def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:

@@ -47,7 +47,7 @@ def learn_confidence(
     field: Field, params: Any, dataset: Dataset, neighbours: Neighbours | None
 ) -> tuple[Confidence | None, PowerConfidence | None]:
     """Returns how sure spectra and received powers are; None where field or data know nothing of them, or for too few
-    validation links. Of spectra, there is none for data of several receivers either.
+    validation links.
 
     `neighbours` are those of the training part alone, if neighbours are asked.
     """
@@ -61,17 +61,18 @@ def learn_confidence(
 def _of_spectra(
     seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
 ) -> Confidence | None:
-    if dataset.kind == "power" or dataset.n_receivers > 1:
+    if dataset.kind == "power":
         return None
     query = dataset.query(index)
     pas = np.asarray(correct(neighbours, jnp.asarray(seen.pas), query))
-    places = jnp.asarray(np.asarray(dataset.receiver().position), jnp.float32), _trained(dataset)
+    trained, receivers = _trained(dataset), jnp.asarray(dataset.rx_positions(index), jnp.float32)
     power = None if seen.power_db is None else jnp.asarray(seen.power_db)
-    known = np.asarray(_features(jnp.asarray(pas), query, *places, power), np.float64)
+    known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
     error = np.log(1 + MARGIN - np.minimum(ssim(pas, np.asarray(dataset.pas(index))), 1))
     *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
     arrays = *learned, interval(rest), np.exp(rest).mean()
-    return Confidence(*places, *(jnp.asarray(array, jnp.float32) for array in arrays))
+    places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
+    return Confidence(places, trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
 def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]) -> PowerConfidence | None:
