@@ -74,7 +74,10 @@ def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None) -> 
     if not todo:
         return
     with CountProgress(f"{job.spec.name}, batches", job.n_batches, job.n_batches - len(todo)) as progress:
-        for _ in jobs.run(job, todo, folder, workers, threads):
+        heard, done = False, list[int]()
+        for batch in jobs.run(job, todo, folder, workers, threads):
+            done.append(batch)
+            heard = heard or jobs.check_heard(job, folder, done)
             progress.advance()
 
 

@@ -12,7 +12,7 @@ import importlib.metadata
 import json
 import multiprocessing
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -30,6 +30,8 @@ from wbgs_jax._util.files import atomic_write
 if TYPE_CHECKING:
     from data_gen.solve import Simulator, TxPaths
 
+SILENT = 64
+"""Transmitters of whom one is heard, unless something is wrong with the scene."""
 PACKAGES = ("sionna-rt", "mitsuba", "drjit", "numpy")
 """Packages whose version may change a result."""
 
@@ -125,11 +127,6 @@ def _work(batch: int, folder: Path) -> int:
     chosen = _job.batch(batch)
     by_frequency = _simulator.paths(_job.tx_positions[chosen], _job.frequencies_hz)
     found = [_measure(_job, tx, [paths[i] for paths in by_frequency]) for i, tx in enumerate(chosen)]
-    if not any(one["n_paths"].any() for one in found):
-        raise UserError(
-            f"no path between the receiver and transmitters {chosen[0]} to {chosen[-1]}, at any frequency; "
-            "check the scene (units, up axis, a closed metal box?), the receiver's place and --tx-grid"
-        )
     read_back = [_simulator.read_back_hz[f] for f in _job.frequencies_hz]
     arrays: dict[str, Any] = {key: np.stack([one[key] for one in found]) for key in found[0]}
     with atomic_write(batch_file(folder, batch)) as stream:
@@ -154,6 +151,23 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
             ]
         ),
     }
+
+
+def check_heard(job: Job, folder: Path, done: Sequence[int]) -> bool:
+    """Returns whether any transmitter of some finished batches has a path.
+
+    Raises:
+        UserError: there is none, and there are enough of them for that to be a mistake.
+    """
+    if any(_load(batch_file(folder, batch))["n_paths"].any() for batch in done):
+        return True
+    silent = sum(len(job.batch(batch)) for batch in done)
+    if silent >= min(SILENT, len(job.tx_positions)):
+        raise UserError(
+            f"no path between the receiver and any of {silent} transmitters, at any frequency; "
+            "check the scene (units, up axis, a closed metal box?), the receiver's place and --tx-grid"
+        )
+    return False
 
 
 def collect(job: Job, folder: Path) -> Results:

@@ -1,7 +1,7 @@
 """What a user's meshes are (solids or sheets), and mistakes in them that a ray tracer would not report. Metres, z up."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import trimesh
@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 
 from data_gen.scenes.base import Part
 from data_gen.scenes.geometry import distance
-from wbgs_jax._util.errors import UserError
 
 TOUCH = 1e-4
 """Metres: surfaces that are nearer lie on each other."""
@@ -57,8 +56,8 @@ def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, " edges"]:
     return np.einsum("ek,ek->e", first, second) > 1 - 1e-6
 
 
-def check_surfaces(parts: Sequence[Part]) -> None:
-    """Raises a `UserError` when a part folds back onto itself or two sheets lie on each other.
+def surface_flaws(parts: Sequence[Part]) -> Iterator[str]:
+    """Gives a sentence for every part that folds back onto itself, and for every two sheets that lie on each other.
 
     A solid may touch a sheet, as furniture does that stands on the floor: the face in between is seen from nowhere.
     """
@@ -66,13 +65,17 @@ def check_surfaces(parts: Sequence[Part]) -> None:
         if (found := folds(part.mesh)).any():
             where = place(part.mesh.vertices[part.mesh.face_adjacency_edges[found][0, 0]])
             advice = "triangulate its faces on export and remove double ones"
-            raise UserError(f"object {part.name!r} folds back onto itself at {where}; {advice}")
-    for first, second in itertools.permutations([p for p in parts if not p.closed], 2):
-        if (points := _common(first.mesh, second.mesh)).any():
-            raise UserError(
-                f"objects {first.name!r} and {second.name!r} lie on each other, at {place(points[0])} for one; "
-                "cut a hole where the other is, or remove one"
-            )
+            yield f"object {part.name!r} folds back onto itself at {where}; {advice}"
+    sheets = [p for p in parts if not p.closed]
+    bounds = np.array([p.mesh.bounds for p in sheets]).reshape(-1, 2, 3)
+    for first, (low, high) in zip(sheets, bounds, strict=True):
+        for near in np.flatnonzero(((bounds[:, 0] < high + TOUCH) & (bounds[:, 1] > low - TOUCH)).all(1)):
+            second = sheets[near]
+            if second is not first and (points := _common(first.mesh, second.mesh)).any():
+                yield (
+                    f"objects {first.name!r} and {second.name!r} lie on each other, at {place(points[0])} for one; "
+                    "cut a hole where the other is, or remove one"
+                )
 
 
 def _common(first: trimesh.Trimesh, second: trimesh.Trimesh) -> Float[np.ndarray, "points 3"]:

@@ -39,8 +39,8 @@ class SceneOptions:
     """Own scene: transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z."""
     up: Literal["y", "z"] | None = None
     """Own scene: the file's vertical axis."""
-    scale: float = 1.0
-    """Own scene: metres in one unit of the file."""
+    scale: float | None = None
+    """Own scene: metres in one unit of the file; 1 unless given, and then sizes that make one doubt it are refused."""
     rx_orientation: tuple[float, float, float, float] | None = None
     """Quaternion w x y z from the receiver's local frame to the world; that of the scene unless given."""
 
@@ -59,7 +59,7 @@ class SceneOptions:
         return spec if self.rx_orientation is None else dataclasses.replace(spec, rx_orientation=_unit(self.rx_orientation))
 
     def _numbered_spec(self) -> SceneSpec:
-        if self.materials or self.tx_grid or self.up or self.scale != 1:
+        if self.materials or self.tx_grid or self.up or self.scale is not None:
             raise UserError("--materials, --tx-grid, --up and --scale are for a scene of your own; give its file with --scene")
         spec = get_scene(int(self.scene))
         return spec if self.rx is None else dataclasses.replace(spec, rx_position=parse_point(self.rx, "--rx"))

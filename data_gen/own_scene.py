@@ -3,6 +3,7 @@
 All that can be wrong is told here in one line, before hours are spent on tracing.
 """
 
+import dataclasses
 import fnmatch
 import tomllib
 from collections.abc import Sequence
@@ -14,20 +15,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from data_gen.materials import ITU, THICKNESS, Law, check_material_frequencies, own_law, own_material
-from data_gen.mesh_checks import check_surfaces, is_solid, kind, outward, place
+from data_gen.mesh_checks import is_solid, kind, outward, place, surface_flaws
 from data_gen.scene_files import FileObject, read_objects
 from data_gen.scenes.base import FREQUENCIES_HZ, RX_CLEARANCE, Part, SceneSpec, grid_3d
 from data_gen.scenes.geometry import Vec3, distance, winding_number
 from wbgs_jax._util.errors import UserError
 
 EXTENT = (0.5, 200.0)
-"""Metres: the largest side of a scene is in between, or its unit is not the metre."""
+"""Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody says so, ..."""
+SAID_EXTENT = (0.01, 20_000.0)
+"""... and then in between these. A scene.xml of Sionna RT says so by itself."""
 ROOM = 10.0
 """Metres: the usual size of a room, to guess a unit from."""
 MAX_THICKNESS = 2.0
 """Metres: a thicker slab is one given in millimetres."""
-MAX_TRIANGLES = 100_000
+MAX_TRIANGLES = 2_000_000
 MAX_TX = 1_000_000
+SHOWN = 40
+"""Objects that are described."""
 HELP = "see docs/own_scene.md"
 
 
@@ -41,6 +46,9 @@ class Slab(NamedTuple):
 @dataclass(frozen=True)
 class OwnScene(SceneSpec):
     """A scene from a file. Its walls need not close a room: being in it means being in the box around everything."""
+
+    flaws: tuple[str, ...] = ()
+    """What is wrong with surfaces that are taken as they are."""
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points are in the box around all objects."""
@@ -63,7 +71,7 @@ class OwnScene(SceneSpec):
 
 def own_scene(
     file: Path, materials: Path | None, *, rx: str, tx_grid: str, frequencies_hz: Sequence[float] = (),
-    up: str | None = None, scale: float = 1.0,
+    up: str | None = None, scale: float | None = None,
 ) -> OwnScene:  # fmt: skip
     """Reads and checks a scene file.
 
@@ -73,7 +81,8 @@ def own_scene(
         rx: position of the receiver, "x,y,z".
         tx_grid: candidate transmitters, "x0,y0,z0:x1,y1,z1:nx,ny,nz" or the path of a .csv with the header x,y,z.
         frequencies_hz: hertz; the ten of the released scenes unless given.
-        up, scale: vertical axis and unit of the file, as in `read_objects`.
+        up, scale: vertical axis and unit of the file, as in `read_objects`; without a scale the unit is the metre, and sizes
+            that make one doubt it are refused.
 
     All positions are in metres in the scene's z-up frame, after `up` and `scale`.
 
@@ -82,8 +91,8 @@ def own_scene(
     """
     position, candidates = parse_point(rx, "--rx"), _transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
-    objects = read_objects(file, up, scale)
-    _check_size(file, objects)
+    objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
+    _check_size(file, objects, SAID_EXTENT if simulated or scale is not None else EXTENT)
     slabs = _slabs(file, objects, materials)
     check_material_frequencies([slab.material for slab in slabs], frequencies)
     description = f"{len(objects)} objects of {file.name}"
@@ -91,16 +100,26 @@ def own_scene(
     spec.check_receiver()
     if not spec.in_room(candidates).any():
         raise UserError(f"no transmitter of --tx-grid is inside the scene, which spans {_span(spec)}; move the grid")
-    check_surfaces(spec.parts)
-    return spec
+    if not simulated and (flaw := next(surface_flaws(spec.parts), None)):
+        raise UserError(flaw)
+    return dataclasses.replace(spec, flaws=tuple(surface_flaws(spec.parts))) if simulated else spec
 
 
 def describe(spec: SceneSpec) -> str:
-    """Returns how objects were understood, a line each: name, material, thickness (m), solid or sheet, number of triangles."""
+    """Returns how objects were understood, a line each, of many those with most triangles: name, material, thickness (m), solid
+    or sheet, number of triangles; and what is wrong with them."""
     sort = {True: "solid", False: "sheet"}
-    rows = [(p.name, p.material, f"{p.thickness:g} m", sort[p.closed], f"{len(p.mesh.faces)} triangles") for p in spec.parts]
+    largest = sorted(np.argsort([-len(p.mesh.faces) for p in spec.parts], kind="stable")[:SHOWN])
+    shown = [spec.parts[i] for i in largest]
+    rows = [(p.name, p.material, f"{p.thickness:g} m", sort[p.closed], f"{len(p.mesh.faces)} triangles") for p in shown]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    if len(shown) < len(spec.parts):
+        lines.append(f"... and {len(spec.parts) - len(shown)} smaller objects")
+    flaws = spec.flaws if isinstance(spec, OwnScene) else ()
+    if flaws:
+        lines.append(f"warning: {flaws[0]}" + (f" ({len(flaws) - 1} more of such places)" if len(flaws) > 1 else ""))
+    return "\n".join(lines)
 
 
 def _span(spec: SceneSpec) -> str:
@@ -108,14 +127,16 @@ def _span(spec: SceneSpec) -> str:
     return f"{place(low)} to {place(high)} m"
 
 
-def _check_size(file: Path, objects: Sequence[FileObject]) -> None:
+def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, float]) -> None:
     corners = np.concatenate([o.mesh.bounds for o in objects])
     size = np.ptp(corners, axis=0)
     largest = float(size.max())
-    if not EXTENT[0] <= largest <= EXTENT[1]:
+    if not extent[0] <= largest <= extent[1]:
         factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / ROOM)))
-        extent = " x ".join(f"{side:.4g}" for side in size)
-        raise UserError(f"{file} measures {extent} m; if its unit is not the metre, say so, perhaps with --scale {factor:g}")
+        sides = " x ".join(f"{side:.4g}" for side in size)
+        raise UserError(
+            f"{file} measures {sides} m; give the metres in its unit, perhaps --scale {factor:g}, or --scale 1 if that is right"
+        )
     total = sum(len(o.mesh.faces) for o in objects)
     if total > MAX_TRIANGLES:
         name = max(objects, key=lambda o: len(o.mesh.faces)).name

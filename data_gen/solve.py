@@ -94,7 +94,8 @@ class Simulator:
         for frequency in frequencies_hz:
             self._set_frequency(frequency)
             found = [tracer.fields(geometry) for tracer, geometry in zip(self._tracers, traced, strict=True)]
-            result.append(_by_transmitter(found, frequency, len(tx_positions)))
+            elements = self.array.rows * self.array.columns
+            result.append(_by_transmitter([paths for paths in found if paths], frequency, len(tx_positions), elements))
         return result
 
     def _set_frequency(self, frequency_hz: float) -> None:
@@ -109,7 +110,8 @@ class Simulator:
 
 
 def _tracers(scene: rt.Scene, spec: SceneSpec, settings: SolverSettings) -> tuple[Any, ...]:
-    """Returns what finds the paths: each has `trace() -> geometry` and `fields(geometry) -> rt.Paths`."""
+    """Returns what finds the paths: each has `trace() -> geometry` and `fields(geometry) -> rt.Paths`, or None if there are
+    none."""
     if settings.solver == "simulator":
         return (PublicTracer(scene, settings),)
     tracer = PathTracer(scene, RayLauncher(spec, settings), settings)
@@ -149,8 +151,8 @@ def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
     return [float(yaw), float(pitch), float(roll)]
 
 
-def _by_transmitter(found: Sequence[rt.Paths], frequency_hz: float, n_tx: int) -> list[TxPaths]:
-    parts = [_arrays(paths, frequency_hz, n_tx) for paths in found]
+def _by_transmitter(found: Sequence[rt.Paths], frequency_hz: float, n_tx: int, elements: int) -> list[TxPaths]:
+    parts = [_arrays(paths, frequency_hz, n_tx) for paths in found] or [_no_paths(elements, n_tx)]
     return [_sorted_paths(*map(np.concatenate, zip(*(part[i] for part in parts), strict=True))) for i in range(n_tx)]
 
 
@@ -159,7 +161,7 @@ def _arrays(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[tuple[np.nd
     # a: (receiver, element, tx, tx element, path); tau, valid: (receiver, tx, path); interactions: (depth, receiver, tx, path).
     real, imaginary = (np.array(x)[0, :, :, 0].astype(np.float64) for x in found.a)
     if found.tau.shape[-1] == 0:
-        return [(np.zeros((0, len(real)), complex), np.zeros(0), np.zeros(0, int))] * n_tx
+        return _no_paths(len(real), n_tx)
     delays = np.array(found.tau)[0].astype(np.float64)
     carrier = np.exp(-2j * np.pi * np.mod(frequency_hz * delays, 1.0))
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]
@@ -167,6 +169,10 @@ def _arrays(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[tuple[np.nd
     order = (np.array(found.interactions)[:, 0] != rt.InteractionType.NONE).sum(0)
     valid &= np.abs(coefficients).max(-1) > FAINT
     return [(coefficients[i, valid[i]], delays[i, valid[i]], order[i, valid[i]]) for i in range(n_tx)]
+
+
+def _no_paths(elements: int, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    return [(np.zeros((0, elements), complex), np.zeros(0), np.zeros(0, int))] * n_tx
 
 
 def _sorted_paths(

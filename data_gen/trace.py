@@ -115,8 +115,9 @@ class PathTracer:
         self._candidates.DIFFRACTION_SAMPLING_PROBABILITY = settings.diffraction_probability
         self._scene, self._rays, self._settings = scene, rays, settings
 
-    def trace(self) -> PathsBuffer:
-        """Returns the geometry of all paths, for `fields`. The transmitters must stay where they are between the two.
+    def trace(self) -> PathsBuffer | None:
+        """Returns the geometry of all paths, for `fields`; None where there is none, as in a closed yard, which
+        Sionna RT stumbles over. The transmitters must stay where they are between the two.
 
         Raises:
             UserError: a transmitter has more candidate paths than the buffer holds.
@@ -143,11 +144,15 @@ class PathTracer:
         if self._diffuse:
             _keep_diffuse(paths)
         paths.discard_invalid()
+        if not paths.buffer_size:
+            return None
         end_unused_vertices(paths, targets[0])
         return paths
 
-    def fields(self, traced: PathsBuffer) -> rt.Paths:
+    def fields(self, traced: PathsBuffer | None) -> rt.Paths | None:
         """Returns the traced paths with the coefficients they have at the scene's present frequency."""
+        if traced is None:
+            return None
         scene = self._scene
         # Not those of `trace`: the distances between antenna elements follow the wavelength.
         sources, targets = self._ends()

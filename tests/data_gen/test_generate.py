@@ -149,7 +149,7 @@ def test_transmitters_without_a_path_are_left_out_and_counted(simulator_backend,
     np.testing.assert_array_equal(scene.tx_positions, kept)
 
 
-def test_no_path_at_all_is_told_after_the_first_batch(simulator_backend, tmp_path, monkeypatch):
+def test_no_path_at_all_is_told_before_long(simulator_backend, tmp_path, monkeypatch):
     from data_gen.solve import Simulator, TxPaths
 
     nothing = TxPaths(np.zeros((0, 16), complex), np.zeros(0), np.zeros(0, int))
@@ -159,8 +159,11 @@ def test_no_path_at_all_is_told_after_the_first_batch(simulator_backend, tmp_pat
         return [[nothing] * len(positions) for _ in frequencies]
 
     monkeypatch.setattr(Simulator, "paths", paths)
-    with pytest.raises(UserError, match="no path between the receiver and transmitters 0 to 7"):
+    with pytest.raises(UserError, match="no path between the receiver and any of 20 transmitters"):
         generate(options(tmp_path))
+    monkeypatch.setattr("data_gen.jobs.SILENT", 10)
+    with pytest.raises(UserError, match="no path between the receiver and any of 16 transmitters"):
+        generate(options(tmp_path, seed=1))
 
 
 @pytest.mark.parametrize(
