@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 import tyro
-from own_room import FREQUENCIES, GRID, ROOM, RX, TOML, load, meshes, refused, toml, with_object, write_obj
+from own_room import FREQUENCIES, GRID, ROOM, RX, TOML, load, meshes, refused, shape, toml, with_object, write_obj, write_xml
 
 from data_gen.example.make_room import OBJECTS, obj
 from data_gen.own_scene import describe, own_scene
@@ -174,7 +174,33 @@ def test_a_missing_or_unknown_file(tmp_path):
 
 @pytest.mark.parametrize("scale", [1000.0, 100.0, 0.001])
 def test_another_unit(scale, tmp_path):
-    refused(f"measures .* perhaps with --scale {1 / scale:g}", write_obj(tmp_path, scale))
+    refused(f"measures .* perhaps --scale {1 / scale:g}", write_obj(tmp_path, scale))
+
+
+def test_a_size_that_is_said_to_be_right_is_believed(tmp_path):
+    """A factory of 600 m, whose author says so; a scene of the simulator's says so by itself."""
+    places = {"rx": "80,240,120", "tx_grid": "160,50,50:540,400,230:9,7,4"}
+    spec = load(write_obj(tmp_path, 100.0), scale=1.0, **places)
+    np.testing.assert_allclose(spec.bounds()[1], [600, 450, 270])
+    assert len(load(write_xml(tmp_path, 100.0), None, **places).parts) == len(OBJECTS)
+    refused("measures", write_obj(tmp_path, 1e5), scale=1.0, **places)
+
+
+def test_flaws_of_a_scene_of_the_simulator_are_warnings(tmp_path):
+    """Its users trace it as it is; an export of one's own should be mended."""
+    file = write_xml(tmp_path)
+    poster = trimesh.Trimesh([(0, 1, 1), (0, 2, 1), (0, 2, 2), (0, 1, 2)], [(0, 1, 2), (0, 2, 3)])
+    poster.export(tmp_path / "meshes" / "poster.ply")
+    file.write_text(file.read_text().replace("</scene>", shape("poster") + "</scene>"))
+    spec = load(file, None)
+    assert len(spec.flaws) == 2 and "lie on each other" in spec.flaws[0]
+    assert describe(spec).splitlines()[-1].startswith("warning: objects 'wall_west' and 'poster' lie on each other")
+
+
+def test_many_objects_are_not_all_described(tmp_path, monkeypatch):
+    monkeypatch.setattr("data_gen.own_scene.SHOWN", 3)
+    lines = describe(load()).splitlines()
+    assert len(lines) == 4 and lines[-1] == "... and 7 smaller objects" and any("table" in line for line in lines)
 
 
 def test_too_many_triangles(tmp_path, monkeypatch):

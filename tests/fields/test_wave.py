@@ -21,9 +21,9 @@ from wbgs_jax.fields import wave
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.inference.predictor import at_receiver, observe_links, predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
-from wbgs_jax.radio.channel import received_power_db
+from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
 from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.types import Links, make_query, make_receiver
+from wbgs_jax.types import Batch, Links, make_query, make_receiver
 
 FREQUENCIES = np.array([1e9, 3e9, 10e9, 30e9])
 RX = (1.0, 1.0, 1.2)
@@ -292,6 +292,31 @@ def test_phase_blind_spectra_of_next_to_nothing_have_gradients():
     (_, strongest), found = gradients(params)
     assert float(strongest) < 1e-19
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.materials))
+
+
+@pytest.mark.parametrize("coherent", [True, False])
+def test_a_link_without_any_path_has_gradients(coherent):
+    """Data may hold a spectrum where the mesh lets nothing through; a training goes on."""
+    field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), coherent=coherent, **SMALL)
+    query, receivers = make_query([[3.0, 2.0, 1.0]], 28e9), jax.tree.map(lambda leaf: leaf[None], plan.receiver)
+    links = Links(query, jnp.zeros(1, int), jnp.zeros(1, int))
+    cache = field.prepare(links, receivers)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, cache)
+    heard = jnp.exp(1j * jnp.arange(16.0))[None].astype(jnp.complex64)
+    truth = snapshot_to_pas(heard, plan.receiver.element_positions)
+    batch = Batch(links, plan.receiver, truth, heard, None, jax.random.key(0))
+
+    @jax.jit
+    def found(params, cache):
+        return jax.value_and_grad(lambda params: field.loss(params, cache, batch)[0])(params)
+
+    for paths in (cache, nothing):
+        loss, gradient = found(params, paths)
+        assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    seen = jax.jit(WaveField.render_links)(field, params, field.plan(params, plan.receiver, cache=cache), nothing, links)
+    assert not np.any(seen.pas)
+    if coherent:
+        assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB
 
 
 def test_the_pattern_is_the_receivers():

@@ -34,6 +34,8 @@ from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
 from wbgs_jax.radio.patterns import Antenna
 from wbgs_jax.types import Receiver
 
+FAINTEST_SUM = 1e-12
+"""Of the power of several paths, relative to the strongest: what cancels further, or is nothing, has no spectrum."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Beyond it (S/m) every material is a mirror, and single precision ends."""
 
@@ -134,12 +136,13 @@ def path_covariances(
     spread = jnp.exp(params.placement)
 
     def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
-        strongest = jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude))), FAINTEST)
+        strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude)))
+        strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # without any path: 1 / FAINTEST^2 is no float
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
         left = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
         covariance = covariance_from_paths(arrived, plan.receiver, f, left)
-        trace = jnp.maximum(jnp.trace(covariance).real, FAINTEST)
-        return covariance / trace, trace / len(covariance) * strongest**2
+        trace = jnp.trace(covariance).real
+        return covariance / jnp.maximum(trace, FAINTEST_SUM), trace / len(covariance) * strongest**2
 
     found: Any = jax.vmap(one)(paths, arrived, frequency_hz)
     return found

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.propagation.crossings import planes_of
@@ -26,6 +26,11 @@ NO_LENGTH = 1e-12
 """Square metres: twice the smallest triangle of an image and a side that bounds a beam."""
 BEAMS_AT_ONCE = 64
 """Few enough for a CPU's cache."""
+MOST_TRIED = 10_000_000
+"""Pairs of a chain and a further mirror that are looked at for one order, ..."""
+MOST_PAIRS = 1_000_000
+"""... and pairs of a mirror and an edge: where there are more, as between the fronts of a whole city, the smallest mirrors are
+left out."""
 
 
 @pytree
@@ -133,16 +138,29 @@ def receiver_chains(
         slack: metres by which facets are widened, so that rounding loses none.
     """
     area = areas(facets)
+    largest_first = np.argsort(-area, kind="stable")
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
     chains = []
     facet = np.zeros((1, 0), np.int64)
     image = np.broadcast_to(np.asarray(rx, np.float64), (1, 1, 3))  # the last one of a row is the receiver
     for smallest in min_areas:
-        large = np.flatnonzero(area >= smallest)
-        keep = np.isin(facet, large).all(-1)
+        large, keep = _few_enough(facet, largest_first[: np.count_nonzero(area >= smallest)])
         facet, image = _prepend(facet[keep], image[keep], large, corners, normal, offset, slack)
         chains.append(Chains(facet.astype(np.int32), image[:, :-1]))
     return tuple(chains)
+
+
+def _few_enough(
+    facet: Int[np.ndarray, "chains m"], mirrors: Int[np.ndarray, " k"]
+) -> tuple[Int[np.ndarray, " large"], Bool[np.ndarray, " chains"]]:
+    """Returns as many of some mirrors, the largest come first, as can be tried in front of every chain of them alone, in
+    ascending order; and those chains."""
+    rank = np.full(max(facet.max(initial=-1), mirrors.max(initial=-1)) + 1, len(mirrors))
+    rank[mirrors] = np.arange(len(mirrors))
+    worst = rank[facet].max(-1, initial=-1)  # of every chain's mirrors
+    chains_of = np.cumsum(np.bincount(worst + 1, minlength=len(mirrors) + 1))  # of the first 0, 1, ... mirrors
+    count = int(np.searchsorted(np.arange(len(mirrors) + 1) * chains_of[: len(mirrors) + 1], MOST_TRIED, "right")) - 1
+    return np.sort(mirrors[:count]), worst < count
 
 
 def diffracted_chains(
@@ -160,13 +178,15 @@ def diffracted_chains(
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
     start, end = edges.start, edges.start + edges.direction * edges.length[:, None]
     segment = np.stack([start, end, end, end], 1)
-    mirrors = np.flatnonzero(area >= after_area)
+    most = MOST_PAIRS // max(len(segment), 1)
+    largest_first = np.argsort(-area, kind="stable")
+    mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= after_area), most)])
     height = normal[mirrors] @ rx - offset[mirrors]
     image = rx - 2 * height[:, None] * normal[mirrors]
     seen = _seen(image, np.broadcast_to(rx, image.shape), mirrors, segment, corners, normal, offset, slack)
     place, edge = np.nonzero(seen & (np.abs(height) > SIDE)[:, None])
     after = np.stack([mirrors[place], edge], 1)
-    mirrors = np.flatnonzero(area >= before_area)
+    mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= before_area), most)])
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)
     return DiffractedChains(after.astype(np.int32), image[place], before.astype(np.int32))
 

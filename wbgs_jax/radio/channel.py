@@ -131,8 +131,8 @@ def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Fl
     """Returns the spectrum, maximum 1, that an array sees of one transmitter's paths if their powers are added instead of their
     amplitudes. Element positions are in wavelengths."""
     strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))
-    power = squared_magnitude(arrivals.amplitude / jnp.maximum(strongest, FAINTEST))
+    power = squared_magnitude(arrivals.amplitude / jnp.where(strongest > FAINTEST, strongest, 1))  # the root of nothing's
     steering = steering_vector(elements, arrivals.direction)
-    weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST))[:, None]
+    weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST**0.5))[:, None]
     covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)
     return wide_covariance_to_pas(covariance[None], elements[None])[0]
