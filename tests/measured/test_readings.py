@@ -31,6 +31,32 @@ def test_the_published_layout_of_gateways(tmp_path, rng):
     assert np.isnan(readings.powers[3, 1]) and np.isfinite(readings.powers).sum() == 59
 
 
+@pytest.mark.parametrize("style", ["antennas of one station", "receivers by name"])
+def test_the_published_layout_of_channel_state(style, tmp_path, rng):
+    """Its power is the mean over subcarriers, in decibels; an antenna that heard nothing says nothing."""
+    tx, state = places(rng, 12), rng.normal(size=(12, 3, 26)) + 1j * rng.normal(size=(12, 3, 26))
+    state[4, 2] = 0
+    np.save(tmp_path / "csidata.npy", state.astype(np.complex64))
+    rows = [f"[{', '.join(map(str, place))}]" for place in RECEIVERS]
+    if style == "receivers by name":
+        lines = [*(f"rx{i}: {row}" for i, row in enumerate(rows)), "num_rx: 3", "source: a set"]
+        (tmp_path / "rx_positions.yml").write_text("\n".join(lines))
+    else:
+        (tmp_path / "base-station.yml").write_text(f"base_station: [{', '.join(rows)}]")
+    with pytest.raises(UserError, match="has no tx_pos.csv .* NeRF2's own channel state"):
+        load_readings(tmp_path, HEIGHT)
+    write_table(tmp_path / "tx_pos.csv", ["x", "y", "z"], tx)
+    readings = load_readings(tmp_path, HEIGHT)
+    np.testing.assert_allclose(readings.receivers, RECEIVERS)
+    assert np.isnan(readings.powers[4, 2]) and np.isfinite(readings.powers).sum() == 35
+    mean = sum(abs(complex(value)) ** 2 for value in state[7, 1]) / 26
+    assert readings.powers[7, 1] == pytest.approx(10 * np.log10(mean), abs=1e-4)
+    for damaged, said in ((state.real, "complex numbers"), (state[:, :2], "12 transmitters at 2 receivers")):
+        np.save(tmp_path / "csidata.npy", damaged)
+        with pytest.raises(UserError, match=said):
+            load_readings(tmp_path, HEIGHT)
+
+
 def test_means_of_cells(rng):
     """Against a loop over all readings."""
     n, size = 200, 0.5

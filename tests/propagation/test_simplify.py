@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from rooms import box, mesh_of, rectangle
 
+from wbgs_jax.propagation import simplify
 from wbgs_jax.propagation.facets import areas, facets_from_mesh
 from wbgs_jax.propagation.simplify import decimated, distance_from, distances, facets_that_fit, simplified, welded
 
@@ -105,6 +106,17 @@ def test_what_fits_is_not_simplified():
         warnings.simplefilter("error")
         found = facets_that_fit(mesh_of(*parts), 12)
     assert areas(found).min() >= 6
+
+
+def test_of_many_facets_those_are_kept_that_make_up_the_surface(monkeypatch):
+    """A city of equal blocks, and gravel: no fewer than cost little, no more than count."""
+    monkeypatch.setattr(simplify, "FEW", 10)
+    blocks = [box((5 * i, 0, 0), (5 * i + 3, 2, 3)) for i in range(4)]
+    gravel = [box((5 * i + 4, 0, 0), (5 * i + 4.1, 0.1, 0.1)) for i in range(4)]
+    for parts, most, expected in (([*blocks, *gravel], 100, 24), ([blocks[0], *gravel], 100, 10), ([*blocks, *gravel], 23, 23)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert len(facets_that_fit(mesh_of(*parts), most).offset) == expected
 
 
 def test_a_curved_mesh_keeps_its_surface():

@@ -14,7 +14,8 @@ import trimesh
 from jaxtyping import Array, Float
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.measured.readings import check_positions, numbers, read_table
+from wbgs_jax.measured.readings import check_positions
+from wbgs_jax.measured.tables import numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
 PARALLEL = 1e-9

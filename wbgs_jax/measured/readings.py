@@ -4,26 +4,23 @@
     receivers.csv (or anchors.csv)      id,x,y,z, in the order of those columns
     walls.csv (or layout.csv)           optional; floor_plan.py
 
-or as NeRF2 publishes received powers of Bluetooth gateways: tx_pos.csv (x,y,z), gateway_position.yml (name: [x, y, z]) and
-gateway_rssi.csv (one column a gateway; -100: not received). Metres and one frame throughout. Headers may be in capitals.
-Columns of powers that end in the receivers' ids may stand in any order; others stand in that of the receivers.
+or in a layout of NeRF2 (nerf2.py). Metres and one frame throughout. Headers may be in capitals. Columns of powers that end in
+the receivers' ids may stand in any order; others stand in that of the receivers.
 """
 
-import csv
 import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.measured.nerf2 import is_nerf2, load_nerf2
+from wbgs_jax.measured.tables import found, numbers, read_table
 
 READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
-NERF2 = ("tx_pos.csv", "gateway_position.yml", "gateway_rssi.csv")
-NERF2_NOT_RECEIVED = -100.0
 POWERS_DBM = (-200.0, 50.0)
 """Beyond it numbers are no powers; +100 often stands for nothing."""
 FURTHEST = 1e4
@@ -62,53 +59,11 @@ def load_readings(folder: Path, height: float) -> Readings:
     """
     if not folder.is_dir():
         raise UserError(f"there is no folder {folder}")
-    if (folder / NERF2[2]).exists():
-        return _checked(_load_nerf2(folder), folder)
+    if is_nerf2(folder):
+        places, powers, receivers = load_nerf2(folder)
+        rooms = ("",) * len(places)
+        return _checked(Readings(places, powers, np.isfinite(powers).astype(float), rooms, receivers), folder)
     return _checked(_load_tables(folder, height), folder)
-
-
-def found(folder: Path, names: tuple[str, ...]) -> Path:
-    """Returns the first of these files that exists; none is a `UserError`."""
-    for name in names:
-        if (folder / name).exists():
-            return folder / name
-    raise UserError(f"{folder} has no {' or '.join(names)}; docs/measured.md shows the layout")
-
-
-def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Returns the header of a CSV file in small letters, and its rows, all of one length."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream)
-            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} cannot be read: {error}") from None
-    if len(lines) < 2:
-        raise UserError(f"{path} has no rows below its header")
-    header = [name.lower() for name in lines[0][1]]
-    if len(header) == 1 and ";" in header[0]:
-        raise UserError(f"{path} has ';' between its cells; separate them by commas")
-    if len(set(header)) < len(header):
-        raise UserError(f"{path} names two columns alike: {', '.join(header)}")
-    for number, row in lines[1:]:
-        if len(row) != len(header):
-            raise UserError(f"{path}, line {number} has {len(row)} cells, the header {len(header)}")
-    return header, [row for _, row in lines[1:]]
-
-
-def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[str]) -> Float[np.ndarray, "n k"]:
-    """Returns some columns as numbers; empty cells are NaN."""
-    if missing := [name for name in columns if name not in header]:
-        raise UserError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(header)}")
-    where, values = [header.index(name) for name in columns], np.full((len(rows), len(columns)), np.nan)
-    for i, row in enumerate(rows):
-        for k, column in enumerate(where):
-            try:
-                values[i, k] = float(row[column]) if row[column] else np.nan
-            except ValueError:
-                hint = "leave cells empty where nothing was received"
-                raise UserError(f"{path}, row {i + 1}: {row[column]!r} is no number; {hint}") from None
-    return values
 
 
 def _load_tables(folder: Path, height: float) -> Readings:
@@ -135,26 +90,6 @@ def _in_order(columns: list[str], ids: list[str]) -> list[str]:
     """Returns columns in the order of the receivers whose ids they end in; as they are, where they do not."""
     by_id = {column.rsplit("_", 1)[-1]: column for column in columns}
     return [by_id[name] for name in ids] if sorted(by_id) == sorted(ids) else columns
-
-
-def _load_nerf2(folder: Path) -> Readings:
-    tx, gateways, heard = (found(folder, (name,)) for name in NERF2)
-    places = numbers(tx, *read_table(tx), ["x", "y", "z"])
-    try:
-        entries = yaml.safe_load(gateways.read_text(encoding="utf-8"))
-        found_at = [entry["position"] if isinstance(entry, dict) else entry for entry in entries.values()]
-        receivers = np.array([[float(value) for value in position] for position in found_at])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
-        raise UserError(f"{gateways} does not list positions; write 'gateway1: [x, y, z]' for each") from None
-    header, rows = read_table(heard)
-    values = numbers(heard, header, rows, header)
-    values = np.where(values <= NERF2_NOT_RECEIVED, np.nan, values)
-    if values.shape != (len(places), len(receivers)) or receivers.shape[1:] != (3,):
-        raise UserError(
-            f"{heard} has {values.shape[0]} rows of {values.shape[1]} powers; there are {len(places)} positions and "
-            f"{len(receivers)} gateways"
-        )
-    return Readings(places, values, np.isfinite(values).astype(float), ("",) * len(places), receivers)
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:

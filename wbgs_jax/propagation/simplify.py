@@ -32,6 +32,10 @@ AT_ONCE = 0.5
 """Share of the vertices, the cheapest, that may go at once."""
 FINE = 300_000
 """Triangles: meshes of more are simplified before coplanar ones are merged, which takes longer."""
+FEW = 3000
+"""Facets that cost little time: as many as there are, and of a mesh that is simplified, ..."""
+KEPT = 0.98
+"""... and as many of the largest beyond them as make up this share of the surface."""
 LEFT_OUT = 0.1
 """Share of the surface that may be left out, as its smallest facets, before the mesh is simplified instead."""
 TRIES = 4
@@ -62,13 +66,15 @@ class Simplified:
 
 
 def facets_that_fit(mesh: Mesh, most: int) -> Facets:
-    """Returns at most so many facets: the largest of the mesh, or those of a simplified one where that would leave out what
-    counts; a warning says how far it is from the mesh as it was."""
+    """Returns at most so many facets: the largest of the mesh, as many as count (`FEW`, `KEPT`), or those of a simplified one
+    where the largest would leave out what counts; a warning says how far it is from the mesh as it was."""
     if len(mesh.faces) <= FINE:
         found = facets_from_mesh(mesh)
-        size = areas(found)
-        if size[most:].sum() <= LEFT_OUT * size.sum():
-            return jax.tree.map(lambda leaf: leaf[:most], found)
+        share = np.cumsum(areas(found)) / areas(found).sum()
+        if share[min(most, len(share)) - 1] >= 1 - LEFT_OUT:
+            enough = max(FEW, int(np.searchsorted(share, KEPT)) + 1)
+            return jax.tree.map(lambda leaf: leaf[: min(most, enough)], found)
+    most = min(most, FEW)
     count = 2 * most  # pairs of triangles often make one facet
     for _ in range(TRIES):
         small, what = simplified(mesh, count)
