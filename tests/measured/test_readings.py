@@ -43,7 +43,7 @@ def test_the_published_layout_of_channel_state(style, tmp_path, rng):
         (tmp_path / "rx_positions.yml").write_text("\n".join(lines))
     else:
         (tmp_path / "base-station.yml").write_text(f"base_station: [{', '.join(rows)}]")
-    with pytest.raises(UserError, match="has no tx_pos.csv .* NeRF2's own channel state"):
+    with pytest.raises(UserError, match=r"has no tx_pos.csv .* NeRF2's own channel state"):
         load_readings(tmp_path, HEIGHT)
     write_table(tmp_path / "tx_pos.csv", ["x", "y", "z"], tx)
     readings = load_readings(tmp_path, HEIGHT)

@@ -44,8 +44,8 @@ def load_nerf2(folder: Path) -> Powers:
         heard, listed, values = folder / CSI, found(folder, ANTENNAS), _csi(folder / CSI)
         if not (folder / TRANSMITTERS[0]).exists():
             raise UserError(
-                f"{folder} has no {TRANSMITTERS[0]} (x,y,z) that says where its transmitters stood; NeRF2's own channel state is "
-                "about uplinks and downlinks, not about places"
+                f"{folder} has no {TRANSMITTERS[0]} (x,y,z) that says where its transmitters stood; NeRF2's own channel "
+                "state is about uplinks and downlinks, not about places"
             )
     tx = found(folder, TRANSMITTERS)
     places, receivers = numbers(tx, *read_table(tx), ["x", "y", "z"]), _positions(listed)
