@@ -12,6 +12,7 @@ from wave_runs import PARTS, THICKNESS, places, run_in, snapshots
 
 from wbgs_jax.config import changed
 from wbgs_jax.fields import wave
+from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training import search as search_module
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import ITU_MATERIALS
@@ -164,3 +165,16 @@ def test_known_thickness_stays_where_it_is_in_training(run_on):
     np.testing.assert_array_equal(run.state.params.materials.log_thickness, before)
     np.testing.assert_array_equal(run.field.known_thickness, np.full(len(PARTS), THICKNESS, np.float32))
     assert (run.state.params.materials.log_conductivity != np.log(SETTINGS.field.conductivity)).any()
+
+
+def test_of_powers_alone_the_unknown_gain_is_found(run_on, tmp_path, rng):
+    """Nobody has said what was transmitted; what reflects well and what does not is told by powers."""
+    run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS)), float(rng.uniform(-90, 40))
+    run.data = dataclasses.replace(
+        run.data, snapshots=None, steering=None, power_db=received_power_db(run.data.snapshots) + offset
+    )
+    run.control()
+    entry = json.loads((tmp_path / "metrics.jsonl").read_text())
+    assert entry["gain_db"] == pytest.approx(offset, abs=2.5)
+    assert entry["search"]["after"] < entry["search"]["before"] - 0.15, entry
+    assert set(entry) == {"step", "search", "gain_db"}

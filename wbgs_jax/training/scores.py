@@ -19,9 +19,12 @@ from wbgs_jax.types import Batch
 
 AT_ONCE = 8
 """Spectra."""
+POWER_MARGIN_DB = 1.0
+"""What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 Compared = Literal["snapshots", "covariances", "spectra"]
 """What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
-(`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known."""
+(`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known. Of received powers alone it is
+the log absolute error in dB."""
 
 
 @runtime_checkable
@@ -96,7 +99,9 @@ def _score(
             return log_decorrelation(seen.snapshots, batch.snapshots)[0]
         if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
             return surprise(seen.covariance, batch.snapshots)[0]
-        assert batch.pas is not None, "candidates are scored by spectra or snapshots"
+        if batch.pas is None:
+            assert batch.power_db is not None and seen.power_db is not None, "one of the three is known"
+            return jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - batch.power_db)[0])
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas)))
 
     def one(link: Int[Array, ""]) -> Float[Array, " k"]:

@@ -8,6 +8,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from wbgs_jax.config import SearchConfig
@@ -18,11 +19,25 @@ from wbgs_jax.training.geometry import Place, learn_geometry
 from wbgs_jax.training.idealisations import search_idealisations
 from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
-from wbgs_jax.training.scores import Told
+from wbgs_jax.training.scores import Scores, Told
 from wbgs_jax.training.thicknesses import search_slabs
 
+GAINS_DB = (100.0, 5.0), (5.0, 0.5)
+"""How far a gain may be from the one before, and the steps in which it is tried."""
 SWEEPS = 2
 """Times that antennas are searched anew after materials are named, at most."""
+
+
+def search_gain(params: Any, score: Scores) -> tuple[Any, float]:
+    """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB): nobody
+    may have said what was transmitted."""
+    gain = 0.0
+    for reach, step in GAINS_DB:
+        tried = gain + np.arange(-reach, reach + step, step)
+        candidates = [dataclasses.replace(params, log_gain=jnp.asarray(db * np.log(10) / 20, jnp.float32)) for db in tried]
+        best = int(np.argmin(score(candidates).mean(1)))
+        params, gain = candidates[best], float(tried[best])
+    return params, gain
 
 
 @dataclass(frozen=True)
@@ -53,6 +68,11 @@ class Search:
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
         told = Told(field, cache, data, spectra)
+        if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
+            params, gain = search_gain(params, told.scores(config.spectra))
+            params, named = search_materials(params, told.scores(config.spectra), config, usual=True)
+            params, gain = search_gain(params, told.scores(config.spectra))
+            return Edit(params, (), None, {"search": dataclasses.asdict(named), "gain_db": gain}, field, cache)
         if config.antenna_rounds:
             params, _ = self._antennas(params, told, report)
         if config.rounds:
