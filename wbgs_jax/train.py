@@ -23,7 +23,9 @@ from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
+from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.confidence import learn_confidence
+from wbgs_jax.training.lock import locked
 from wbgs_jax.training.loop import TrainResult, check_data, train
 from wbgs_jax.training.neighbours import Learned, learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
@@ -151,8 +153,11 @@ def main(arguments: list[str] | None = None) -> None:
     prepare_folder(folder, config, command.resume)
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
-    result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
-    learn_beside(result, dataset, config, folder)
+    with locked(folder):
+        if steps := checkpoint_steps(folder / "checkpoints"):
+            say(f"going on from the checkpoint of step {steps[-1]}")
+        result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
+        learn_beside(result, dataset, config, folder)
     say(summary(result, folder))
 
 

@@ -26,6 +26,8 @@ LOWEST_OF_PATHS_HZ = 0.3e9
 """Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms."""
 LOWEST_FREQUENCY_HZ = 1e6
 """Smaller numbers are gigahertz or megahertz by mistake."""
+HIGHEST_FREQUENCY_HZ = 1e12
+"""Larger numbers are no radio frequencies."""
 LARGEST_COORDINATE_M = 1e5
 """Larger numbers are millimetres by mistake, or no indoor scene."""
 

@@ -207,7 +207,7 @@ def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
     def gradients(points, orientation):
         paths = Paths(points, nothing, nothing, nothing, jnp.array([True, False]))
         receiver = dataclasses.replace(plan.receiver, orientation=orientation)
-        return arrivals(paths, plan.search, slabs, jnp.asarray(3e9), receiver, diffracted=False).amplitude.real.sum()
+        return arrivals(paths, plan.surfaces, slabs, jnp.asarray(3e9), receiver, diffracted=False).amplitude.real.sum()
 
     for gradient in map(np.asarray, gradients(jnp.asarray(points), plan.receiver.orientation)):
         assert np.isfinite(gradient).all() and gradient.any()

@@ -48,7 +48,7 @@ def test_closed_bodies_and_separate_walls_move_by_themselves():
 
 def drawn(rng, shift=1e-3, turn=0.0) -> Motion:
     """Everything stands elsewhere."""
-    size = still(len(PARTS))
+    size = still(len(PARTS)).of_receiver(0)
     size = dataclasses.replace(size, shift=size.shift + shift, turn=size.turn + turn)
     size = dataclasses.replace(size, receiver=size.receiver + shift)
     return jax.tree.map(lambda leaf: (rng.normal(size=leaf.shape) * leaf).astype(np.float32), size)
@@ -76,7 +76,7 @@ def test_lengths_follow_surfaces_and_ends(kind, rng):
 def test_nothing_changes_where_nothing_moves():
     search = search_of(PARTS, RX, mirror_areas=(0.0,))
     paths = trace(search, TX).specular
-    nothing = still(len(PARTS))
+    nothing = still(len(PARTS)).of_receiver(0)
     np.testing.assert_array_equal(length_changes(paths, search, nothing), 0)
     facets = facets_of(*PARTS)
     same = moved(facets, nothing.shift, nothing.turn)

@@ -1,5 +1,6 @@
 """What all command lines share: how errors become one line and an exit code, and lines for people."""
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -9,12 +10,14 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 
+FURTHEST = 1e5
+"""Metres, or metres a second: farther is a mistake, and beyond single precision soon."""
 _as_python_has_it = warnings.formatwarning
 
 
 def run_command(main: Callable[[], None]) -> None:
-    """Runs a command line's `main`; a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130, and a
-    `UserWarning` a line that begins with "note:"."""
+    """Runs a command line's `main`: a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130, a reader
+    that has gone (`| head`) exit code 141, and a `UserWarning` a line that begins with "note:"."""
     warnings.formatwarning = _note
     try:
         main()
@@ -24,6 +27,9 @@ def run_command(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
 
 
 def _note(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
@@ -61,6 +67,6 @@ def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "me
         values = np.array([float(part) for part in word.split(",")])
     except ValueError:
         values = np.zeros(0)
-    if len(values) != 3 or not np.isfinite(values).all():
-        raise UserError(f"{option} {word} is no {kind}; give x,y,z in {unit}")
+    if len(values) != 3 or not (np.abs(values) <= FURTHEST).all():
+        raise UserError(f"{option} {word[:60]} is no {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
     return values

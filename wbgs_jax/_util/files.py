@@ -5,12 +5,16 @@ import csv
 import io
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 from wbgs_jax._util.errors import UserError
+
+LONGEST_NAME = 100
+"""Characters: file systems take 255, and names get endings."""
 
 
 @contextlib.contextmanager
@@ -36,6 +40,23 @@ def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
                 f"cannot write {path}: {error.strerror or error}; free some space or choose another folder"
             ) from error
         raise
+
+
+def read_text(path: Path) -> str:
+    """Returns the content of a text file; anything else is a `UserError`, a pipe too, which nobody may ever write to."""
+    try:
+        if path.exists() and not path.is_file():
+            raise UserError(f"{path} is not a file; put one in its place")
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}; the folder must hold it") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
+
+
+def safe_name(name: str) -> str:
+    """Returns a name, as data give it, that is no path: letters, digits, blanks and -+._ alone, and no dot at an end."""
+    return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:LONGEST_NAME] or "data"
 
 
 def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:

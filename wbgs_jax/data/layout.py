@@ -21,7 +21,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +32,27 @@ from PIL import Image
 
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_text, safe_name
+from wbgs_jax._util.yaml_files import read_yaml
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import scene_dataset
 from wbgs_jax.data.ply import read_ply, write_ply
 from wbgs_jax.data.scene_file import SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.types import Receiver, make_receiver, stack_receivers
+from wbgs_jax.types import (
+    HIGHEST_FREQUENCY_HZ,
+    LARGEST_COORDINATE_M,
+    LOWEST_FREQUENCY_HZ,
+    Receiver,
+    make_receiver,
+    stack_receivers,
+)
 
+SHORTEST, LONGEST = 1e-6, 1e6
+"""Of quaternions that have a direction."""
+DIGITS = 9
+"""Of the number of an image, at most."""
 NOMINAL_FREQUENCY_HZ = 1e9
 """Stands for the frequency of a folder that names none: a model of one frequency only needs some constant."""
 
@@ -71,7 +84,7 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
     return Dataset(
-        name=name or folder.resolve().name,
+        name=name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),
         tx_positions=positions,
         frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz),
@@ -154,7 +167,7 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:
 
 
 def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
-    header, *rows = [line for line in _read_text(path).splitlines() if line.strip()] or [""]
+    header, *rows = [line for line in read_text(path).splitlines() if line.strip()] or [""]
     if header.lower().replace(" ", "") != "x,y,z":
         raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
     if len(rows) != n:
@@ -170,7 +183,7 @@ def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: f
         return np.full(n, single, np.float64)
     if wanted_hz is not None:
         raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
-    words = _read_text(path).split()
+    words = read_text(path).split()
     if len(words) != n:
         raise UserError(f"{path} has {len(words)} frequencies for {n} images in {SPECTRA}/; give one (GHz) for each")
     return np.array([_ghz_to_hz(word, path) for word in words])
@@ -178,10 +191,7 @@ def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: f
 
 def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
     """Returns the data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
-    try:
-        content = yaml.safe_load(_read_text(path))
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date
-        raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); mend it") from error
+    content = read_yaml(path)
     entries = content if isinstance(content, dict) else {}
     gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
     if not gateways:
@@ -191,12 +201,14 @@ def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
         warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)
     position = _vector(gateway.get("position"), 3, f"{path}: position")
     x, y, z, w = _vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
-    if x == y == z == w == 0:
-        raise UserError(f"{path}: orientation is all zeros; write the quaternion [0, 0, 0, 1] for no rotation")
+    if not SHORTEST < np.linalg.norm(np.array([x, y, z, w]) / LONGEST) * LONGEST < LONGEST:
+        raise UserError(
+            f"{path}: orientation is all zeros, or beyond all measure; write the quaternion [0, 0, 0, 1] for no rotation"
+        )
     frequency = entries.get("frequency", gateway.get("frequency"))
     name = entries.get("dataset_name")
     return (
-        None if name is None else str(name),
+        None if name is None else safe_name(str(name)),
         make_receiver(position, (w, x, y, z)),
         None if frequency is None else _ghz_to_hz(str(frequency), path),
     )
@@ -204,11 +216,11 @@ def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
 
 def _vector(value: Any, length: int, what: str) -> list[float]:
     try:
-        vector = [float(v) for v in value]  # YAML gives 1e-3 as text
+        vector = [float(v) for v in value] if isinstance(value, list) else []  # YAML gives 1e-3 as text
     except (TypeError, ValueError, OverflowError):
         vector = []
-    if len(vector) != length or not np.isfinite(vector).all():
-        raise UserError(f"{what} is {value!r}; it must be {length} finite numbers")
+    if len(vector) != length or not (np.abs(vector) <= LARGEST_COORDINATE_M).all():
+        raise UserError(f"{what} is {repr(value)[:80]}; it must be {length} numbers of at most {LARGEST_COORDINATE_M:g}")
     return vector
 
 
@@ -228,7 +240,7 @@ def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
 
 def _read_index(path: Path, n: int) -> np.ndarray:
     """Returns the indices of the spectra that an index file names; at least one, none twice."""
-    numbers = [_image_number(word.removesuffix(".png"), path) for word in _read_text(path).split()]
+    numbers = [_image_number(word.removesuffix(".png"), path) for word in read_text(path).split()]
     absent = [number for number in numbers if not 1 <= number <= n]
     if absent:
         raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ holds images 1 to {n}; mend the index")
@@ -238,28 +250,19 @@ def _read_index(path: Path, n: int) -> np.ndarray:
 
 
 def _image_number(word: str, where: Path) -> int:
-    if not (word.isascii() and word.isdigit()):
-        raise UserError(f"{where}: {word!r} is not an image number; images are named by numbers, 00001 for example")
+    if not (word.isascii() and word.isdigit() and len(word) <= DIGITS):
+        raise UserError(f"{where}: {word[:40]!r} is not an image number; images are named by numbers, 00001 for example")
     return int(word)
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}; the folder must hold it") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
 
 
 def _ghz_to_hz(word: str, where: Path) -> float:
     """Returns hertz, through decimals, not by a factor of 1e9: rounding must not part a frequency from itself elsewhere."""
     try:
         hertz = float(Decimal(word).scaleb(9))
-    except InvalidOperation:
+    except (ArithmeticError, ValueError):
         hertz = np.nan
-    if not (np.isfinite(hertz) and hertz > 0):
-        raise UserError(f"{where}: the frequency {word!r} is not a positive number of GHz; mend it")
+    if not LOWEST_FREQUENCY_HZ <= hertz <= HIGHEST_FREQUENCY_HZ:
+        raise UserError(f"{where}: the frequency {word[:40]!r} is no number of GHz, 0.001 to 1000; mend it")
     return hertz
 
 

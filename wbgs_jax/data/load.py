@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -11,7 +12,7 @@ from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.join import join
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters
-from wbgs_jax.types import Receiver, make_receiver, stack_receivers
+from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
 
 DATA_VARIABLE = "WBGS_DATA"
 """Environment variable: a folder of scene files to use instead of those released with the package."""
@@ -85,6 +86,18 @@ def released_scenes() -> dict[str, Path]:
     return dict(sorted(files.items(), key=lambda item: (len(item[0]), item[0])))
 
 
+def _label(part: Any, number: int, name: str) -> tuple[str, float]:
+    """Returns the material of a part and its thickness (metres; 0: not known)."""
+    try:
+        thickness = float(part.get("thickness", 0))
+        material = str(part.get("material", part.get("name", number)))
+    except (AttributeError, TypeError, ValueError):
+        thickness, material = np.nan, ""
+    if not 0 <= thickness <= LARGEST_COORDINATE_M:
+        raise UserError(f'part {number} of {name} must be {{"name", "material", "thickness"}}, its thickness metres from 0 on')
+    return material, thickness
+
+
 def _scene_folder() -> Path:
     folder = os.environ.get(DATA_VARIABLE)
     return Path(folder) if folder else RELEASED
@@ -107,11 +120,11 @@ def _receivers(scene: SceneFile) -> list[Receiver]:
 
 def _materials(scene: SceneFile) -> Materials | None:
     """Returns what the triangles are made of: parts of one material and thickness share a material. None if the file does not
-    name its parts."""
+    name its parts; what is no part is a `UserError`."""
     parts = scene.meta.get("parts", [])
-    if len(parts) <= int(scene.face_part.max(initial=-1)):
+    if not isinstance(parts, list) or len(parts) <= int(scene.face_part.max(initial=-1)):
         return None
-    labels = [(str(part.get("material", part.get("name", i))), float(part.get("thickness", 0))) for i, part in enumerate(parts)]
+    labels = [_label(part, i, scene.name) for i, part in enumerate(parts)]
     kinds = sorted(set(labels))
     material = np.array([kinds.index(label) for label in labels], np.int32)[scene.face_part]
     return Materials(material, tuple(f"{name} {thickness:g}" for name, thickness in kinds), np.array([t for _, t in kinds]))

@@ -6,7 +6,7 @@ import numpy as np
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.types import ElementUnit
+from wbgs_jax.types import HIGHEST_FREQUENCY_HZ, LARGEST_COORDINATE_M, LOWEST_FREQUENCY_HZ, ElementUnit
 
 TRAIN, TEST, VALIDATION = 0, 1, 2
 """Values of `split`."""
@@ -93,7 +93,14 @@ def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
         _demand(key not in arrays or np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
     if (power := arrays.get("power_db")) is not None:
         _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
-    _demand((arrays["frequencies_hz"] > 0).all(), "frequencies_hz must be positive")
+    for key in ("tx_positions", "rx_position", "element_positions", "vertices"):
+        largest = np.abs(arrays[key]).max(initial=0)
+        _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres")
+    lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
+    _demand(lowest > 0, "frequencies_hz must be positive")
+    _demand(lowest >= LOWEST_FREQUENCY_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz")
+    _demand(highest <= HIGHEST_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz")
+    _demand((arrays["face_part"] >= 0).all(), "face_part must not be negative")
     split = np.isin(arrays["split"], (TRAIN, TEST, VALIDATION))
     _demand(split.all(), "split must hold 0 (train), 1 (test) and 2 (validation) only")
     faces, lengths = arrays["faces"], np.linalg.norm(arrays["rx_orientation"], axis=-1)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, safe_name
 from wbgs_jax.data.scene_checks import ARRAYS, OBSERVATIONS, TEST, TEXTS, TRAIN, VALIDATION, check_arrays
 from wbgs_jax.types import ElementUnit
 
@@ -26,6 +26,8 @@ __all__ = ["FORMAT", "TEST", "TRAIN", "VALIDATION", "SceneFile", "load_scene", "
 
 FORMAT = 2
 """Of files that are written; older ones are read."""
+MOST_BYTES = 8 * 2**30
+"""That a file may unfold to."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def load_scene(path: Path | str) -> SceneFile:
     """
     path = Path(path)
     try:
+        check_size(path)
         with np.load(path, allow_pickle=False) as archive:
             if "meta" not in archive:
                 raise UserError(f"{path} is not a scene file: it lacks meta; make one with `save_scene` (docs/formats.md)")
@@ -113,7 +116,17 @@ def load_scene(path: Path | str) -> SceneFile:
         arrays = _from_format_1(arrays, meta)
     arrays = check_arrays(arrays, str(path))
     texts = {"element_unit": str(arrays.pop("element_unit")), "element_pattern": _text(arrays.pop("element_pattern"))}
-    return SceneFile(name=str(meta.get("name", path.stem)), meta=meta, **texts, **arrays)  # type: ignore[arg-type]
+    return SceneFile(name=safe_name(str(meta.get("name", path.stem))), meta=meta, **texts, **arrays)  # type: ignore[arg-type]
+
+
+def check_size(path: Path) -> None:
+    """Raises a `UserError` for an archive that would fill the memory: a few kilobytes can unfold to terabytes."""
+    if not zipfile.is_zipfile(path):
+        return
+    with zipfile.ZipFile(path) as archive:
+        unfolded = sum(entry.file_size for entry in archive.infolist())
+    if unfolded > MOST_BYTES:
+        raise UserError(f"{path} unfolds to {unfolded / 2**30:.1f} GiB, more than {MOST_BYTES / 2**30:g}; split it")
 
 
 def _from_format_1(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, np.ndarray]:

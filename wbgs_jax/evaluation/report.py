@@ -16,15 +16,23 @@ from wbgs_jax.data.splits import VALIDATION
 
 def environment() -> dict[str, Any]:
     """Returns code version and device of this process."""
-    describe = ["git", "describe", "--always", "--dirty"]
-    git = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
     device = jax.devices()[0]
     return {
         "version": wbgs_jax.__version__,
-        "commit": git.stdout.strip() or None,
+        "commit": _commit(),
         "device": device.device_kind if device.platform != "cpu" else f"cpu {platform.machine()}",
         "jax": jax.__version__,
     }
+
+
+def _commit() -> str | None:
+    """Returns the commit of the code; None where there is no repository, or no git."""
+    describe = ["git", "describe", "--always", "--dirty"]
+    try:
+        git = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
+    except OSError:
+        return None
+    return git.stdout.strip() or None
 
 
 def provenance(trained: Any) -> dict[str, Any]:

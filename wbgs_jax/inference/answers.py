@@ -16,7 +16,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.predictor import Trained, trained_band
-from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
+from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
 
 SHORTEST = 1e-3
 """Of quaternions that are taken."""
@@ -25,7 +25,7 @@ SHORTEST = 1e-3
 def receiver_at(word: str, dataset: Dataset) -> Receiver:
     """Returns a receiver of the data by its number (none: the first), or another one from "x,y,z" or "x,y,z,w,i,j,k", otherwise
     like the first; anything else is a `UserError`."""
-    if not word or word.isdecimal():
+    if not word or (word.isdecimal() and len(word) < 7):
         return dataset.receiver(int(word or 0))
     like = dataset.receiver()
     try:
@@ -33,10 +33,9 @@ def receiver_at(word: str, dataset: Dataset) -> Receiver:
     except ValueError:
         values = np.zeros(0)
     turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
-    if len(values) not in (3, 7) or not np.isfinite(values).all() or not SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST:
-        raise UserError(
-            f"--rx {word} is no receiver; give its number in the data, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion"
-        )
+    turned = SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST
+    if len(values) not in (3, 7) or not (np.abs(values) <= LARGEST_COORDINATE_M).all() or not turned:
+        raise UserError(f"--rx {word[:60]} is no receiver; give a number, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
     unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 

@@ -79,10 +79,11 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
     of them (host)."""
     if learned is None:
         return None
-    known = jnp.atleast_2d(learned.rx_position)
-    distance = np.linalg.norm(np.asarray(receiver.position) - np.asarray(known), axis=-1)
+    distance = np.linalg.norm(np.asarray(receiver.position) - np.atleast_2d(learned.rx_position), axis=-1)
     near = int(distance.argmin())
-    return dataclasses.replace(learned, rx_position=known[near]) if distance[near] < SAME_PLACE_M else None
+    if distance[near] >= SAME_PLACE_M:
+        return None
+    return learned if learned.rx_position.ndim == 1 else dataclasses.replace(learned, rx_position=learned.rx_position[near])
 
 
 def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.yaml_files import read_yaml
 from wbgs_jax.measured.tables import found, numbers, read_table
 
 RSSI, CSI = "gateway_rssi.csv", "csidata.npy"
@@ -78,11 +78,11 @@ def _csi(path: Path) -> Float[np.ndarray, "n r"]:
 
 def _positions(path: Path) -> Float[np.ndarray, "r 3"]:
     """Returns the positions that a YAML file lists: of one list, or one a name; other entries are left alone."""
+    entries = read_yaml(path)
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
         listed = entries["base_station"] if "base_station" in entries else [*filter(None, map(_position, entries.values()))]
         receivers = np.array([[float(value) for value in position] for position in listed])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
         receivers = np.zeros(0)
     if receivers.ndim != 2 or receivers.shape[1] != 3:
         raise UserError(f"{path} does not list positions; write 'gateway1: [x, y, z]' for each")

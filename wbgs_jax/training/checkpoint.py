@@ -5,6 +5,8 @@ to a temporary folder and renames it, so a checkpoint is whole or absent (one th
 """
 
 import contextlib
+import hashlib
+import json
 import logging
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,7 +20,7 @@ from jaxtyping import Array, Key
 
 from wbgs_jax._util.errors import UserError
 
-FIELD, EMPTY = "field", "empty"
+FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 STATE = "state"
 """Folder of the arrays in a checkpoint."""
 
@@ -37,6 +39,16 @@ class Saved:
 
 def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
     return {prefix + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def digest(arrays: dict[str, np.ndarray], metadata: dict[str, Any]) -> str:
+    """Returns a checksum of everything that a checkpoint holds: a flipped bit would be other parameters, and nothing more."""
+    found = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for key in sorted(arrays):
+        array = np.ascontiguousarray(arrays[key])
+        found.update(f"{key} {array.dtype.name} {array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
@@ -58,10 +70,17 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
         folder.mkdir(parents=True, exist_ok=True)
         with _quiet():
             full = {key: leaf for key, leaf in host.items() if leaf.size}
-            ocp.save(target, full, custom_metadata=metadata | {EMPTY: empty}, overwrite=True)
-    except OSError as error:
+            metadata = metadata | {EMPTY: empty}
+            metadata |= {DIGEST: digest(host, metadata)}
+            ocp.save(target, full, custom_metadata=metadata, overwrite=True)
+    except (OSError, ValueError) as error:  # ValueError: what TensorStore makes of a full disk
+        for unfinished in folder.glob(f"{step}.*tmp*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
+        reason = getattr(error, "strerror", None) or str(error).splitlines()[0][:200]
+        kept = [old for old in checkpoint_steps(folder) if old != step]
+        left = f"the checkpoint of step {kept[-1]} is whole" if kept else "there is no checkpoint yet"
         raise UserError(
-            f"cannot write checkpoint {target}: {error.strerror or error}; free some space or choose another OUT"
+            f"cannot write checkpoint {target}: {reason}; {left}. Free some space and go on with --resume"
         ) from error
     for old in checkpoint_steps(folder)[:-keep]:
         shutil.rmtree(folder / str(old))
@@ -78,8 +97,12 @@ def read(folder: Path, step: int) -> Saved:
         if not metadata:  # Orbax gives None for a file that it cannot read
             raise ValueError("no metadata")
         found = {key: np.asarray(value) for key, value in ocp.load(path.absolute()).items()}
-    metadata = dict(metadata)
-    found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.pop(EMPTY, {}).items()}
+        metadata = dict(metadata)
+        expected = metadata.pop(DIGEST, None)  # older checkpoints have none
+        found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.get(EMPTY, {}).items()}
+        if expected not in (None, digest(found, metadata)):
+            raise ValueError("its checksum is another one")
+        metadata.pop(EMPTY, None)
     field = {key.removeprefix(FIELD): value for key, value in found.items() if key.startswith(FIELD)}
     return Saved(path, {key: value for key, value in found.items() if not key.startswith(FIELD)}, field, metadata)
 
@@ -145,6 +168,6 @@ def _explained(path: Path) -> Iterator[None]:
         if isinstance(error, UserError):
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(
-            f"checkpoint {path} is damaged or incomplete ({reason}); delete that folder to use an older one"
-        ) from error
+        older = [step for step in checkpoint_steps(path.parent) if str(step) != path.name]
+        advice = f"delete that folder to use that of step {older[-1]}" if older else "there is no other; train again"
+        raise UserError(f"checkpoint {path} is damaged or incomplete ({reason}); {advice}") from error

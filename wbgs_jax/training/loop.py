@@ -19,6 +19,7 @@ from jaxtyping import Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings, limit_steps
+from wbgs_jax.data.checksum import checksum
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.data.surface import DatasetScene
@@ -73,6 +74,7 @@ class Run:
 
     def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path):
         self.numbers = training_links(dataset)  # of the links, as the data count them
+        self.checksum = checksum(dataset)
         dataset = without_test(dataset)  # nothing in a training can look at the test
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
@@ -211,7 +213,7 @@ class Run:
     def save(self) -> None:
         """Writes a checkpoint of the present step."""
         limits = dataclasses.asdict(self.limits) if self.limits else None
-        metadata = {"limits": limits, "seconds": self.seconds}
+        metadata = {"limits": limits, "seconds": self.seconds, "data": self.checksum}
         checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, self.settings.loop.keep_checkpoints)
 
     def restore(self) -> bool:
@@ -221,6 +223,8 @@ class Run:
         if not steps:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
+        if saved.metadata.get("data", self.checksum) != self.checksum:
+            raise UserError(f"the data of {self.folder} are not those that it was trained on; put them back, or train again")
         self.field = type(self.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)

@@ -17,6 +17,7 @@ import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.config import Settings, from_dict, sections, to_dict
+from wbgs_jax.data.checksum import check_data
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.splits import (
@@ -91,10 +92,12 @@ class TrainedField:
     """How sure its answers are."""
     power_confidence: PowerConfidence | None = None
     """How sure the received powers are that it says."""
+    data: str = ""
+    """Checksum of the data that it was trained on; empty where nobody has kept it."""
 
     def dataset(self) -> Dataset:
-        """Returns the data that it was trained on."""
-        return self.config.dataset()
+        """Returns the data that it was trained on; others under the same name are a `UserError`."""
+        return check_data(self.config.dataset(), self.data, f"this run ({self.config.source})")
 
     def origin(self) -> dict[str, Any]:
         """Returns where it comes from: field, preset, seed and step."""
@@ -163,4 +166,4 @@ def load_trained(folder: Path | str) -> TrainedField:
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     seconds = float(saved.metadata["seconds"])
     beside = read_neighbours(folder), read_confidence(folder), read_power_confidence(folder)
-    return TrainedField(config, field, params, steps[-1], seconds, *beside)
+    return TrainedField(config, field, params, steps[-1], seconds, *beside, data=saved.metadata.get("data", ""))
