@@ -231,3 +231,19 @@ def test_a_reader_that_has_gone_is_no_traceback():
     process.stdout.close()
     assert process.stderr.read() == b"" and process.wait() == 141
     process.stderr.close()
+
+
+def test_a_flipped_bit_in_a_scene_file_is_no_other_scene(tmp_path, rng):
+    """Whatever bit it is: refused, or of no consequence, as one of a file's date."""
+    path = tmp_path / "scene.npz"
+    save_scene(path, tiny_scene())
+    whole, expected, refused = path.read_bytes(), checksum(load_dataset(path)), 0
+    for place in rng.integers(len(whole), size=60):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(damaged))
+        try:
+            assert checksum(load_dataset(path)) == expected, f"byte {place}"
+        except UserError:
+            refused += 1
+    assert refused > 30
