@@ -169,5 +169,9 @@ def _explained(path: Path) -> Iterator[None]:
             raise
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         older = [step for step in checkpoint_steps(path.parent) if str(step) != path.name]
-        advice = f"delete that folder to use that of step {older[-1]}" if older else "there is no other: delete the run and train again"
+        advice = (
+            f"delete that folder to use that of step {older[-1]}"
+            if older
+            else "there is no other: delete the run and train again"
+        )
         raise UserError(f"checkpoint {path} is damaged or incomplete ({reason}); {advice}") from error
