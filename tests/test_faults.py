@@ -27,6 +27,7 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.lock import FILE, locked
 from wbgs_jax.training.loop import Run, train
+from wbgs_jax.training.run_folder import load_trained
 
 SETTINGS = tiny_settings("wave")
 
@@ -78,7 +79,7 @@ def test_other_data_under_the_same_name_are_told(tmp_path):
     run = make_coherent_run(tmp_path / "box")
     stored = checkpoint.read(run / "checkpoints", 5)
     assert "data" not in stored.metadata  # of before checksums: taken as it is
-    assert call(evaluation.main, "--run", run, "--no-pictures").code == 0
+    assert len(load_trained(run).dataset()) == len(tiny_dataset())
     scene, folder = tmp_path / "box.npz", tmp_path / "trained"
     dataset = hold_out_validation(load_dataset(scene))
     train(dataset, "wave", SETTINGS, 0, folder)
