@@ -26,7 +26,7 @@ from wbgs_jax.data.checksum import checksum
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.lock import FILE, locked
-from wbgs_jax.training.loop import Run, train
+from wbgs_jax.training.loop import Run
 from wbgs_jax.training.run_folder import load_trained
 
 SETTINGS = tiny_settings("wave")
@@ -82,13 +82,13 @@ def test_other_data_under_the_same_name_are_told(tmp_path):
     assert len(load_trained(run).dataset()) == len(tiny_dataset())
     scene, folder = tmp_path / "box.npz", tmp_path / "trained"
     dataset = hold_out_validation(load_dataset(scene))
-    train(dataset, "wave", SETTINGS, 0, folder)
+    Run(dataset, "wave", SETTINGS, 0, folder).save()
     other = hold_out_validation(tiny_dataset(seed=1))
     with pytest.raises(UserError, match="are not those that it was trained on"):
         Run(other, "wave", SETTINGS, 0, folder).restore()
     assert Run(dataset, "wave", SETTINGS, 0, folder).restore()
     for entry in (folder / "checkpoints").iterdir():
-        entry.rename(run / "checkpoints" / entry.name)
+        entry.rename(run / "checkpoints" / "9")  # newer than the one without
     asked = ["--run", run, "--tx", "1,0,1", "--ghz", "10", "--out", tmp_path / "x.npz"]
     assert call(predict.main, *asked).code == 0
     save_scene(scene, tiny_scene(seed=1))
