@@ -46,8 +46,11 @@ def test_equal_paths_need_their_phases_and_every_order(rng):
 
 
 def test_order_is_cumulative(rng):
-    result = measure(paths(rng, [1, 0.3, 0.1], [0, 2, 3]))
-    assert result["order<=0"] == result["order<=1"] < result["order<=2"] < result["order<=3"] == 1.0
+    """More interactions explain more of most images; of one image they need not."""
+    results = [measure(paths(rng, [1, 0.3, 0.1], [0, 2, 3])) for _ in range(9)]
+    assert all(result["order<=0"] == result["order<=1"] < 1.0 == result["order<=3"] for result in results)
+    median = {name: np.median([result[name] for result in results]) for name in ceilings.NAMES}
+    assert median["order<=1"] < median["order<=2"] < 1.0
 
 
 def test_images_are_those_of_the_array(rng):
