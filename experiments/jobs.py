@@ -36,7 +36,7 @@ ONE_FREQUENCY = ("wrfgs",)
 BASELINES = "baselines"
 """In the place of a field: the predictors that learn nothing."""
 SLOW = ("nerf2",)
-"""Fields that are slow to ask."""
+"""Fields that are slow to ask: the tables score them on fewer transmitters."""
 SCORED_TRAINED = 200
 """Transmitters that are scored where all have trained; drawn once for all."""
 ROOMS = {
@@ -130,8 +130,8 @@ class Job:
             dataset = dataclasses.replace(dataset, train=everything, test=everything)
         if self.combination:
             dataset = unseen_frequencies(dataset, self.train_ghz)
-        slow = SCORED_SLOW if self.field in SLOW else PROFILES[self.profile].scored_tx
-        return some_test_transmitters(dataset, SCORED_TRAINED if self.all_tx else slow)
+        few = SCORED_SLOW if self.field in SLOW and self.profile in TABLE_PROFILES else PROFILES[self.profile].scored_tx
+        return some_test_transmitters(dataset, SCORED_TRAINED if self.all_tx else few)
 
     def models(self) -> Iterator[tuple[str, Dataset]]:
         """Yields a name and the data set of every model that is trained."""
