@@ -1,53 +1,37 @@
-"""Ask a trained field for spectra, or export it:
+"""Ask a trained field for spectra or channels, or export it:
 
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
-wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what snapshot|power|k-factor|delay-spread --out channel.npz
-wbgs-jax predict --run RUN --tx x,y,z --ghz 28 --what paths --out paths.csv
-wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --out elsewhere.npz
+wbgs-jax predict --run RUN --line 0,0,1.5:4,0,1.5:41 --ghz 28 --what power --out line.csv --picture line.png
+wbgs-jax predict --run RUN --tx x,y,z --sweep 1:100:50 --what delay-spread --out sweep.npz
+wbgs-jax predict --run RUN --queries queries.csv --out spectra.npz [--resume]
+wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --what paths --out paths.csv
 wbgs-jax predict --run RUN --export field.zip
 """
 
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float
-from matplotlib.figure import Figure
 
 from wbgs_jax._util.command import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, write_csv
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.inference.answers import (
-    check_frequencies,
-    doubts,
-    frequencies,
-    link_words,
-    point_words,
-    receiver_at,
-    source_of,
-    write_answer,
-)
-from wbgs_jax.inference.confidence import LEVEL, expect_many
-from wbgs_jax.inference.export import export_field
-from wbgs_jax.inference.links import as_rows, ask_mimo, ask_paths, ask_response
-from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import at_receiver, observe_queries
-from wbgs_jax.inference.quantities import ask_channel
-from wbgs_jax.radio.array import planar_array
-from wbgs_jax.training.run_folder import TrainedField, load_trained
-from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, Receiver, make_query
+from wbgs_jax._util.progress import CountProgress
+from wbgs_jax.inference import queries as asked
+from wbgs_jax.inference import writing
+from wbgs_jax.inference.parts import Answers, open_parts
+from wbgs_jax.inference.queries import Queries, shown_rows
 
-SHOWN = 12
-"""Spectra in a picture."""
-SUFFIXES = {"out": ".npz", "picture": ".png", "export": ".zip"}
+# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
+
+SUFFIXES = {"out": (".npz",), "picture": (".png",), "export": (".zip",)}
 What = Literal[
     "spectra",
     "snapshot",
@@ -60,7 +44,13 @@ What = Literal[
     "frequency-response",
     "mimo",
 ]
+SCALARS = ("power", "beamforming-gain", "k-factor", "angular-spread", "delay-spread")
+"""Of `What`: a number a query, or two."""
 MOST_POINTS, MOST_ELEMENTS = 4096, 1024
+BLOCK = 256
+"""Queries that are asked, and kept, at a time."""
+SHOWN = 12
+"""Warnings."""
 
 
 @dataclass(frozen=True)
@@ -71,16 +61,23 @@ class Command:
     """Run folder."""
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
+    line: str = ""
+    """Transmitters on a line, FROM:TO:NUMBER, such as 0,0,1.5:4,0,1.5:41."""
+    grid: str = ""
+    """Transmitters on a grid, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
     ghz: tuple[float, ...] = ()
     """Frequencies, 1 to 100, and from 0.3 for fields with paths; every transmitter is asked at every one of them."""
+    sweep: str = ""
+    """Frequencies, LOWEST:HIGHEST:NUMBER, such as 1:100:50, each the same factor above the last."""
+    queries: Path | None = None
+    """Instead of all these a CSV file with the columns x,y,z,ghz, a row a query."""
     rx: str = ""
-    """Another receiver than the first of the data: the number of one of them; or x,y,z in metres, or x,y,z,w,i,j,k with the
-    quaternion that turns its array into the world frame. Array and pattern stay. Only fields with paths know places that the
-    data do not have."""
+    """Another receiver than the first of the data: the number of one; x,y,z in metres; or x,y,z,w,i,j,k with the quaternion
+    that turns its array into the world frame. Only fields with paths know places that the data do not have."""
     what: What = "spectra"
     """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
     tx_velocity: str = "0,0,0"
-    """Of the transmitters, metres a second: Doppler shifts of paths follow from it."""
+    """Of transmitters, metres a second: Doppler shifts of paths follow from it."""
     rx_velocity: str = "0,0,0"
     """Of the receiver."""
     band_mhz: float = 100.0
@@ -88,102 +85,66 @@ class Command:
     points: int = 64
     """... and frequencies in it."""
     tx_array: str = "1x1"
-    """Of a MIMO matrix: ROWSxCOLUMNS elements of each transmitter half a wavelength apart, in the y-z plane of the world."""
+    """Of a MIMO matrix: ROWSxCOLUMNS elements half a wavelength apart, in the y-z plane of the world."""
     out: Path | None = None
-    """Write the answers to this .npz file; a table of paths to a .csv file, too."""
+    """Write the answers to this .npz file, or to a .csv file: what is a number a query, and tables of paths."""
+    resume: bool = False
+    """Go on where the same command was interrupted."""
     picture: Path | None = None
-    """Draw the spectra (the first 12) into this .png file."""
+    """Draw them into this .png file: 12 spectra, or curves."""
     export: Path | None = None
     """Write the field to this .zip file, which runs without its training code (docs/inference.md)."""
 
 
-@dataclass(frozen=True)
-class Spectra:
-    """The answer: every transmitter at every frequency."""
-
-    pas: Float[np.ndarray, "tx freq 90 360"]
-    """float32."""
-    tx_positions: Float[np.ndarray, "tx 3"]
-    frequencies_hz: Float[np.ndarray, " freq"]
-    expected: Float[np.ndarray, "tx freq 3"] | None = None
-    """Expected SSIM of every answer, and the ends of its interval; None where a run does not know how sure it is."""
-
-
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
-    for name, suffix in SUFFIXES.items():
+    for name, suffixes in SUFFIXES.items():
         path = getattr(command, name)
-        if path is not None and path.suffix not in (suffix, *([".csv"] if (name, command.what) == ("out", "paths") else [])):
-            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
-    asks, writes = bool(command.tx or command.ghz), bool(command.out or command.picture)
+        allowed = (*suffixes, *([".csv"] if name == "out" and command.what in (*SCALARS, "paths") else []))
+        if path is not None and path.suffix not in allowed:
+            raise UserError(f"--{name} {path} does not end in {' or '.join(allowed)}; rename it")
+    places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
+    bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
+    asks, writes = bool(places or bands), bool(command.out or command.picture)
     if not (asks or writes or command.export):
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
-    if (asks or writes) and not (command.tx and command.ghz and writes):
+    if (asks or writes) and not (places and bands and writes):
         raise UserError("answers need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+    for several in (places, bands):
+        if len(several) > 1:
+            raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
     _array(command.tx_array)
     if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
         raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
-    if command.what != "spectra" and (command.picture or (asks and not command.out)):
+    if command.what not in ("spectra", *SCALARS) and (command.picture or (asks and not command.out)):
         raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
 
 
-def ask(
-    trained: TrainedField,
-    receiver: Receiver,
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-) -> Spectra:
-    """Returns the spectra of every transmitter at every frequency."""
-    shape = len(tx_positions), len(frequencies_hz)
-    tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
-    seen = observe_queries(trained, receiver, make_query(tx, frequency))
-    pas, power = np.asarray(seen.pas), None if seen.power_db is None else np.asarray(seen.power_db)
-    confidence = for_receiver(trained.confidence, receiver)
-    expected = None
-    if confidence is not None:
-        expected = np.stack(expect_many(confidence, pas, tx, frequency, power), -1).reshape(*shape, 3)
-    return Spectra(pas.reshape(*shape, *pas.shape[1:]), tx_positions, frequencies_hz, expected)
+def queries_of(command: Command) -> Queries:
+    """Returns what is asked; frequencies that no field answers are a `UserError`."""
+    from wbgs_jax.inference.bounds import frequencies
+
+    if command.queries:
+        positions, ghz = asked.read_queries(command.queries)
+        return Queries(positions, frequencies(ghz, str(command.queries)), paired=True)
+    if command.line or command.grid:
+        positions = asked.parse_line(command.line) if command.line else asked.parse_grid(command.grid)
+    else:
+        positions = parse_positions(command.tx)
+    option = "--sweep" if command.sweep else "--ghz"
+    found = Queries(positions, frequencies(asked.parse_sweep(command.sweep) if command.sweep else command.ghz, option))
+    asked.check_count(len(found), "this command")
+    return found
 
 
-def sureness(spectra: Spectra) -> list[str]:
-    """Returns how good the first `SHOWN` answers are expected to be: one line each."""
-    if spectra.expected is None:
-        return []
-    lines = []
-    for (tx, frequency), (ssim, low, high) in zip(
-        np.ndindex(spectra.expected.shape[:2]), spectra.expected.reshape(-1, 3), strict=True
-    ):
-        where = link_words(spectra.tx_positions[tx], float(spectra.frequencies_hz[frequency]))
-        lines.append(f"{where}: expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
-    return lines[:SHOWN]
-
-
-def ask_for(
-    command: Command,
-    trained: TrainedField,
-    dataset: Dataset,
-    receiver: Receiver,
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-) -> dict[str, np.ndarray]:
-    """Returns the arrays that answer what is asked for beside spectra."""
-    asked = receiver, tx_positions, frequencies_hz
-    if command.what == "paths":
-        velocities = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
-        return ask_paths(trained, dataset, *asked, *velocities)
-    if command.what == "frequency-response":
-        return ask_response(trained, *asked, 1e6 * command.band_mhz, command.points)
-    if command.what == "mimo":
-        return ask_mimo(trained, *asked, planar_array(*_array(command.tx_array)))
-    return ask_channel(command.what, trained, dataset, *asked)
-
-
-def lowest_asked(command: Command, frequencies_hz: Float[np.ndarray, " freq"]) -> float:
+def lowest_asked(command: Command, queries: Queries) -> float:
     """Returns the lowest frequency (hertz) that is asked for; a band that reaches beyond what fields know is a `UserError`."""
+    from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
+
     half = 0.5e6 * command.band_mhz if command.what == "frequency-response" else 0.0
-    lowest, highest = float(frequencies_hz.min() - half), float(frequencies_hz.max() + half)
+    lowest, highest = float(queries.frequencies_hz.min() - half), float(queries.frequencies_hz.max() + half)
     if lowest < LOWEST_OF_PATHS_HZ or highest > MAX_FREQUENCY_HZ:
         edge = lowest if lowest < LOWEST_OF_PATHS_HZ else highest
         span = f"{LOWEST_OF_PATHS_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
@@ -204,81 +165,99 @@ def _array(word: str) -> tuple[int, int]:
     return rows, columns
 
 
-def power_lines(answer: dict[str, np.ndarray]) -> list[str]:
-    """Returns the first `SHOWN` received powers, and how sure they are: one line each; nothing of other quantities."""
-    if "within_db" not in answer:
-        return []
-    lines = []
-    for place, power in np.ndenumerate(answer["power_db"]):
-        where = link_words(answer["tx_positions"][place[0]], float(answer["frequencies_hz"][place[1]]))
-        expected, within = (answer[name][place] for name in ("expected_error_db", "within_db"))
-        sure = f"expected {expected:.1f} dB off, {100 * LEVEL:.0f} % within {within:.1f} dB"
-        lines.append(f"{where}: {power:.1f} dB of the transmitted power; {sure}")
-    return lines[:SHOWN]
+def _load(run: Path) -> tuple[Any, list[Path]]:
+    from wbgs_jax.training.run_folder import load_trained, sources_of
+
+    trained = load_trained(run)
+    return trained, sources_of(run, trained.config)
 
 
-def draw(spectra: Spectra) -> Figure:
-    """Returns a figure of the first `SHOWN` spectra over azimuth and zenith, the frequencies of a transmitter in a row."""
-    images = spectra.pas.reshape(-1, *spectra.pas.shape[2:])[:SHOWN]
-    columns = min(2, len(images))
-    rows = -(-len(images) // columns)
-    figure = Figure(figsize=(5.5 * columns, 1.9 * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for i, axis in enumerate(axes.flat):
-        if i >= len(images):
-            axis.axis("off")
-            continue
-        tx, frequency = divmod(i, len(spectra.frequencies_hz))
-        shown = axis.imshow(images[i], vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
-        axis.set_title(
-            f"{spectra.frequencies_hz[frequency] / 1e9:g} GHz, TX {point_words(spectra.tx_positions[tx])}", fontsize=9
-        )
-        axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
-    figure.supxlabel("azimuth [deg]", fontsize=9)
-    figure.supylabel("zenith [deg]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label="normalised amplitude")
-    return figure
+def _export(command: Command) -> None:
+    from wbgs_jax.inference.export import export_field
+
+    assert command.export is not None
+    export_field(_load(command.run)[0], command.export)
+    say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
+
+
+def _warn(opened: Any, queries: Queries) -> None:
+    """Says what of the question is doubtful."""
+    positions, frequencies = queries.tx_positions, queries.frequencies_hz
+    if queries.paired:
+        positions, frequencies = np.unique(positions, axis=0), np.unique(frequencies)
+    lines = opened.bounds.doubts(np.asarray(opened.source["receiver"]["position"]), positions, frequencies)
+    for line in lines[:SHOWN]:
+        say(f"warning: {line}")
+    if len(lines) > SHOWN:
+        say(f"warning: and {len(lines) - SHOWN} more like these")
+
+
+def ask(command: Command, queries: Queries, opened: Any) -> Answers:
+    """Returns the answers to all queries, block by block; those of several blocks are kept in a folder until they are written.
+    Ctrl-C leaves them there."""
+    blocks = queries.blocks(BLOCK)
+    target = command.out or command.picture
+    assert target is not None, "checked"
+    if len(blocks) == 1:
+        return Answers([opened.answer(blocks[0])])
+    parts = open_parts(target, _question(command, queries, opened), command.resume)
+    if len(parts):
+        say(f"going on after {len(parts)} of {len(blocks)} blocks of {BLOCK} queries")
+    try:
+        with CountProgress(f"{command.what}, blocks of {BLOCK}", len(blocks), len(parts)) as progress:
+            for block in blocks[len(parts) :]:
+                parts.add(opened.answer(block))
+                progress.advance()
+    except KeyboardInterrupt:
+        say(f"{len(parts)} of {len(blocks)} blocks are kept in {parts.folder}; the same command with --resume goes on")
+        raise
+    return parts
+
+
+def _question(command: Command, queries: Queries, opened: Any) -> dict[str, Any]:
+    """Returns what a resumed command must ask as well."""
+    options = {
+        name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
+    }
+    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": opened.source}
+
+
+def answer(command: Command, queries: Queries) -> None:
+    """Asks, and writes what is wanted."""
+    from wbgs_jax.inference.opened import Options, open_field
+
+    tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
+    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, _array(command.tx_array))
+    if command.what == "spectra" and command.out is None:
+        queries = queries.some(shown_rows(len(queries)))  # no others are drawn
+    lowest = lowest_asked(command, queries)
+    opened = open_field(command.run, command.rx, command.what, queries, lowest, options, lambda: _load(command.run))
+    _warn(opened, queries)
+    answers = ask(command, queries, opened)
+    for line in writing.lines(command.what, answers, queries):
+        say(line)
+    count = f"{len(queries)} queries"
+    if not queries.paired:
+        count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
+    if command.out:
+        writing.write(command.out, command.what, answers, queries, opened.source)
+        say(f"{command.what}: {command.out} ({count})")
+    if command.picture:
+        writing.write_picture(command.picture, command.what, answers, queries)
+        say(f"picture: {command.picture}")
+    answers.remove()
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax predict")
     check(command)
-    tx_positions, frequencies_hz = parse_positions(command.tx), frequencies(command.ghz)
-    trained = load_trained(command.run)
-    dataset = trained.dataset()
+    queries = queries_of(command) if command.out or command.picture else None
+    use_compilation_cache()
     if command.export:
-        export_field(trained, command.export, dataset=dataset)
-        say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
-    if not (command.out or command.picture):
-        return
-    receiver = receiver_at(command.rx, dataset)
-    trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, lowest_asked(command, frequencies_hz))
-    for line in doubts(dataset, np.asarray(receiver.position), tx_positions, frequencies_hz):
-        say(f"warning: {line}")
-    if command.what != "spectra":
-        assert command.out is not None, "checked"
-        answer = ask_for(command, trained, dataset, receiver, tx_positions, frequencies_hz)
-        for line in power_lines(answer):
-            say(line)
-        if command.out.suffix == ".csv":
-            write_csv(command.out, as_rows(answer))
-        else:
-            write_answer(command.out, answer, source_of(trained, dataset, receiver))
-        say(f"{command.what}: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
-        return
-    spectra = ask(trained, receiver, tx_positions, frequencies_hz)
-    for line in sureness(spectra):
-        say(line)
-    if command.out:
-        write_answer(command.out, vars(spectra), source_of(trained, dataset, receiver))
-        say(f"spectra: {command.out} ({len(tx_positions)} transmitters at {len(frequencies_hz)} frequencies)")
-    if command.picture:
-        with atomic_write(command.picture) as stream:
-            draw(spectra).savefig(stream, format="png", dpi=110)
-        say(f"picture: {command.picture}")
+        _export(command)
+    if queries is not None:
+        answer(command, queries)
 
 
 if __name__ == "__main__":

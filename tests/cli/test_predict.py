@@ -11,12 +11,13 @@ from commands import call
 from PIL import Image
 from synthetic import tiny_scene
 from toys import RippleConfig, RippleField, registered, toy_settings
-from untrained import State, make_coherent_run, make_run
+from untrained import SETTINGS, State, make_coherent_run, make_run
 
 from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
+from wbgs_jax.inference import asking
 from wbgs_jax.inference.confidence import PowerConfidence, write_confidence
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.training import checkpoint
@@ -176,11 +177,137 @@ def test_powers_come_with_how_sure_they_are(tmp_path):
     [
         (["--what", "power"], ["nothing to do"]),
         ([*ASK, "--what", "power"], ["--out"]),
-        ([*ASK, "--what", "power", "--picture", "OUT/a.png", "--out", "OUT/a.npz"], ["no --picture"]),
+        ([*ASK, "--what", "snapshot", "--picture", "OUT/a.png", "--out", "OUT/a.npz"], ["no --picture"]),
+        ([*ASK, "--what", "snapshot", "--out", "OUT/a.csv"], ["--out", ".npz"]),
+        ([*ASK, "--line", "0,0,1:1,0,1:5", "--out", "OUT/a.npz"], ["--tx and --line exclude each other"]),
+        ([*ASK, "--sweep", "1:9:5", "--out", "OUT/a.npz"], ["--ghz and --sweep exclude each other"]),
+        ([*ASK, "--queries", "OUT/q.csv", "--out", "OUT/a.npz"], ["--tx and --queries exclude each other"]),
+        (["--queries", "OUT/q.csv", "--out", "OUT/a.npz"], ["cannot read", "q.csv"]),
+        (["--tx", INSIDE[0], "--sweep", "1:900:5", "--out", "OUT/a.npz"], ["--sweep", "0.3 to 100 GHz"]),
+        (["--grid", "0,0,1:1,0,1:5", "--ghz", "28", "--out", "OUT/a.npz"], ["--grid", "NXxNYxNZ"]),
+        (["--line", "0,0,1:1,0,1:700000", "--sweep", "1:9:2", "--out", "OUT/a.npz"], ["1,400,000 queries"]),
     ],
 )
-def test_numbers_are_written_and_not_drawn(run, tmp_path, arguments, words):
+def test_numbers_that_cannot_be_asked_for(run, tmp_path, arguments, words):
     test_what_cannot_be_asked(run, tmp_path, arguments, words)
+
+
+@pytest.fixture
+def hearing(tmp_path):
+    """`--run RUN` of a toy field that answers at once: power -60 + x + GHz."""
+    with registered(HearingField):
+        yield ["--run", make_toy_run(tmp_path / "hearing", HearingField(RippleConfig()))]
+
+
+def test_a_line_a_sweep_and_a_grid(hearing, tmp_path):
+    out, picture = tmp_path / "a.csv", tmp_path / "a.png"
+    line = ["--line", "0,0,1:2,0,1:5"]
+    result = predict(*hearing, *line, "--ghz", 2, 5, "--what", "power", "--out", out, "--picture", picture)
+    assert result.code == 0, result.err
+    rows = [row.split(",") for row in out.read_text().splitlines()]
+    assert rows[0] == ["x", "y", "z", "ghz", "power_db"] and len(rows) == 11
+    assert [float(value) for value in rows[2]] == [0, 0, 1, 5, -55] and float(rows[-1][-1]) == -53
+    with Image.open(picture) as image:
+        assert np.asarray(image.convert("L")).std() > 5
+    out = tmp_path / "a.npz"
+    sweep = predict(*hearing, "--tx", "1,0,1", "--sweep", "1:100:3", "--what", "power", "--out", out, "--picture", picture)
+    assert sweep.code == 0, sweep.err
+    with np.load(out) as answer:
+        np.testing.assert_allclose(answer["frequencies_hz"], [1e9, 1e10, 1e11])
+        np.testing.assert_allclose(answer["power_db"], [[-58, -49, 41]], rtol=1e-5)
+    assert predict(*hearing, "--grid", "0,0,1:1,1,1:2x3x1", "--ghz", 2, "--out", out).code == 0
+    with np.load(out) as answer:
+        assert answer["pas"].shape == (6, 1, 90, 360)
+
+
+def test_a_file_of_queries(hearing, tmp_path):
+    queries, out, picture = tmp_path / "q.csv", tmp_path / "a.csv", tmp_path / "a.png"
+    queries.write_text("x,y,z,ghz\n1,0,1,5\n-1,0,1,2\n0,0,1,5\n")
+    files = ["--out", out, "--picture", picture]
+    assert predict(*hearing, "--queries", queries, "--what", "power", *files).code == 0
+    assert out.read_text().splitlines()[1:] == ["1,0,1,5,-54", "-1,0,1,2,-59", "0,0,1,5,-55"]
+    result = predict(*hearing, "--queries", queries, "--out", tmp_path / "a.npz")
+    assert result.code == 0 and "(3 queries)" in result.err
+    with np.load(tmp_path / "a.npz") as answer:
+        assert answer["pas"].shape == (3, 90, 360) and answer["tx_positions"].shape == (3, 3)
+
+
+def test_paths_of_a_file_of_queries(coherent, tmp_path):
+    queries, out = tmp_path / "q.csv", tmp_path / "a.csv"
+    queries.write_text("x,y,z,ghz\n1,0.5,1.5,28\n1,0.5,1.5,2.4\n-1,1,1.2,28\n")
+    result = predict("--run", coherent, "--queries", queries, "--what", "paths", "--out", out)
+    assert result.code == 0, result.err
+    rows = [row.split(",") for row in out.read_text().splitlines()[1:]]
+    numbers = [int(row[0]) for row in rows]
+    assert numbers == sorted(numbers) and {*numbers} == {0, 1, 2}
+    assert {(int(row[0]), float(row[4])) for row in rows} == {(0, 28.0), (1, 2.4), (2, 28.0)}
+
+
+def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
+    """And gives, to the byte, the answers of a command that was not; those that are done are not asked for again."""
+    monkeypatch.setattr(predict_command, "BLOCK", 4)
+    whole, out, part = tmp_path / "whole.npz", tmp_path / "a.npz", tmp_path / "a.npz.part"
+    ask = [*hearing, "--line", "0,0,1:2,0,1:5", "--ghz", 2, 5, "--what", "power"]
+    assert predict(*ask, "--out", whole).code == 0
+    real, asked = asking.answer_block, []
+
+    def interrupted(*arguments):
+        if len(asked) == 1:
+            raise KeyboardInterrupt
+        asked.append(arguments)
+        return real(*arguments)
+
+    monkeypatch.setattr(asking, "answer_block", interrupted)
+    stopped = predict(*ask, "--out", out)
+    assert stopped.code == 130 and not out.exists() and part.is_dir()
+    assert "1 of 3 blocks are kept" in stopped.err and stopped.lines[-1] == "interrupted"
+    monkeypatch.setattr(asking, "answer_block", lambda *arguments: asked.append(arguments) or real(*arguments))
+    refused = predict(*ask, "--out", out)
+    assert refused.code == 2 and "--resume" in refused.err
+    refused = predict(*hearing, "--line", "0,0,1:2,0,1:6", "--ghz", 2, 5, "--what", "power", "--out", out, "--resume")
+    assert refused.code == 2 and "another question (queries)" in refused.err
+    assert predict(*ask, "--out", out, "--resume").code == 0
+    assert len(asked) == 3 and not part.exists()
+    with np.load(out) as one, np.load(whole) as other:
+        assert {*one} == {*other}
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_a_picture_alone_asks_for_no_more_than_it_shows(hearing, tmp_path, monkeypatch):
+    sizes = []
+    real = asking.answer_block
+    monkeypatch.setattr(asking, "answer_block", lambda *a: sizes.append(sum(len(p.rows) for p in a[-1])) or real(*a))
+    result = predict(*hearing, "--line", "0,0,1:2,0,1:900", "--ghz", 2, "--picture", tmp_path / "a.png")
+    assert (result.code, sizes) == (0, [12])
+
+
+@pytest.mark.parametrize(("what", "name"), [("spectra", "pas"), ("power", "power_db")])
+def test_a_field_that_was_left_ready_says_the_same(tmp_path, monkeypatch, what, name):
+    """Without reading the run again, unless it has changed."""
+    run = make_run(tmp_path / "box")
+    ask = ["--run", run, "--tx", *INSIDE, "--ghz", 28, 2, "--what", what, "--out"]
+    monkeypatch.setenv("WBGS_CACHE", "")
+    assert predict(*ask, tmp_path / "plain.npz").code == 0
+    monkeypatch.setenv("WBGS_CACHE", str(tmp_path / "cache"))
+    assert predict(*ask, tmp_path / "first.npz").code == 0
+    loaded = []
+    real = predict_command._load
+    monkeypatch.setattr(predict_command, "_load", lambda run: loaded.append(run) or real(run))
+    again = predict(*ask, tmp_path / "second.npz")
+    assert (again.code, loaded) == (0, [])
+    with np.load(tmp_path / "plain.npz") as plain:
+        for one in ("first", "second"):
+            with np.load(tmp_path / f"{one}.npz") as answer:
+                assert {*answer} == {*plain}
+                np.testing.assert_allclose(answer[name], plain[name], atol=2e-5)
+                assert str(answer["meta"]) == str(plain["meta"])
+    assert predict(*ask[:-1], "--rx", 1, "--out", tmp_path / "none.npz").code == 2
+    for entry in (tmp_path / "cache").rglob("ready/*.npz"):
+        entry.write_bytes(b"damaged")
+    assert predict(*ask, tmp_path / "third.npz").code == 0 and loaded
+    write_config(run, RunConfig("gone.npz", "wideband", "smoke", 0, None, SETTINGS))
+    assert predict(*ask, tmp_path / "fourth.npz").code == 2
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import sys
 from types import SimpleNamespace
 
 import jax
+import numpy as np
 
-from wbgs_jax._util import compilation
-from wbgs_jax._util.compilation import VARIABLE, use_compilation_cache
+from wbgs_jax._util.compilation import VARIABLE, load_program, trace_program, use_compilation_cache
 
 PROGRAM = """
 import logging, jax, jax.numpy as jnp
@@ -45,7 +45,7 @@ def test_it_can_be_switched_off_and_jax_has_its_own_say(tmp_path):
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     nothing_set = SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None))
-    monkeypatch.setattr(compilation, "jax", nothing_set)
+    monkeypatch.setitem(sys.modules, "jax", nothing_set)
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "cache"))
     own = jax.config.jax_compilation_cache_dir  # that of the tests
     jax.config.update("jax_compilation_cache_dir", None)
@@ -53,3 +53,17 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, monkeypatch):
         assert use_compilation_cache() is None
     finally:
         jax.config.update("jax_compilation_cache_dir", own)
+
+
+def test_a_program_is_traced_once(tmp_path):
+    """For arguments of equal shapes and the same settings."""
+
+    def function(x, y):
+        return {"sum": x + y, "parts": [x, y]}
+
+    shapes = [jax.ShapeDtypeStruct((n,), np.float32) for n in (3, 1)]
+    names = [trace_program(tmp_path, function, shapes, structure) for structure in ("a", "a", "b")]
+    assert names[0] == names[1] != names[2] and len(list(tmp_path.rglob("*.bin"))) == 2
+    found = load_program(tmp_path, names[0])(np.arange(3, dtype=np.float32), np.ones(1, np.float32))
+    np.testing.assert_array_equal(found["sum"], [1, 2, 3])
+    np.testing.assert_array_equal(found["parts"][1], [1])

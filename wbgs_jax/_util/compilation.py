@@ -1,28 +1,28 @@
-"""XLA's persistent compilation cache for the command lines: what one run compiled, the next one loads.
+"""Compiled programs that outlive a process: what one command has traced and compiled, the next one loads.
 
-The library never switches it on by itself; other JAX pipelines have their own.
+The library never switches this on by itself; other JAX pipelines have their own caches.
 """
 
 import hashlib
 import os
 import platform
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
-
-import jax
+from typing import Any
 
 VARIABLE = "WBGS_CACHE"
 """Environment variable: folder of the cache; empty switches it off."""
 MIN_SECONDS = 0.5
 """What compiles faster is not kept."""
+SOURCES = Path(__file__).parents[1]
+PROGRAMS = "programs"
+"""Folder of traced programs in the cache."""
 
 
-def use_compilation_cache() -> Path | None:
-    """Keeps compiled programs in `WBGS_CACHE`, ~/.cache/wbgs-jax unless set; returns the folder, or None where there is none.
-
-    JAX's own setting (`JAX_COMPILATION_CACHE_DIR`) goes first.
-    """
-    if own := getattr(jax.config, "jax_compilation_cache_dir", None):
-        return Path(own)
+def cache_folder() -> Path | None:
+    """Returns the folder that commands keep programs in, `WBGS_CACHE` (~/.cache/wbgs-jax unless set); None where there is
+    none."""
     wanted = os.environ.get(VARIABLE, str(Path.home() / ".cache" / "wbgs-jax"))
     if not wanted:
         return None
@@ -31,9 +31,63 @@ def use_compilation_cache() -> Path | None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:  # a home that cannot be written costs compile time, not the run
         return None
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_SECONDS)
     return folder
+
+
+def use_compilation_cache() -> Path | None:
+    """Lets XLA keep compiled programs in `cache_folder`; returns the folder, or None where there is none.
+
+    JAX's own setting (`JAX_COMPILATION_CACHE_DIR`) goes first.
+    """
+    import jax  # here: `cache_folder` is asked by what has no need of JAX
+
+    if own := getattr(jax.config, "jax_compilation_cache_dir", None):
+        return Path(own)
+    if (folder := cache_folder()) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_SECONDS)
+    return folder
+
+
+def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[Any], structure: str) -> str:
+    """Traces a function of arrays (positional) for arguments of some shapes, keeps the program and returns its name.
+
+    Args:
+        folder: the cache.
+        function: of arrays, to arrays in lists and dictionaries.
+        shapes: of the arguments, `jax.ShapeDtypeStruct`.
+        structure: what else the program follows from, beside the source of this package: settings, the structure of trees.
+    """
+    import jax
+    import jax.export
+
+    from wbgs_jax._util.files import atomic_write
+
+    words = [source_digest(), jax.__version__, jax.default_backend(), structure, *(f"{s.dtype} {s.shape}" for s in shapes)]
+    name = hashlib.sha256("\n".join(words).encode()).hexdigest()[:32]
+    path = folder / PROGRAMS / f"{name}.bin"
+    if not path.exists():
+        exported = jax.export.export(jax.jit(function))(*shapes)
+        with atomic_write(path) as stream:
+            stream.write(exported.serialize())
+    return name
+
+
+def load_program(folder: Path, name: str) -> Callable[..., Any]:
+    """Returns a program that `trace_program` kept."""
+    import jax
+    import jax.export
+
+    return jax.jit(jax.export.deserialize(bytearray((folder / PROGRAMS / f"{name}.bin").read_bytes())).call)
+
+
+@cache
+def source_digest() -> str:
+    """Returns a checksum of this package's source."""
+    found = hashlib.sha256()
+    for path in sorted(SOURCES.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def _machine() -> str:

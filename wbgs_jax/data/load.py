@@ -53,6 +53,12 @@ def source_names(source: str | int | Path) -> list[str]:
     return [word] if Path(word).exists() else [name for name in word.split(",") if name]
 
 
+def source_paths(source: str) -> list[Path]:
+    """Returns the files and folders that a data set is read from."""
+    released = released_scenes()
+    return [released.get(name, Path(name)) for name in source_names(source)]
+
+
 def scene_dataset(scene: SceneFile) -> Dataset:
     """Returns the links of a scene file, transmitter by transmitter, then receiver by receiver, frequency fastest.
 

@@ -15,8 +15,21 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import field_names, get_field
+from wbgs_jax.inference.bounds import Bounds, frequencies, link_words, point_words
 from wbgs_jax.inference.predictor import Trained, trained_band
-from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
+from wbgs_jax.types import LARGEST_COORDINATE_M, MIN_FREQUENCY_HZ, Receiver
+
+__all__ = [
+    "bounds_of",
+    "check_frequencies",
+    "doubts",
+    "frequencies",
+    "link_words",
+    "point_words",
+    "receiver_at",
+    "source_of",
+    "write_answer",
+]
 
 SHORTEST = 1e-3
 """Of quaternions that are taken."""
@@ -40,14 +53,6 @@ def receiver_at(word: str, dataset: Dataset) -> Receiver:
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 
 
-def frequencies(ghz: tuple[float, ...]) -> Float[np.ndarray, " freq"]:
-    """Returns hertz; what no field answers is a `UserError`."""
-    low, high = LOWEST_OF_PATHS_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
-    if wrong := [f for f in ghz if not low <= f <= high]:
-        raise UserError(f"--ghz {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
-    return np.array(ghz) * 1e9
-
-
 def check_frequencies(trained: Trained, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below the band of the model, and knows no paths, which hold there too."""
     if lowest_hz < MIN_FREQUENCY_HZ and "paths" not in trained.field.known():
@@ -58,6 +63,11 @@ def check_frequencies(trained: Trained, lowest_hz: float) -> None:
         )
 
 
+def bounds_of(dataset: Dataset) -> Bounds:
+    """Returns where a field knows something by training."""
+    return Bounds(dataset.name, DatasetScene(dataset).box, trained_band(dataset))
+
+
 def doubts(
     dataset: Dataset,
     rx: Float[np.ndarray, "3"],
@@ -65,34 +75,7 @@ def doubts(
     frequencies_hz: Float[np.ndarray, " freq"],
 ) -> list[str]:
     """Returns why some of the answers should not be trusted: one line each."""
-    (low, high), band = DatasetScene(dataset).box, trained_band(dataset)
-    box = f"the box of {dataset.name}, {point_words(low)} to {point_words(high)}"
-    places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
-    lines = [
-        f"{end} {point_words(place)} lies outside {box}; the field was not trained there"
-        for end, place in places
-        if ((place < low) | (place > high)).any()
-    ]
-    for f in frequencies_hz:
-        if f < MIN_FREQUENCY_HZ:
-            lines.append(
-                f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
-                "badly what is not many wavelengths large"
-            )
-        elif not band[0] <= f <= band[1]:
-            trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
-            lines.append(f"{f / 1e9:g} GHz lies outside {trained}; the field was not trained there")
-    return lines
-
-
-def point_words(position: Float[np.ndarray, "3"]) -> str:
-    """Returns "(x, y, z) m"."""
-    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
-
-
-def link_words(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
-    """Returns how a line names a link."""
-    return f"TX {point_words(tx_position)} at {frequency_hz / 1e9:g} GHz"
+    return bounds_of(dataset).doubts(rx, tx_positions, frequencies_hz)
 
 
 def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> None:

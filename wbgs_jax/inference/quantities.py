@@ -1,5 +1,6 @@
 """Quantities of the channel that a trained field is asked for, beside spectra: snapshots, powers, gains, spreads."""
 
+import contextlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -44,12 +45,7 @@ def ask_channel(
     Raises:
         UserError: the field knows nothing of it.
     """
-    enough = {"paths", OBSERVED.get(what, "paths")}
-    if not enough & set(trained.field.known()):
-        able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
-        raise UserError(f"the {trained.field.name} field has no {what}, only spectra; train --field {able}")
-    if what == "power":
-        check_power(trained.field, dataset)
+    check_known(what, trained, dataset)
     name, function = CHANNEL[what]
     query = make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
     if function is None:
@@ -60,6 +56,28 @@ def ask_channel(
     asked = {"tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
     sure = trained.power_confidence if what == "power" else None
     return {name: values} | asked | ({} if sure is None else expected_errors(sure, values, receiver, **asked))
+
+
+def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
+    """Raises a `UserError` where a field knows nothing of a quantity; spectra every field knows."""
+    if what not in CHANNEL:
+        return
+    enough = {"paths", OBSERVED.get(what, "paths")}
+    if not enough & set(trained.field.known()):
+        able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
+        raise UserError(f"the {trained.field.name} field has no {what}, only spectra; train --field {able}")
+    if what == "power":
+        check_power(trained.field, dataset)
+
+
+def known_quantities(trained: Trained, dataset: Dataset) -> list[str]:
+    """Returns what a field can be asked for beside what follows from paths alone: spectra, and names of `OBSERVED`."""
+    found = ["spectra"]
+    for what in OBSERVED:
+        with contextlib.suppress(UserError):
+            check_known(what, trained, dataset)
+            found.append(what)
+    return found
 
 
 def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, function: OfArrivals) -> np.ndarray:

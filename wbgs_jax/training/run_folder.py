@@ -19,7 +19,7 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.config import Settings, from_dict, sections, to_dict
 from wbgs_jax.data.checksum import check_data
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.load import load_dataset, source_paths
 from wbgs_jax.data.splits import (
     VALIDATION,
     fewer_transmitters,
@@ -29,6 +29,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, get_field
+from wbgs_jax.inference import confidence, neighbours
 from wbgs_jax.inference.confidence import Confidence, PowerConfidence, read_confidence, read_power_confidence
 from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
 from wbgs_jax.training import checkpoint
@@ -102,6 +103,12 @@ class TrainedField:
     def origin(self) -> dict[str, Any]:
         """Returns where it comes from: field, preset, seed and step."""
         return {name: getattr(self.config, name) for name in ("field", "preset", "seed")} | {"step": self.step}
+
+
+def sources_of(folder: Path, config: RunConfig) -> list[Path]:
+    """Returns the files and folders that a trained field and its data are read from."""
+    beside = ("config.json", "checkpoints", neighbours.FILE, confidence.FILE, confidence.POWER_FILE)
+    return [*(folder / name for name in beside), *source_paths(config.source)]
 
 
 def write_config(folder: Path, config: RunConfig) -> None:

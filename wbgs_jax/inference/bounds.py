@@ -1,0 +1,71 @@
+"""Where a trained field was trained, what is doubtful elsewhere, and how lines name links."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
+
+
+class Bounds(NamedTuple):
+    """What a field knows by training."""
+
+    name: str
+    """Of the data."""
+    box: Float[np.ndarray, "2 3"]
+    """Lowest and highest corner, metres."""
+    band: tuple[float, float]
+    """Hertz."""
+
+    def as_json(self) -> list[Any]:
+        """Returns what `Bounds.from_json` reads."""
+        return [self.name, np.asarray(self.box).tolist(), list(self.band)]
+
+    @classmethod
+    def from_json(cls, values: list[Any]) -> "Bounds":
+        """Returns what `as_json` gave."""
+        name, box, (low, high) = values
+        return cls(name, np.array(box), (low, high))
+
+    def doubts(
+        self, rx: Float[np.ndarray, "3"], tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
+    ) -> list[str]:
+        """Returns why some of the answers should not be trusted: one line each."""
+        (low, high), band = self.box, self.band
+        box = f"the box of {self.name}, {point_words(low)} to {point_words(high)}"
+        places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
+        lines = [
+            f"{end} {point_words(place)} lies outside {box}; the field was not trained there"
+            for end, place in places
+            if ((place < low) | (place > high)).any()
+        ]
+        for f in frequencies_hz:
+            if f < MIN_FREQUENCY_HZ:
+                lines.append(
+                    f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
+                    "badly what is not many wavelengths large"
+                )
+            elif not band[0] <= f <= band[1]:
+                trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
+                lines.append(f"{f / 1e9:g} GHz lies outside {trained}; the field was not trained there")
+        return lines
+
+
+def point_words(position: Float[np.ndarray, "3"]) -> str:
+    """Returns "(x, y, z) m"."""
+    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
+
+
+def link_words(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
+    """Returns how a line names a link."""
+    return f"TX {point_words(tx_position)} at {frequency_hz / 1e9:g} GHz"
+
+
+def frequencies(ghz: tuple[float, ...], source: str = "--ghz") -> Float[np.ndarray, " freq"]:
+    """Returns hertz; what no field answers is a `UserError` that names where it was read."""
+    low, high = LOWEST_OF_PATHS_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
+    if wrong := [f for f in ghz if not low <= f <= high]:
+        raise UserError(f"{source} {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
+    return np.array(ghz) * 1e9

@@ -1,0 +1,103 @@
+"""A run folder opened for one question: by what an earlier command left ready where that will do, else by reading the run."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax.inference.bounds import Bounds
+from wbgs_jax.inference.queries import Product, Queries
+from wbgs_jax.inference.ready import MOST, QUANTITIES, Ready, load_ready, make_ready
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ
+
+
+class Options(NamedTuple):
+    """Of some quantities alone."""
+
+    tx_velocity: Float[np.ndarray, "3"]
+    """Metres a second."""
+    rx_velocity: Float[np.ndarray, "3"]
+    band_hz: float
+    """Of frequency responses."""
+    points: int
+    """Frequencies in the band."""
+    tx_array: tuple[int, int]
+    """Rows and columns of a MIMO matrix's transmitters."""
+
+
+class Opened(NamedTuple):
+    """Who answers, and what lines and files say of it."""
+
+    answer: Callable[[list[Product]], dict[str, np.ndarray]]
+    """Answers a block of queries (`asking.answer_block`)."""
+    bounds: Bounds
+    source: dict[str, Any]
+    """Scene, field, step, version and receiver (`answers.source_of`)."""
+
+
+def open_field(
+    run: Path,
+    rx: str,
+    what: str,
+    queries: Queries,
+    lowest_hz: float,
+    options: Options,
+    load: Callable[[], tuple[Any, list[Path]]],
+) -> Opened:
+    """Returns who answers queries. The first command that asks a little leaves the field ready for those that follow.
+
+    Args:
+        run: the folder.
+        rx: names the receiver (`answers.receiver_at`).
+        what: is asked.
+        queries: all of them.
+        lowest_hz: the lowest frequency among them.
+        options: of some quantities.
+        load: reads the run: a trained field, and the files and folders that it follows from.
+
+    Raises:
+        UserError: the run cannot be read, or knows nothing of what is asked.
+    """
+    few = len(queries) <= MOST and what in QUANTITIES
+    if few and (ready := load_ready(run, rx, len(queries))) and _knows(ready, what, lowest_hz):
+        return _opened_ready(ready, what, queries)
+    return _opened_run(run, rx, what, queries, lowest_hz, options, load, few)
+
+
+def _knows(ready: Ready, what: str, lowest_hz: float) -> bool:
+    return what in ready.meta["what"] and lowest_hz >= ready.meta["lowest_hz"]
+
+
+def _opened_ready(ready: Ready, what: str, queries: Queries) -> Opened:
+    answer = ready(what, *queries.flat())
+    return Opened(lambda block: answer, Bounds.from_json(ready.meta["bounds"]), ready.meta["source"])
+
+
+def _opened_run(
+    run: Path, rx: str, what: str, queries: Queries, lowest_hz: float, options: Options, load: Callable[[], Any], few: bool
+) -> Opened:
+    # Here: what was left ready needs nothing of all this, and it takes seconds to load.
+    from wbgs_jax.inference import asking
+    from wbgs_jax.inference.answers import bounds_of, check_frequencies, receiver_at, source_of
+    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.inference.quantities import check_known, known_quantities
+
+    trained, watched = load()
+    dataset = trained.dataset()
+    receiver = receiver_at(rx, dataset)
+    trained = at_receiver(trained, receiver, dataset)
+    check_frequencies(trained, lowest_hz)
+    bounds, source = bounds_of(dataset), source_of(trained, dataset, receiver)
+    if few:
+        check_known(what, trained, dataset)
+        meta = {
+            "source": source,
+            "bounds": bounds.as_json(),
+            "what": known_quantities(trained, dataset),
+            "lowest_hz": LOWEST_OF_PATHS_HZ if "paths" in trained.field.known() else MIN_FREQUENCY_HZ,
+        }
+        if ready := make_ready(run, rx, len(queries), trained, receiver, watched, meta):
+            return _opened_ready(ready, what, queries)
+    return Opened(lambda block: asking.answer_block(what, trained, dataset, receiver, options, block), bounds, source)

@@ -1,0 +1,181 @@
+"""What a trained field is asked, from words and files: transmitters at frequencies, every one at every other or row by row."""
+
+import csv
+import hashlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from wbgs_jax._util.command import parse_vector
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_text
+
+MOST = 1_000_000
+"""Queries."""
+COLUMNS = ("x", "y", "z", "ghz")
+"""Of a file of queries."""
+AXES = "xyz"
+UNIT = "metres"
+SHOWN = 12
+"""Queries in a picture."""
+
+
+class Product(NamedTuple):
+    """Some transmitters at some frequencies, every one at every other."""
+
+    rows: Int[np.ndarray, " n"]
+    """Numbers of the queries, the frequency fastest."""
+    tx_numbers: Int[np.ndarray, " tx"]
+    tx_positions: Float[np.ndarray, "tx 3"]
+    frequencies_hz: Float[np.ndarray, " freq"]
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Every transmitter at every frequency, or (`paired`) the first transmitter at the first frequency, and so on."""
+
+    tx_positions: Float[np.ndarray, "tx 3"]
+    """World frame, metres."""
+    frequencies_hz: Float[np.ndarray, " freq"]
+    paired: bool = False
+
+    def __len__(self) -> int:
+        return len(self.tx_positions) * (1 if self.paired else len(self.frequencies_hz))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Leading axes of an answer: (tx, freq), or (queries,)."""
+        return (len(self),) if self.paired else (len(self.tx_positions), len(self.frequencies_hz))
+
+    def flat(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        """Returns position and frequency of every query, the frequency fastest."""
+        if self.paired:
+            return self.tx_positions, self.frequencies_hz
+        tx, freq = self.shape
+        return np.repeat(self.tx_positions, freq, axis=0), np.tile(self.frequencies_hz, tx)
+
+    def some(self, rows: Int[np.ndarray, " k"]) -> "Queries":
+        """Returns a few of the queries, paired."""
+        positions, frequencies = self.flat()
+        return Queries(positions[rows], frequencies[rows], paired=True)
+
+    def blocks(self, size: int) -> list[list[Product]]:
+        """Returns all queries in order, at most about `size` at a time. A block is a range of queries, in products: what is
+        known of a transmitter, or of a frequency, is found once for each."""
+        if self.paired:
+            return [
+                list(self._by_frequency(np.arange(start, min(start + size, len(self))))) for start in range(0, len(self), size)
+            ]
+        tx, freq = self.shape
+        step_freq = min(size, freq)
+        step_tx = max(size // freq, 1)
+        rows = np.arange(tx * freq).reshape(tx, freq)
+        blocks = []
+        for i in range(0, tx, step_tx):
+            for j in range(0, freq, step_freq):
+                some, at = slice(i, i + step_tx), slice(j, j + step_freq)
+                numbers = np.arange(tx)[some]
+                blocks.append([Product(rows[some, at].ravel(), numbers, self.tx_positions[some], self.frequencies_hz[at])])
+        return blocks
+
+    def _by_frequency(self, rows: Int[np.ndarray, " k"]) -> Iterator[Product]:
+        for frequency in np.unique(self.frequencies_hz[rows]):
+            alike = rows[self.frequencies_hz[rows] == frequency]
+            yield Product(alike, alike, self.tx_positions[alike], np.array([frequency]))
+
+    def digest(self) -> str:
+        """Returns a checksum."""
+        positions, frequencies = (np.ascontiguousarray(part, np.float64) for part in self.flat())
+        return hashlib.sha256(positions.tobytes() + frequencies.tobytes()).hexdigest()
+
+
+def shown_rows(count: int) -> Int[np.ndarray, " k"]:
+    """Returns the numbers of the queries that are drawn: all, or `SHOWN` that are spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, SHOWN)).round().astype(int))
+
+
+def check_count(count: int, source: str) -> None:
+    """Raises a `UserError` for more queries than anybody means."""
+    if count > MOST:
+        raise UserError(f"{source} makes {count:,} queries; ask at most {MOST:,} at a time")
+
+
+def parse_line(word: str) -> Float[np.ndarray, "tx 3"]:
+    """Returns positions (metres) at equal distances from "x,y,z:x,y,z:NUMBER", both ends included."""
+    start, end, number = _three(word, "--line", "0,0,1.5:4,0,1.5:41")
+    count = _number(number, "--line", word)
+    return np.linspace(parse_vector(start, "--line", "position", UNIT), parse_vector(end, "--line", "position", UNIT), count)
+
+
+def parse_grid(word: str) -> Float[np.ndarray, "tx 3"]:
+    """Returns positions (metres), x fastest, from "x,y,z:x,y,z:NXxNYxNZ": lowest and highest corner, and how many along each
+    axis."""
+    example = "-2,-2,1.5:2,2,1.5:9x9x1"
+    low, high, number = _three(word, "--grid", example)
+    counts = [_number(part, "--grid", word) for part in number.split("x")]
+    if len(counts) != len(AXES):
+        raise UserError(
+            f"--grid {word[:60]} has no three numbers of places after the corners; give x,y,z:x,y,z:NXxNYxNZ, such as {example}"
+        )
+    check_count(int(np.prod(counts)), "--grid")
+    corners = [parse_vector(corner, "--grid", "position", UNIT) for corner in (low, high)]
+    axes = [np.linspace(a, b, n) for a, b, n in zip(*corners, counts, strict=True)]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([x, y, z], -1).reshape(-1, 3)
+
+
+def parse_sweep(word: str) -> tuple[float, ...]:
+    """Returns frequencies (GHz) from "LOWEST:HIGHEST:NUMBER", each the same factor above the last, both ends included."""
+    low, high, number = _three(word, "--sweep", "1:100:50")
+    try:
+        ends = float(low), float(high)
+    except ValueError:
+        ends = np.nan, np.nan
+    if not (0 < ends[0] < np.inf and 0 < ends[1] < np.inf):
+        raise UserError(f"--sweep {word[:60]} has no two frequencies; give LOWEST:HIGHEST:NUMBER in GHz, such as 1:100:50")
+    swept = np.geomspace(*ends, _number(number, "--sweep", word))
+    return tuple(np.clip(swept, min(ends), max(ends)).tolist())  # rounding must not leave the band
+
+
+def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...]]:
+    """Returns positions (metres) and frequencies (GHz) of a CSV file with the columns x, y, z and ghz, a row a query."""
+    rows = csv.DictReader(io.StringIO(read_text(path)))
+    names = [name.strip().lower() for name in rows.fieldnames or ()]
+    if missing := [name for name in COLUMNS if name not in names]:
+        raise UserError(f"{path} has no column {', '.join(missing)}; its first line must name x,y,z,ghz (metres, gigahertz)")
+    rows.fieldnames = names
+    found = []
+    for row in rows:
+        try:
+            values = [float(row[name]) for name in COLUMNS]
+        except (TypeError, ValueError):
+            values = [np.nan]
+        if not np.isfinite(values).all():
+            raise UserError(f"line {rows.line_num} of {path} lacks a number; give x,y,z in metres and ghz in gigahertz")
+        found.append(values)
+        check_count(len(found), str(path))
+    if not found:
+        raise UserError(f"{path} has no queries; give a row each below x,y,z,ghz")
+    table = np.array(found)
+    for row in table:
+        parse_vector(",".join(map(str, row[:3])), str(path), "position", UNIT)
+    return table[:, :3], tuple(table[:, 3].tolist())
+
+
+def _three(word: str, option: str, example: str) -> list[str]:
+    parts = word.split(":")
+    if len(parts) != 3:
+        raise UserError(f"{option} {word[:60]} has not three parts with : between them; give FROM:TO:NUMBER, such as {example}")
+    return parts
+
+
+def _number(word: str, option: str, whole: str) -> int:
+    if not (word.isdecimal() and len(word) < 8 and int(word) > 0):
+        raise UserError(f"{option} {whole[:60]} says no number of points; {word[:20]!r} must be 1, 2, ...")
+    check_count(int(word), option)
+    return int(word)
