@@ -20,6 +20,7 @@ COMMANDS = {
     "eval": Entry("wbgs_jax.eval", "score a trained field on held-out transmitters, and draw it"),
     "predict": Entry("wbgs_jax.predict", "ask a trained field for spectra or channels, or export it"),
     "map": Entry("wbgs_jax.map", "ask a trained field for maps over a floor: power, best beams, spreads"),
+    "view": Entry("wbgs_jax.view", "look at a trained field in a browser: drag its transmitter, see paths and maps"),
     "measure": Entry("wbgs_jax.measure", "learn a map of received power from readings, and score it"),
     "layout": Entry("wbgs_jax.data.layout", "write a scene file as a folder of the published layout"),
 }

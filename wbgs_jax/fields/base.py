@@ -21,7 +21,7 @@ from wbgs_jax._util.pytree import from_leaves
 from wbgs_jax.config import PRESETS, Settings
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
-from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
+from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene
 
 Quantity = Literal["pas", "snapshots", "power", "paths"]
 """What a field may know of a link."""
@@ -38,6 +38,28 @@ class Observation(NamedTuple):
     """Received power relative to the transmitted power (dB), of a field that knows it."""
     covariance: Complex[Array, "b elements elements"] | None = None
     """Mean product y y^H of the snapshots, scaled to a trace of 1, of a field that knows how far to trust its phases."""
+
+
+class Splatted(NamedTuple):
+    """The Gaussians of a field that splats, and what its networks make of them for B queries."""
+
+    gaussians: Gaussians
+    attenuation: Float[Array, "n b"]
+    """delta of the paper (section 4.5), 0..1."""
+    signal: Float[Array, "n b"]
+    """Sig of the paper (equation 3)."""
+
+
+class Electrical(NamedTuple):
+    """What a field knows of M materials (ITU-R P.2040): relative permittivity, conductivity c f^d with f in GHz, thickness."""
+
+    permittivity: Float[np.ndarray, " m"]
+    conductivity: Float[np.ndarray, " m"]
+    """c, S/m."""
+    slope: Float[np.ndarray, " m"]
+    """d."""
+    thickness: Float[np.ndarray, " m"]
+    """Metres."""
 
 
 class Aux(NamedTuple):
@@ -141,6 +163,24 @@ class Field(ABC):
     def arrivals(self, params: Any, plan: Any, query: Query) -> Arrivals:
         """Returns what arrives over every path, of a field whose `gives` names "paths"."""
         raise NotImplementedError(f"the {self.name} field knows no paths")
+
+    def splatted(self, params: Any, plan: Any, query: Query) -> Splatted | None:
+        """Returns its Gaussians with their attenuation and signal for B queries; None of a field that has none."""
+        return None
+
+    def electrical(self, params: Any) -> Electrical | None:
+        """Returns the properties of the scene's materials (host); None of a field that knows of none."""
+        return None
+
+    def with_material(self, params: Any, material: int, permittivity: float, conductivity: float) -> Any:
+        """Returns parameters in which one material has another relative permittivity and conductivity at 1 GHz, S/m (host)."""
+        raise NotImplementedError("a field without `electrical` has no materials")
+
+    def blurred(self, params: Any, metres: Float[Array, ""] | float) -> Any:
+        """Returns parameters whose spectra and powers are means over transmitters that stand about so many metres (standard
+        deviation along each axis) from where they are asked for: without the fringes of interference that change over less.
+        By default, of a field that has none, the parameters as they are."""
+        return params
 
     def portable(self, plan: Any) -> Any:
         """Returns the plan without what is cheaply computed again from the parameters: what a file holds of it."""

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, Quantity, register
+from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import SHARES, Scored, Share, constant, features, learn_share, share_of
@@ -194,9 +194,28 @@ class HybridField(Field):
         """Returns larger limits of the splatting field."""
         return self.wideband.grow(limits, required)
 
+    def splatted(self, params: HybridParams, plan: HybridPlan, query: Query) -> Splatted:
+        """Returns the Gaussians of the splatting field with their attenuation and signal."""
+        return self.wideband.splatted(params.wideband, plan.wideband, query)
+
+    def electrical(self, params: HybridParams) -> Electrical | None:
+        """Returns the materials of the coherent field."""
+        return None if self.wave is None else self.wave.electrical(params.wave)
+
+    def with_material(self, params: HybridParams, material: int, permittivity: float, conductivity: float) -> HybridParams:
+        """Returns parameters with another material of the coherent field."""
+        wave = self.wave.with_material(params.wave, material, permittivity, conductivity)
+        return dataclasses.replace(params, wave=wave)
+
     def portable(self, plan: HybridPlan) -> HybridPlan:
         """Returns the plan without what is cheaply computed again."""
         return dataclasses.replace(plan, wideband=self.wideband.portable(plan.wideband))
+
+    def blurred(self, params: HybridParams, metres: Float[Array, ""] | float) -> HybridParams:
+        """Returns parameters whose coherent part is a mean over transmitters nearby; the splatting one has no fringes."""
+        if self.wave is None:
+            return params
+        return dataclasses.replace(params, wave=self.wave.blurred(params.wave, metres))
 
     def anywhere(self, params: HybridParams) -> tuple[Field, Any]:
         """Returns the coherent field: what the splatting one has learned is what its receiver sees."""

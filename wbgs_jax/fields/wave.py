@@ -19,7 +19,7 @@ from jaxtyping import Array, Complex, Float, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, register
+from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, register
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.fields.prepared_paths import PreparedPaths, prepare_paths, trace
 from wbgs_jax.fields.wave_channel import (
@@ -192,6 +192,28 @@ class WaveField(Field):
         total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
         places = {"facets": facets, "edges": edges_of_facets(facets), "motion": total}
         return dataclasses.replace(self, **{name: _to_device(place) for name, place in places.items()})
+
+    def electrical(self, params: WaveParams) -> Electrical:
+        """Returns the properties of the materials, as far as they were learned."""
+        m = jax.tree.map(np.asarray, params.materials)
+        known = np.asarray(self.known_thickness)
+        thickness = np.where(known > 0, known, np.exp(m.log_thickness))
+        return Electrical(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
+
+    def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
+        """Returns parameters in which one material has another permittivity (above 1) and conductivity."""
+        m = params.materials
+        changed = dataclasses.replace(
+            m,
+            log_susceptibility=m.log_susceptibility.at[material].set(np.log(permittivity - 1)),
+            log_conductivity=m.log_conductivity.at[material].set(np.log(conductivity)),
+        )
+        return dataclasses.replace(params, materials=changed)
+
+    def blurred(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
+        """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
+        variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2
+        return dataclasses.replace(params, placement=params.placement.at[-1].set(0.5 * jnp.log(variance)))
 
     def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
         """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
 from wbgs_jax.config import PRESETS, check_positive, check_share
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, compare, power_error_db, register, with_field
+from wbgs_jax.fields.base import Aux, Field, Group, Observation, Splatted, compare, power_error_db, register, with_field
 from wbgs_jax.fields.em_features import (
     MAX_ATTENUATION,
     RELATIVE_FEATURES,
@@ -180,6 +180,10 @@ class WidebandField(Field):
         """Returns limits that hold the required entries and jobs, and no less than before."""
         grown = fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
         return TileLimits(max(grown.entries, limits.entries), max(grown.jobs, limits.jobs))
+
+    def splatted(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Splatted:
+        """Returns the Gaussians with their attenuation and signal for B queries."""
+        return Splatted(params.gaussians, *em_features(params, plan, query))
 
     def portable(self, plan: WidebandPlan) -> WidebandPlan:
         """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""

@@ -89,7 +89,9 @@ def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], names: tuple[str,
     order = np.argsort(-power, kind="stable")
     order = order[(np.abs(found.polarised[order]) > 0).any(-1)]
     columns: dict[str, np.ndarray] = {name: np.full(len(order), value) for name, value in link.items()}
-    columns["interactions"] = np.array([_words(found.interaction[i], found.material[i], names) for i in order], dtype=np.str_)
+    columns["interactions"] = np.array(
+        [describe_interactions(found.interaction[i], found.material[i], names) for i in order], dtype=np.str_
+    )
     columns["length_m"] = found.length[order]
     columns["delay_ns"] = found.length[order] / SPEED_OF_LIGHT * 1e9
     for end, direction in (("arrival", found.direction), ("departure", found.departure)):
@@ -103,7 +105,7 @@ def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], names: tuple[str,
     return columns | {"doppler_hz": shift[order]}
 
 
-def _words(kinds: np.ndarray, materials: np.ndarray, names: tuple[str, ...]) -> str:
+def describe_interactions(kinds: np.ndarray, materials: np.ndarray, names: tuple[str, ...]) -> str:
     """Returns what a path meets: "off concrete, through glass"."""
     met = [
         f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"

@@ -99,7 +99,8 @@ def arrivals(
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
     met = paths.interaction_type, _materials(paths, surfaces)
-    return Arrivals(amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:], *met)
+    seen = amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:]
+    return Arrivals(*seen, *met, points=paths.points)
 
 
 def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:

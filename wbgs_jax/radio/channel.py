@@ -34,6 +34,8 @@ class Arrivals(NamedTuple):
     """Index of the material that it meets there; -1 beyond the last."""
     curved: Float[Array, "*b"] | None = None
     """1 where waves reach the array as spheres, 0 where they are plane (`propagation.transport.element_voltages`)."""
+    points: Float[Array, "*b k 5 3"] | None = None
+    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
 
 
 FAINTEST = 1e-30

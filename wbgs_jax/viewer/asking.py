@@ -1,0 +1,210 @@
+"""What the viewer asks of a trained field: everything about one transmitter at one frequency, compiled once."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Electrical, Splatted
+from wbgs_jax.inference.answers import doubts
+from wbgs_jax.inference.confidence import Expected, expected_ssim
+from wbgs_jax.inference.floor import Plane, ask_plane, pieces
+from wbgs_jax.inference.links import describe_interactions, names_of
+from wbgs_jax.inference.neighbours import correct, for_receiver
+from wbgs_jax.inference.predictor import Trained, check_power
+from wbgs_jax.radio.channel import Arrivals, decibels
+from wbgs_jax.types import Query, Receiver, make_query
+
+
+@dataclass(frozen=True)
+class PathList:
+    """The paths of one link, the strongest first."""
+
+    points: Float[np.ndarray, "k 5 3"]
+    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    amplitude: Complex[np.ndarray, " k"]
+    power_db: Float[np.ndarray, " k"]
+    length: Float[np.ndarray, " k"]
+    """Metres."""
+    direction: Float[np.ndarray, "k 3"]
+    """Of arrival, unit vectors in the receiver's frame."""
+    interaction: Int[np.ndarray, "k 5"]
+    """Types, as `propagation.paths` has them."""
+    words: tuple[str, ...]
+    """What each path meets: "off concrete, through glass"."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a field says of one transmitter at one frequency."""
+
+    pas: Float[np.ndarray, "90 360"]
+    power_db: float | None
+    """Relative to the transmitted power; None where the field knows of none."""
+    expected: tuple[float, float, float] | None
+    """Expected SSIM, and the ends of its 90 % interval."""
+    paths: PathList | None
+    doubts: tuple[str, ...]
+    """Why the answer should not be trusted, a line each."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The observed spectrum of the nearest transmitter of the data, at the nearest frequency."""
+
+    pas: Float[np.ndarray, "90 360"]
+    position: Float[np.ndarray, "3"]
+    frequency_hz: float
+    distance_m: float
+    part: str
+    """"training", "validation" or "test"."""
+    ssim: float
+    """Of what the field says there."""
+
+
+class Asker:
+    """A trained field, asked about single transmitters.
+
+    Materials may be changed; everything else is as it was trained.
+    """
+
+    def __init__(self, trained: Trained, dataset: Dataset, receiver: Receiver):
+        self.trained, self.dataset, self.receiver = trained, dataset, receiver
+        self.plan = trained.field.plan(trained.params, receiver)
+        self._neighbours, self._confidence = (
+            for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence)
+        )
+        self._spectra = self._links_with_spectra()
+        self._samples: dict[int, Sample] = {}
+
+    @property
+    def knows_paths(self) -> bool:
+        """Whether the field knows paths."""
+        return "paths" in self.trained.field.known()
+
+    @property
+    def knows_power(self) -> bool:
+        """Whether the field knows received power."""
+        try:
+            check_power(self.trained.field, self.dataset)
+        except UserError:
+            return False
+        return True
+
+    def ask(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Answer:
+        """Returns what the field says of a transmitter (world frame, metres)."""
+        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
+        learned = self._neighbours, self._confidence
+        found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
+        pas, power, expected, arrived = jax.tree.map(np.asarray, found)
+        unsure = doubts(self.dataset, np.asarray(self.receiver.position), np.asarray(position)[None], np.array([frequency_hz]))
+        return Answer(
+            pas,
+            float(power) if power is not None and self.knows_power else None,
+            None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
+            None if arrived is None else self._listed(arrived),
+            tuple(unsure),
+        )
+
+    def nearest_sample(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Sample | None:
+        """Returns the observed spectrum nearest to a transmitter and frequency; None where the data have no spectra."""
+        if not len(self._spectra):
+            return None
+        data, index = self.dataset, self._spectra
+        away = np.linalg.norm(data.tx_positions[index] - position, axis=1)
+        octaves = np.abs(np.log2(data.frequencies_hz[index] / frequency_hz))
+        nearest = away <= away.min() + 1e-6
+        link = int(index[nearest][np.argmin(octaves[nearest])])
+        if link not in self._samples:
+            self._samples[link] = self._sample(link)
+        return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
+
+    def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Splatted | None:
+        """Returns the Gaussians with attenuation and signal (NumPy) of a field that splats."""
+        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
+        found: Splatted | None = self.trained.field.splatted(self.trained.params, self.plan, query)
+        return jax.tree.map(np.asarray, found)
+
+    def power_plane(
+        self, plane: Plane, frequency_hz: float, progress: Callable[[float], None] = lambda share: None
+    ) -> Float[np.ndarray, "ny nx"]:
+        """Returns the received power (dB) from transmitters all over a plane; `progress` hears the share that is done."""
+        frequencies, done = np.array([frequency_hz]), 0
+        total = pieces(plane, frequencies)
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            progress(done / total)
+
+        return ask_plane("power", self.trained, self.dataset, self.receiver, plane, frequencies, advance)["power_db"][0]
+
+    def materials(self) -> tuple[tuple[str, ...], Electrical] | None:
+        """Returns names and properties of the materials; None of a field that knows of none."""
+        found = self.trained.field.electrical(self.trained.params)
+        if found is None:
+            return None
+        names = names_of(self.dataset) or ("everything",)
+        return tuple(name or f"material {number}" for number, name in enumerate(names[: len(found.permittivity)])), found
+
+    def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
+        """Gives a material another permittivity and conductivity at 1 GHz (S/m) from now on."""
+        params = self.trained.field.with_material(self.trained.params, number, permittivity, conductivity)
+        self.trained = dataclasses.replace(self.trained, params=params)  # type: ignore[type-var]
+        self._samples.clear()
+
+    def restore(self, trained: Trained) -> None:
+        """Asks a field as it was trained from now on."""
+        self.trained = trained
+        self._samples.clear()
+
+    def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
+        """Returns the links of this receiver whose spectra are known."""
+        if self.dataset.kind == "power":
+            return np.zeros(0, int)
+        places = np.asarray(self.dataset.receivers.position)
+        away = np.linalg.norm(places - np.asarray(self.receiver.position), axis=1)
+        return np.flatnonzero((self.dataset.receiver_index == np.argmin(away)) & (away.min() < 1e-3))
+
+    def _sample(self, link: int) -> Sample:
+        data, index = self.dataset, np.array([link])
+        position, frequency = data.tx_positions[link], float(data.frequencies_hz[link])
+        truth = np.asarray(data.pas(index))
+        said = self.ask(position, frequency).pas
+        parts = {"training": data.train, "validation": data.validation, "test": data.test}
+        part = next((name for name, links in parts.items() if link in links), "other")
+        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said[None], truth)[0]))
+
+    def _listed(self, arrived: Arrivals) -> PathList:
+        power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
+        order = np.argsort(-power, kind="stable")
+        order = order[np.abs(arrived.amplitude[order]) > 0]
+        kinds, materials = np.asarray(arrived.interaction)[order], np.asarray(arrived.material)[order]
+        names = names_of(self.dataset)
+        words = tuple(describe_interactions(*met, names) for met in zip(kinds, materials, strict=True))
+        points = np.asarray(arrived.points)[order]
+        amplitude, length, direction = (np.asarray(a)[order] for a in (arrived.amplitude, arrived.length, arrived.direction))
+        return PathList(points, amplitude, power[order], length, direction, kinds, words)
+
+
+def _answer(
+    field: Field, params: Any, plan: Any, query: Query, neighbours: Any, confidence: Any, with_paths: bool
+) -> tuple[Any, Any, Any, Any]:
+    """Returns spectrum, power, expected SSIM and arrivals of a batch of one query, without its axis."""
+    seen = field.render(params, plan, query)
+    pas = correct(neighbours, seen.pas, query)
+    expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
+    arrived = field.arrivals(params, plan, query) if with_paths else None
+    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, arrived))
+
+
+_ask = jax.jit(_answer, static_argnames="with_paths")
