@@ -11,10 +11,10 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 STUB = ROOT / "wbgs_jax" / "__init__.pyi"
-HEAD = """# The public names
+HEAD = """# API
 
-Made from the docstrings by `make docs`; do not edit. `import wbgs_jax as wb` and use them as `wb.NAME`. Arrays are float32
-unless it says otherwise; shapes stand in brackets, such as `(b, 90, 360)`.
+All public names, written from the docstrings by `make docs`; do not edit. `import wbgs_jax as wb` and use them as `wb.NAME`.
+Arrays are float32 unless stated otherwise; shapes are in brackets, such as `(b, 90, 360)`.
 """
 TITLES = {
     "fields": "Fields",
@@ -56,14 +56,19 @@ def document(name: str, value: Any) -> str:
     value = inspect.unwrap(value) if callable(value) and not inspect.isclass(value) else value
     text = inspect.getdoc(value) or ""
     if not inspect.isclass(value):
-        return f"### `{name}`\n\n```python\n{name}{signature(value)}\n```\n\n{text}\n"
+        return f"### `{name}`\n\n```text\n{name}{signature(value)}\n```\n\n{text}\n"
     rows = [f"* `{attribute}`{f': {words}' if words else ''}" for attribute, words in attributes(value)]
     methods = [
-        f"* `{method}()`: {(inspect.getdoc(getattr(value, method)) or '').splitlines()[0]}"
+        f"* `{method}()`: {first_paragraph(getattr(value, method))}"
         for method in vars(value)
         if not method.startswith("_") and inspect.isroutine(getattr(value, method))
     ]
     return f"### `{name}`\n\n{text}\n\n" + "\n".join([*rows, *methods]) + "\n"
+
+
+def first_paragraph(value: Any) -> str:
+    """Returns the first paragraph of a docstring, in one line."""
+    return (inspect.getdoc(inspect.unwrap(value)) or "").split("\n\n")[0].replace("\n", " ")
 
 
 def attributes(value: type) -> list[tuple[str, str]]:
@@ -86,8 +91,7 @@ def module_entry(name: str, module: ModuleType) -> str:
     for function, value in vars(module).items():
         own = getattr(value, "__module__", "") == module.__name__ or function in getattr(module, "__all__", ())
         if own and not function.startswith("_") and callable(value):
-            first = (inspect.getdoc(inspect.unwrap(value)) or "").split("\n\n")[0].replace("\n", " ")
-            lines.append(f"* `{name}.{function}`: {first}")
+            lines.append(f"* `{name}.{function}`: {first_paragraph(value)}")
     return "\n".join(lines) + "\n"
 
 
