@@ -19,13 +19,15 @@ from rich.console import Console
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import write_json
+from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.evaluation import pictures
 from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.training import curves
-from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.manifest import write_manifest
+from wbgs_jax.training.run_folder import TrainedField, load_trained
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
     report, predicted = evaluate(trained, dataset, command.part)
     write_json(command.run / f"{with_part('eval', command.part)}.json", report)
+    if command.data is None:
+        write_manifest(command.run, trained, report)
     if command.results:
         path = result_path(command.results, report, trained.config.preset)
         write_json(path, report | {"provenance": provenance(trained)})
@@ -73,6 +77,20 @@ def main(arguments: list[str] | None = None) -> None:
         return
     Console(width=None if sys.stdout.isatty() else 140).print(table(report))
     print("\n".join(closing_lines(report, BLOCK)))
+    for line in next_lines(trained, dataset, command.run):
+        console.print(line)
+
+
+def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
+    """Returns what to look at next."""
+    place = ",".join(f"{x:.3g}" for x in dataset.tx_positions[dataset.test[0] if len(dataset.test) else 0])
+    ghz = f"{dataset.frequencies_hz.max() / 1e9:g}"
+    lines = []
+    if dataset.kind != "power":
+        lines.append(f"next: wbgs-jax predict --run {run} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
+    if "power" in trained.field.known() and dataset.kind != "pas":
+        lines.append(f"      wbgs-jax map --run {run} --ghz {ghz} --picture map.png")
+    return [*lines, f"      wbgs-jax view --run {run}"]
 
 
 if __name__ == "__main__":

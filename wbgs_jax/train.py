@@ -25,10 +25,12 @@ from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.confidence import learn_confidence
+from wbgs_jax.training.estimate import duration_words, expected_seconds
 from wbgs_jax.training.lock import locked
 from wbgs_jax.training.loop import TrainResult, check_data, train
+from wbgs_jax.training.manifest import write_manifest
 from wbgs_jax.training.neighbours import Learned, learn_neighbours
-from wbgs_jax.training.run_folder import RunConfig, prepare_folder
+from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
 
 PROGRAM = "wbgs-jax train"
 
@@ -154,11 +156,28 @@ def main(arguments: list[str] | None = None) -> None:
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
     with locked(folder):
-        if steps := checkpoint_steps(folder / "checkpoints"):
+        steps = checkpoint_steps(folder / "checkpoints")
+        if steps:
             say(f"going on from the checkpoint of step {steps[-1]}")
+        for line in opening_lines(folder, config, steps[-1] if steps else 0):
+            say(line)
         result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
         learn_beside(result, dataset, config, folder)
+        write_manifest(folder, load_trained(folder))
     say(summary(result, folder))
+    say(f"next: wbgs-jax eval --run {folder}   (scores on held-out transmitters, and pictures)")
+
+
+def opening_lines(folder: Path, config: RunConfig, done: int) -> list[str]:
+    """Returns how long it will take, and where the results go."""
+    steps = config.settings.optim.steps
+    share = max(steps - done, 0) / get_field(config.field).presets[config.preset].optim.steps
+    seconds = expected_seconds(config.field, config.preset, share)
+    lasts = "how long it takes stands in the lines below" if seconds is None else f"{duration_words(seconds)} on this machine"
+    return [
+        f"{steps - done} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",
+        f"results: {folder} (checkpoints, curves in metrics.jsonl)",
+    ]
 
 
 def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path) -> None:

@@ -10,6 +10,7 @@ from PIL import Image
 from synthetic import tiny_dataset, tiny_scene
 from toys import RippleField, registered
 
+import wbgs_jax
 from wbgs_jax import eval as eval_command
 from wbgs_jax import train as train_command
 from wbgs_jax.data.layout import export_layout
@@ -60,6 +61,11 @@ def train_and_check(folder, *arguments):
     result = call(train_command.main, *arguments, "--out", folder)
     assert (result.code, result.out) == (0, ""), result.err
     assert "trained 4 steps" in result.err
+    lines = result.err.splitlines()
+    assert lines[1].startswith("4 steps, ") and lines[2].startswith(f"results: {folder} ")
+    assert lines[-1].startswith(f"next: wbgs-jax eval --run {folder} ")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["training"]["steps"] == 4 and len(manifest["data"]["sha256"]) == 64 and manifest["scores"] == {}
     return folder
 
 
@@ -86,6 +92,9 @@ def assert_eval_prints_one_json_object_and_draws(folder, field):
     assert result.code == 0, result.err
     report = json.loads(result.out)
     assert report == json.loads((folder / "eval.json").read_text())
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["scores"]["test"]["median_ssim"] == report["median_ssim"]
+    assert manifest["versions"]["wbgs_jax"] == wbgs_jax.__version__ and "--seed" in manifest["training"]["command"]
     assert report.keys() >= {"scene", "field", "n", "median_ssim", "mean_ssim", "per_frequency", "baselines"}
     assert (report["scene"], report["field"], report["part"], report["n"]) == ("box", field, "test", 6)
     assert [row["frequency_ghz"] for row in report["per_frequency"]] == [1, 10, 94]

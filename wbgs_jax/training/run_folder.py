@@ -1,6 +1,6 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
-config.json   metrics.jsonl   checkpoints/STEP/   eval.json   pictures/*.png
+config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pictures/*.png
 neighbours.npz   confidence.npz   power_confidence.npz
 """
 

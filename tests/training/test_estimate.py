@@ -1,0 +1,25 @@
+"""How long a training will take: where one like it has been timed, and in words."""
+
+import pytest
+
+from wbgs_jax.training import estimate
+from wbgs_jax.training.estimate import duration_words, expected_seconds
+
+
+def test_a_slower_machine_takes_longer(monkeypatch):
+    monkeypatch.setattr(estimate, "_probe", lambda: 2 * estimate.PROBE_SECONDS)
+    whole = expected_seconds("hybrid", "cpu")
+    assert whole == 2 * estimate.SECONDS["hybrid", "cpu"]
+    assert expected_seconds("hybrid", "cpu", 0.25) == whole / 4
+    assert expected_seconds("of one's own", "cpu") is None
+
+
+def test_the_probe_takes_a_moment():
+    assert 0 < estimate._probe() < 5
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(3.0, "about a minute"), (700.0, "about 12 minutes"), (14400.0, "about 4.0 hours")]
+)
+def test_words(seconds, words):
+    assert duration_words(seconds) == words

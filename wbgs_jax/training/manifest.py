@@ -1,0 +1,62 @@
+"""`manifest.json` of a run folder: everything that somebody else needs to know of a run, in one file."""
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.evaluation.report import provenance
+from wbgs_jax.training.run_folder import TrainedField
+
+FORMAT = 1
+FILE = "manifest.json"
+PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax")
+
+
+def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] | None = None) -> None:
+    """Writes or brings up to date the manifest of a run folder.
+
+    Args:
+        folder: of the run.
+        trained: its field.
+        report: of an evaluation (`evaluation.score.evaluate`), whose scores it is to say; those of earlier ones stay, as long
+            as the run has not gone on.
+    """
+    path, known = folder / FILE, {}
+    if path.exists():
+        before = read_json(path)
+        known = before.get("scores", {}) if before.get("training", {}).get("steps") == trained.step else {}
+    config, origin = trained.config, provenance(trained)
+    scores = known | ({} if report is None else {report["part"]: _figures(report)})
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "data": {"source": config.source, "sha256": trained.data},
+            "model": {"field": config.field, "preset": config.preset, **trained.field.sizes(trained.params)},
+            "training": {
+                "command": origin["command"],
+                "seed": config.seed,
+                "steps": trained.step,
+                "seconds": round(trained.seconds, 1),
+                "settings": origin["settings"],
+            },
+            "versions": {"wbgs_jax": origin["version"], "commit": origin["commit"], "python": platform.python_version()}
+            | {name: _version(name) for name in PACKAGES},
+            "device": origin["device"],
+            "scores": scores,
+        },
+    )
+
+
+def _figures(report: dict[str, Any]) -> dict[str, Any]:
+    """Returns the numbers of a report that stand alone."""
+    return {name: value for name, value in report.items() if isinstance(value, int | float) and not isinstance(value, bool)}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
