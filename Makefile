@@ -20,7 +20,8 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval measured test test-slow simulator data lint typecheck bench experiments tables docs clean
+.PHONY: help setup train eval view measured test test-slow lowest newest simulator data lint typecheck bench experiments tables \
+	docs site notebooks package clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -47,6 +48,9 @@ train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|
 eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
 	$(VENV)/bin/wbgs-jax eval --run $(RUN)
 
+view: setup  ## look at a trained run in the browser: make view OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
+	$(VENV)/bin/wbgs-jax view --run $(RUN)
+
 measured: setup  ## learn and score a map of measured powers: make measured DATA=folder [OUT=folder]  (docs/measured.md)
 	@test -n "$(DATA)" || { echo "error: give the folder with the readings: make measured DATA=folder" >&2; exit 2; }
 	$(VENV)/bin/wbgs-jax measure --data $(DATA) --out $(MEASURED)/scores.json --picture $(MEASURED)/maps.png
@@ -56,6 +60,22 @@ test: setup  ## run the tests
 
 test-slow: setup  ## run the slow tests too, in fully optimised code: larger cases of what `make test` checks
 	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
+
+lowest:  ## run the tests with the lowest versions of the dependencies that pyproject.toml allows (needs uv)
+	$(call tested-with,lowest-direct)
+
+newest:  ## run the tests with the newest versions of the dependencies (needs uv)
+	$(call tested-with,highest)
+
+# An environment of its own, removed afterwards; the tests run from the tree.
+define tested-with
+@command -v uv >/dev/null 2>&1 || { echo "error: uv chooses the versions and is not here; install it: pip install uv" >&2; exit 2; }
+@work=$$(mktemp -d) && trap 'rm -rf "$$work"' EXIT && \
+	uv venv --quiet --python "$(PYTHON)" "$$work/venv" && \
+	VIRTUAL_ENV="$$work/venv" uv pip install --quiet --resolution $(1) -e ".[dev]" && \
+	VIRTUAL_ENV="$$work/venv" uv pip list 2>/dev/null | grep -iE "^(jax|jaxlib|flax|numpy|optax|orbax-checkpoint|scipy) " && \
+	"$$work/venv/bin/python" -m pytest -n 2 --dist worksteal -m "not slow"
+endef
 
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \
@@ -83,6 +103,15 @@ tables: setup  ## write docs/results.md and the marked numbers of all pages from
 docs: setup  ## write docs/api.md from the docstrings
 	$(PY) docs/make_api.py
 
+site: setup  ## build the documentation site into site/; what is broken in it is an error
+	$(PY) -m mkdocs build --strict --quiet
+
+notebooks: setup  ## execute the notebooks of docs/notebooks
+	$(PY) docs/make_notebooks.py
+
+package: setup  ## build wheel and source archive into dist/, check both, try the wheel in an empty environment
+	PYTHON="$(PYTHON)" .ci/package
+
 clean:  ## remove caches; runs, data and .venv stay
-	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis dist site
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
