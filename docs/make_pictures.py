@@ -40,7 +40,7 @@ def direction(azimuth: float, zenith: float):
 
 def draw_array() -> Figure:
     """Returns the array in its frame, with one direction and its angles."""
-    figure = Figure(figsize=(6.4, 4.6))
+    figure = Figure(figsize=(6.4, 4.8))
     axis = figure.add_axes((0, 0, 1, 1), projection="3d")
     axis.scatter(*wb.planar_array().T, color=colormaps["viridis"](0.3), s=36, depthshade=False)
     for vector, name in zip(np.eye(3), ("x, where the array looks", "y", "z, zenith of the spectrum"), strict=True):
@@ -54,7 +54,7 @@ def draw_array() -> Figure:
     draw_arc(axis, np.linspace(0, azimuth, 30), 90.0, 0.6, "φ")
     draw_arc(axis, azimuth, np.linspace(0, zenith, 30), 0.6, "θ")
     axis.set(xlim=(-0.8, 1.6), ylim=(-0.8, 1.6), zlim=(-0.8, 1.6))
-    axis.set_box_aspect((1, 1, 1), zoom=1.45)
+    axis.set_box_aspect((1, 1, 1), zoom=1.2)
     axis.set_axis_off()
     axis.view_init(20, 40)
     return figure
