@@ -22,6 +22,7 @@ COMMANDS = {
     "map": Entry("wbgs_jax.map", "ask a trained field for maps over a floor: power, best beams, spreads"),
     "view": Entry("wbgs_jax.view", "look at a trained field in a browser: drag its transmitter, see paths and maps"),
     "measure": Entry("wbgs_jax.measure", "learn a map of received power from readings, and score it"),
+    "convert": Entry("wbgs_jax.convert", "Gaussians, paths and channels for other programs, and theirs for a training"),
     "layout": Entry("wbgs_jax.data.layout", "write a scene file as a folder of the published layout"),
 }
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.inference.predictor import Trained, observe_queries
+from wbgs_jax.inference.predictor import BLOCK, Trained, observe_queries
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.propagation.transport import mimo_matrix
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
@@ -68,6 +68,29 @@ def ask_paths(
             link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
             tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, names_of(dataset)))
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def arrivals_of(trained: Trained, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float) -> Arrivals:
+    """Returns what arrives over every path from transmitters at one frequency, as NumPy arrays with a leading axis for them.
+
+    Raises:
+        UserError: the field knows no paths.
+    """
+    check_paths(trained)
+    plan, parts, count = trained.field.plan(trained.params, receiver), [], len(tx_positions)
+    size = min(BLOCK, count)
+    for start in range(0, count, size):
+        index = np.minimum(np.arange(start, start + size), count - 1)  # the last one fills the last block up
+        query = make_query(tx_positions[index], np.full(size, frequency_hz))
+        found = jax.tree.map(np.asarray, _arrivals(trained.field, trained.params, plan, query))
+        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: count - start], found))
+    together: Arrivals = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return together
+
+
+@jax.jit
+def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> Arrivals:
+    return field.arrivals(params, plan, query)
 
 
 @jax.jit

@@ -23,7 +23,8 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
         report: of an evaluation (`evaluation.score.evaluate`), whose scores it is to say; those of earlier ones stay, as long
             as the run has not gone on.
     """
-    path, known = folder / FILE, {}
+    path = folder / FILE
+    known: dict[str, Any] = {}
     if path.exists():
         before = read_json(path)
         known = before.get("scores", {}) if before.get("training", {}).get("steps") == trained.step else {}

@@ -1,0 +1,70 @@
+"""`wbgs-jax convert`: a run's Gaussians and paths for other programs, and paths of theirs as a scene that trains."""
+
+import numpy as np
+import pytest
+from commands import assert_error_for_people, call
+from untrained import make_coherent_run, make_run
+
+from wbgs_jax import convert as convert_command
+from wbgs_jax.data.load import load_dataset
+from wbgs_jax.interchange.deepmimo import read_deepmimo
+from wbgs_jax.interchange.gaussian_ply import read_gaussians
+from wbgs_jax.interchange.ray_paths import load_paths
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return {"wideband": make_run(folder / "wideband"), "wave": make_coherent_run(folder / "wave")}
+
+
+def convert(*arguments):
+    result = call(convert_command.main, *arguments)
+    assert (result.code, result.out) == (0, ""), result.err
+    return result.err
+
+
+def test_gaussians_for_a_splat_viewer(runs, tmp_path):
+    said = convert("--run", runs["wideband"], "--tx", "1,0.5,1.5", "--ghz", 28, "--out", tmp_path / "a.ply")
+    assert "(60, coloured by their mean signal at 28 GHz)" in said
+    gaussians, colours = read_gaussians(tmp_path / "a.ply")
+    assert gaussians.means.shape == (60, 3) and colours.std() > 0.05
+    refused = call(convert_command.main, *["--run", runs["wave"], "--tx=1,0,1", "--ghz=28", "--out", tmp_path / "b.ply"])
+    assert_error_for_people(refused, "wave field", "no Gaussians")
+
+
+def test_paths_out_and_in_again(runs, tmp_path):
+    """As Sionna's and as a DeepMIMO scenario: both become the same scene."""
+    grid = ["--grid", "-1,0.5,1.5:1,1,1.5:3x2x1", "--ghz", 5]
+    convert("--run", runs["wave"], *grid, "--out", tmp_path / "paths.npz")
+    convert("--run", runs["wave"], *grid, "--out", tmp_path / "scenario")
+    paths = load_paths(tmp_path / "paths.npz")
+    assert paths.a.shape[:2] == (1, 6) and paths.valid.any(-1).all()
+    direct = np.linalg.norm(paths.sources - paths.targets[0], axis=1) / 299792458
+    np.testing.assert_allclose(np.where(paths.valid, paths.tau, 1).min(-1)[0], direct, rtol=1e-4)
+    users = read_deepmimo(tmp_path / "scenario")
+    assert users["power"].shape[0] == 6 and users["tx_pos"].shape == (1, 3)
+    convert("--paths", tmp_path / "paths.npz", "--array", "2x2", "--out", tmp_path / "one.npz")
+    convert("--paths", tmp_path / "scenario", "--ghz", 5, "--array", "2x2", "--out", tmp_path / "other.npz")
+    one, other = (load_dataset(tmp_path / f"{name}.npz") for name in ("one", "other"))
+    assert one.snapshots.shape == (6, 4) and len(one.test) == 1
+    np.testing.assert_allclose(one.snapshots, other.snapshots, rtol=1e-2, atol=1e-3 * np.abs(one.snapshots).max())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--out", "a.ply"], ["--run", "--paths"]),
+        (["--run", "RUN", "--out", "a.ply"], ["--tx", "--ghz 28"]),
+        (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.obj"], ["a.obj", "gaussians.ply"]),
+        (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["knows no paths"]),
+        (["--paths", "gone", "--ghz", "28", "--out", "a.npz"], ["cannot read gone"]),
+        (["--paths", "gone", "--out", "a.npz"], ["gone does not say its frequency"]),
+        (["--paths", "gone", "--out", "a.ply"], ["does not end in .npz"]),
+    ],
+)
+def test_what_cannot_be_converted(runs, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    result = call(convert_command.main, *(str(runs["wideband"]) if word == "RUN" else word for word in arguments))
+    assert_error_for_people(result, *words)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,122 @@
+"""Paths as Sionna RT's: round trips, a line of sight in closed form, a field's own paths, and the scenes that follow."""
+
+from dataclasses import fields
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from drawn_paths import draw_paths
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
+from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_arrivals, from_sionna, load_paths, save_paths
+from wbgs_jax.interchange.scenes import scene_of_paths
+from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
+from wbgs_jax.radio.channel import Arrivals
+
+
+def assert_same(one, other):
+    for field in fields(RayPaths):
+        np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+def test_a_file_and_back(rng, tmp_path):
+    paths = draw_paths(rng)
+    save_paths(tmp_path / "paths.npz", paths)
+    assert_same(load_paths(tmp_path / "paths.npz"), paths)
+    with np.load(tmp_path / "paths.npz") as archive:
+        assert archive["a"].shape == (2, 1, 6, 1, 4) and archive["vertices"].shape == (3, 2, 6, 4, 3)
+
+
+@pytest.mark.parametrize("synthetic", [True, False])
+def test_an_object_of_the_simulator(rng, synthetic):
+    """`a` as real and imaginary part, axes of antennas, positions as columns."""
+    paths = draw_paths(rng)
+    one = paths.as_sionna()
+
+    def between_antennas(name, values):
+        axis = 1 + (name in ("interactions", "vertices"))
+        values = np.expand_dims(values, (axis, axis + 2))
+        return np.repeat(values, 3, axis)
+
+    given = {name: values for name, values in one.items() if name not in ("a", "sources", "targets", "frequency_hz")}
+    if not synthetic:
+        given = {name: between_antennas(name, values) for name, values in given.items()}
+    a = np.repeat(one["a"], 3, 1)
+    ends = {"sources": paths.sources.T, "targets": paths.targets.T}
+    simulated = SimpleNamespace(a=(a.real, a.imag), **given, **ends)
+    assert_same(from_sionna(simulated, 2.4e9), paths)
+    with pytest.raises(UserError, match="frequency"):
+        from_sionna(simulated)
+
+
+def test_what_are_no_paths(rng, tmp_path):
+    arrays = draw_paths(rng).as_sionna()
+    with pytest.raises(UserError, match="have no tau"):
+        from_sionna({name: values for name, values in arrays.items() if name != "tau"})
+    with pytest.raises(UserError, match="phi_r of these paths has shape"):
+        from_sionna(arrays | {"phi_r": arrays["phi_r"][:1]})
+    (tmp_path / "a.npz").write_bytes(b"nothing")
+    with pytest.raises(UserError, match="damaged"):
+        load_paths(tmp_path / "a.npz")
+
+
+def test_backwards_twice_is_forwards(rng):
+    paths = draw_paths(rng)
+    back = paths.reversed()
+    np.testing.assert_allclose(back.channel(), paths.channel().T)
+    np.testing.assert_array_equal(back.theta_t, np.swapaxes(paths.theta_r, 0, 1))
+    assert_same(back.reversed(), paths)
+
+
+def line_of_sight(tx, rx, frequency_hz):
+    """Free space between isotropic antennas."""
+    offset = np.asarray(rx, float) - tx
+    length = np.linalg.norm(offset, axis=-1)
+    amplitude = (
+        SPEED_OF_LIGHT / frequency_hz / (4 * np.pi * length) * np.exp(-2j * np.pi * frequency_hz * length / SPEED_OF_LIGHT)
+    )
+    direction = offset / length[:, None]
+    one = {"amplitude": amplitude, "direction": -direction, "length": length, "departure": direction, "arrival": direction}
+    met = np.zeros((len(tx), 1, 5), int)
+    points = np.repeat(np.asarray(tx, float)[:, None, None], 5, -2)
+    return Arrivals(**{name: values[:, None] for name, values in one.items()}, interaction=met, points=points)
+
+
+def test_snapshots_of_a_line_of_sight(rng, tmp_path):
+    """What an array sees of plane waves from where the transmitters stand."""
+    tx, rx, elements = rng.uniform(1, 4, (9, 3)), np.array([0.0, 0, 1]), planar_array(2, 2)
+    paths = [from_arrivals(line_of_sight(tx, rx, f), tx, rx, f) for f in (5e9, 2e9)]
+    np.testing.assert_allclose(
+        np.abs(paths[0].a[0, :, 0]), SPEED_OF_LIGHT / 5e9 / (4 * np.pi * np.linalg.norm(tx - rx, axis=1))
+    )
+    np.testing.assert_allclose(np.angle(paths[0].a), 0, atol=1e-6)
+    save_scene(tmp_path / "scene.npz", scene_of_paths(paths, elements, "sight"))
+    scene = load_scene(tmp_path / "scene.npz")
+    assert scene.snapshots.shape == (9, 1, 2, 4) and (scene.split == TEST).sum() == 2
+    np.testing.assert_array_equal(scene.frequencies_hz, [2e9, 5e9])
+    arrived = line_of_sight(tx, rx, 5e9)
+    expected = arrived.amplitude * np.asarray(steering_vector(*map(jnp.asarray, (elements, arrived.direction[:, 0]))))
+    np.testing.assert_allclose(scene.snapshots[:, 0, 1], expected, rtol=1e-4)
+
+
+def test_places_of_interactions():
+    """Reflections have one; transmissions are known by their wall alone."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [2, 2, 0], [3, 3, 3], [3, 3, 3]], float)[None, None]
+    met = np.array([[[REFLECTED, TRANSMITTED, REFLECTED, 0, 0]]])
+    arrived = line_of_sight(np.zeros((1, 3)), np.array([3.0, 3, 3]), 1e9)._replace(interaction=met, points=points)
+    paths = from_arrivals(arrived, np.zeros((1, 3)), np.array([3.0, 3, 3]), 1e9)
+    assert paths.interactions[0, 0, 0, 0] == SPECULAR
+    np.testing.assert_array_equal(paths.vertices[0, 0, 0, 0], [1, 0, 0])
+    assert np.isnan(paths.vertices[[1, 3, 4]]).all()
+    np.testing.assert_array_equal(paths.vertices[2, 0, 0, 0], [2, 2, 0])
+
+
+def test_scenes_that_cannot_be(rng):
+    paths = draw_paths(rng, transmitters=3)
+    with pytest.raises(UserError, match="3 transmitters"):
+        scene_of_paths([paths], planar_array(2, 2), "few")
+    with pytest.raises(UserError, match="different ends"):
+        scene_of_paths([draw_paths(rng), draw_paths(rng)], planar_array(2, 2), "two")

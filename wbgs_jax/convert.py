@@ -1,0 +1,167 @@
+"""Hand a trained field to other programs, and their channels to a training:
+
+wbgs-jax convert --run RUN --tx x,y,z --ghz 28 --out gaussians.ply          Gaussians, for splat viewers
+wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths, as sionna.rt.Paths has them
+wbgs-jax convert --run RUN --grid LOW:HIGH:NXxNYxNZ --ghz 28 --out folder   a DeepMIMO scenario
+wbgs-jax convert --paths sionna.npz --array 4x4 --out scene.npz             paths of Sionna RT as a scene file
+wbgs-jax convert --paths scenario --ghz 28 --array 4x4 --out scene.npz      a DeepMIMO scenario as a scene file
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from wbgs_jax._util.command import parse_positions, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.inference.queries import parse_grid
+from wbgs_jax.predict import parse_array
+
+# What takes JAX is imported where it is wanted, as in predict.py.
+
+COLORS = "viridis"
+BRIGHT = 0.99
+"""Share of the Gaussians that are no brighter than the end of the colours."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Hand a trained field to other programs, and their channels to a training."""
+
+    out: Path
+    """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). From --paths: a scene file, .npz."""
+    run: Path | None = None
+    """Run folder, or ..."""
+    paths: Path | None = None
+    """... paths of another program: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
+    tx: tuple[str, ...] = ()
+    """Of a run: transmitters, each as x,y,z in metres."""
+    grid: str = ""
+    """Or a grid of them, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
+    ghz: float | None = None
+    """Frequency; of --paths where these do not say it."""
+    rx: str = ""
+    """Of a run: another receiver than the first (`wbgs-jax predict --help`)."""
+    array: str = "4x4"
+    """Of --paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart in the y-z plane."""
+    mesh: Path | None = None
+    """Of --paths: the scene's surfaces, a .ply file in metres, which the coherent field needs."""
+    swap: bool = False
+    """Of --paths of Sionna RT: train for the transmitters' side; needed where one transmitter is seen by many receivers."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that cannot work."""
+    if (command.run is None) == (command.paths is None):
+        raise UserError("give either --run RUN, to hand a field on, or --paths FILE, to make a scene file of other paths")
+    if command.paths is not None and command.out.suffix != ".npz":
+        raise UserError(f"--out {command.out} does not end in .npz; a scene file does")
+    if command.run is None:
+        return
+    if bool(command.tx) == bool(command.grid) or command.ghz is None:
+        raise UserError("a run is asked for transmitters at a frequency: give --tx x,y,z or --grid, and --ghz 28")
+    if command.out.suffix not in (".ply", ".npz", ""):
+        raise UserError(f"--out {command.out} is of no known kind; give gaussians.ply, paths.npz, or a folder for DeepMIMO")
+
+
+def hand_on(command: Command) -> str:
+    """Writes what a field knows, and returns a line about it."""
+    from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at
+    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.training.run_folder import load_trained
+
+    assert command.run is not None and command.ghz is not None, "checked"
+    positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
+    hertz = frequencies((command.ghz,))
+    trained = load_trained(command.run)
+    dataset = trained.dataset()
+    receiver = receiver_at(command.rx, dataset)
+    trained = at_receiver(trained, receiver, dataset)
+    check_frequencies(trained, float(hertz[0]))
+    for line in doubts(dataset, np.asarray(receiver.position), positions, hertz)[:3]:
+        say(f"warning: {line}")
+    write = _write_gaussians if command.out.suffix == ".ply" else _write_paths
+    return write(command, trained, receiver, positions, float(hertz[0]))
+
+
+def _write_gaussians(
+    command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
+) -> str:
+    """Writes the Gaussians: brighter colours send more towards the receiver, opacity is their attenuation."""
+    from matplotlib import colormaps
+
+    from wbgs_jax.interchange.gaussian_ply import write_gaussians
+    from wbgs_jax.types import make_query
+
+    plan = trained.field.plan(trained.params, receiver)
+    query = make_query(positions, np.full(len(positions), frequency_hz))
+    seen = trained.field.splatted(trained.params, plan, query)
+    if seen is None:
+        raise UserError(f"the {trained.field.name} field of this run has no Gaussians; train --field wideband or hybrid")
+    signal, attenuation = (np.abs(np.asarray(values)).mean(1) for values in (seen.signal, seen.attenuation))
+    brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], BRIGHT)), 1e-12)
+    colours = colormaps[COLORS](np.clip(signal / brightest, 0, 1))[:, :3]
+    count = write_gaussians(command.out, seen.gaussians, colours, attenuation)
+    return f"Gaussians: {command.out} ({count}, coloured by their mean signal at {command.ghz:g} GHz)"
+
+
+def _write_paths(
+    command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
+) -> str:
+    from wbgs_jax.inference.links import arrivals_of
+    from wbgs_jax.interchange.deepmimo import as_deepmimo, write_deepmimo
+    from wbgs_jax.interchange.ray_paths import from_arrivals, save_paths
+
+    found = arrivals_of(trained, receiver, positions, frequency_hz)
+    paths = from_arrivals(found, positions, np.asarray(receiver.position), frequency_hz)
+    if command.out.suffix == ".npz":
+        save_paths(command.out, paths)
+        return f"paths: {command.out} ({paths.valid.sum()} of {len(positions)} transmitters)"
+    write_deepmimo(command.out, as_deepmimo(paths.reversed()))
+    return f"DeepMIMO scenario: {command.out} (the receiver as base station, {len(positions)} transmitters as users)"
+
+
+def take_in(command: Command) -> str:
+    """Writes a scene file of other programs' paths, and returns a line about it."""
+    from wbgs_jax.data.ply import read_ply
+    from wbgs_jax.data.scene_file import save_scene
+    from wbgs_jax.interchange.deepmimo import from_deepmimo, is_deepmimo, read_deepmimo
+    from wbgs_jax.interchange.ray_paths import load_paths
+    from wbgs_jax.interchange.scenes import scene_of_paths
+    from wbgs_jax.radio.array import planar_array
+
+    assert command.paths is not None, "checked"
+    hertz = None if command.ghz is None else 1e9 * command.ghz
+    if is_deepmimo(command.paths):
+        if hertz is None:
+            raise UserError(f"{command.paths} does not say its frequency; give --ghz, as in the scenario's parameters")
+        paths = from_deepmimo(read_deepmimo(command.paths), hertz).reversed()
+    else:
+        paths = load_paths(command.paths, hertz)
+        paths = paths.reversed() if command.swap else paths
+    vertices, faces = (None, None) if command.mesh is None else read_ply(command.mesh)
+    scene = scene_of_paths([paths], planar_array(*parse_array(command.array, "--array")), command.out.stem, vertices, faces)
+    save_scene(command.out, scene)
+    heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
+    count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
+    return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {command.out}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax convert")
+    check(command)
+    use_compilation_cache()
+    say(take_in(command) if command.run is None else hand_on(command))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,94 @@
+"""Gaussians as the PLY file of 3D Gaussian splatting (Kerbl et al. 2023), which splat viewers open, and back.
+
+A vertex a Gaussian, float32, binary little endian: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3. Opacity
+is kept before its sigmoid, scales as natural logarithms, the rotation as a quaternion w x y z; colours are the constant term of
+spherical harmonics. Radio has no colours: whoever writes says what they stand for.
+"""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax.types import Gaussians
+
+SH_CONSTANT = 0.28209479177387814
+"""Y_0^0, of what a colour is 0.5 + SH_CONSTANT * f_dc."""
+RESTS = 45
+"""Coefficients beyond the constant that viewers expect: three degrees, three colours."""
+MOST_CERTAIN = 1e-6
+"""Distance of opacities from 0 and 1."""
+PLACE, COLOUR, SCALE, TURN = (
+    ("x", "y", "z"),
+    ("f_dc_0", "f_dc_1", "f_dc_2"),
+    *(tuple(f"{name}_{i}" for i in range(count)) for name, count in (("scale", 3), ("rot", 4))),
+)
+NAMES = (*PLACE, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(RESTS)), "opacity", *SCALE, *TURN)
+NEEDED = (*PLACE, *COLOUR, "opacity", *SCALE, *TURN)
+
+
+def write_gaussians(
+    path: Path | str,
+    gaussians: Gaussians,
+    colours: Float[np.ndarray, "n 3"] | None = None,
+    opacity: Float[np.ndarray, " n"] | None = None,
+) -> int:
+    """Writes the Gaussians that are alive, and returns how many they are.
+
+    Args:
+        path: of the file.
+        gaussians: in the world frame.
+        colours: red, green, blue from 0 to 1; grey by default.
+        opacity: from 0 to 1; by default what the Gaussians themselves hold, `sigmoid(opacity_logits)`.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    alive = np.asarray(gaussians.alive)
+    logits = np.asarray(gaussians.opacity_logits, np.float32)
+    if opacity is not None:
+        share = np.clip(opacity, MOST_CERTAIN, 1 - MOST_CERTAIN)
+        logits = np.log(share / (1 - share))
+    rgb = np.full((len(alive), 3), 0.5) if colours is None else np.clip(colours, 0, 1)
+    parts = {PLACE: gaussians.means, COLOUR: (rgb - 0.5) / SH_CONSTANT, ("opacity",): logits[:, None]}
+    parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats}
+    rows = np.zeros(int(alive.sum()), [(name, "<f4") for name in NAMES])
+    for names, values in parts.items():
+        for name, column in zip(names, np.asarray(values, np.float32)[alive].T, strict=True):
+            rows[name] = column
+    with atomic_write(path) as stream:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
+    return len(rows)
+
+
+def read_gaussians(path: Path | str) -> tuple[Gaussians, Float[np.ndarray, "n 3"]]:
+    """Returns the Gaussians of a splatting PLY file, and their colours from 0 to 1.
+
+    Raises:
+        UserError: the file is missing, damaged, or holds no Gaussians.
+    """
+    path = Path(path)
+    try:
+        rows = {element.name: element.data for element in PlyData.read(path).elements}.get("vertex")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
+    except (PlyParseError, ValueError, EOFError, MemoryError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path} is not a PLY file or is truncated ({reason}); export it again") from error
+    found = () if rows is None else rows.dtype.names or ()
+    missing = [name for name in NEEDED if name not in found]
+    if rows is None or missing:
+        raise UserError(f"{path} has no {missing[0]}: it holds points or a mesh, not Gaussians; export it as splats")
+    columns = {
+        names: np.stack([np.asarray(rows[name], np.float32) for name in names], -1) for names in (PLACE, COLOUR, SCALE, TURN)
+    }
+    opacity = np.asarray(rows["opacity"], np.float32)
+    if not all(np.isfinite(values).all() for values in (*columns.values(), opacity)):
+        raise UserError(f"{path} has NaN or infinity among its Gaussians; clean it and export it again")
+    place, scale, turn = (jnp.asarray(columns[names]) for names in (PLACE, SCALE, TURN))
+    colours = np.clip(0.5 + SH_CONSTANT * columns[COLOUR], 0, 1)
+    return Gaussians(place, scale, turn, jnp.asarray(opacity)), colours

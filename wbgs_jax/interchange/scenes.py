@@ -1,0 +1,82 @@
+"""Paths of other programs as a scene file that a field can be trained on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile
+from wbgs_jax.interchange.ray_paths import RayPaths
+
+TEST_SHARE = 0.2
+FEWEST = 5
+"""Transmitters."""
+
+
+def scene_of_paths(
+    paths: Sequence[RayPaths],
+    element_positions: Float[np.ndarray, "elements 3"],
+    name: str,
+    vertices: Float[np.ndarray, "vertices 3"] | None = None,
+    faces: np.ndarray | None = None,
+    seed: int = 0,
+) -> SceneFile:
+    """Returns a scene of paths between the same places at one frequency or several: snapshots of an array at every receiver,
+    whose local frame is the world's. A fifth of the transmitters is for the test.
+
+    Waves are plane over the array, and elements are alike: what `a` of the paths says already holds the antennas.
+
+    Args:
+        paths: of each frequency.
+        element_positions: of the receivers' arrays, wavelengths.
+        name: of the scene.
+        vertices: of the scene's surfaces, metres; none by default.
+        faces: triangles.
+        seed: of the split.
+
+    Raises:
+        UserError: places are not known or differ, or there are too few transmitters.
+    """
+    first, count = paths[0], len(paths[0].sources)
+    places = np.concatenate([first.sources, first.targets])
+    if not np.isfinite(places).all():
+        raise UserError(f"the paths of {name} do not say where transmitters and receivers are; give sources and targets")
+    if any(not np.allclose(p.sources, first.sources) or not np.allclose(p.targets, first.targets) for p in paths):
+        raise UserError(
+            f"the paths of {name} at different frequencies have different ends; give the same ones in the same order"
+        )
+    if count < FEWEST:
+        raise UserError(
+            f"{name} has {count} transmitters, and a training needs {FEWEST}; swap the ends if it has many receivers"
+        )
+    order = np.argsort([p.frequency_hz for p in paths])
+    snapshots = np.stack([snapshots_of(paths[i], element_positions) for i in order], 2)
+    split = np.full(count, TRAIN, np.int8)
+    split[np.random.default_rng(seed).permutation(count)[: max(round(TEST_SHARE * count), 1)]] = TEST
+    receivers = len(first.targets)
+    known = faces is not None and vertices is not None
+    return SceneFile(
+        name=name,
+        tx_positions=first.sources,
+        frequencies_hz=np.array([paths[i].frequency_hz for i in order]),
+        rx_position=first.targets,
+        rx_orientation=np.tile([1.0, 0, 0, 0], (receivers, 1)),
+        element_positions=np.tile(element_positions, (receivers, 1, 1)),
+        vertices=np.asarray(vertices if known else np.zeros((0, 3)), np.float32),
+        faces=np.asarray(faces if known else np.zeros((0, 3)), np.int32),
+        face_part=np.zeros(0 if faces is None or not known else len(faces), np.int32),
+        split=split,
+        snapshots=snapshots.astype(np.complex64),
+        meta={"parts": [{"name": "surface", "material": "unknown", "thickness": 0}]} if known else {},
+    )
+
+
+def snapshots_of(paths: RayPaths, element_positions: Float[np.ndarray, "elements 3"]) -> Complex[np.ndarray, "t r elements"]:
+    """Returns the voltages of the elements of every receiver's array (wavelengths, world frame), carrier phase included."""
+    turns = np.mod(paths.frequency_hz * paths.tau, 1)
+    voltage = np.where(paths.valid, paths.a * np.exp(-2j * np.pi * turns), 0)
+    sine = np.sin(paths.theta_r)
+    direction = np.stack([sine * np.cos(paths.phi_r), sine * np.sin(paths.phi_r), np.cos(paths.theta_r)], -1)
+    steering = np.exp(2j * np.pi * np.nan_to_num(direction) @ np.asarray(element_positions).T)
+    return np.einsum("rtk,rtke->tre", voltage, steering)
