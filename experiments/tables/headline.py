@@ -17,7 +17,7 @@ from experiments.tables.cells import NAMES, NOT_RUN, Scores, ceiling, cell, medi
 from experiments.tables.plots import STYLES, save
 from experiments.variants import HIGHER_RATE, VARIANTS
 
-TITLE = "Headline"
+TITLE = "Headline by the presets of version 0.1"
 Model = tuple[str, str]
 """A field and its variant."""
 COMPARISONS: dict[tuple[Model, Model], str] = {

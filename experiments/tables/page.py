@@ -9,9 +9,21 @@ from pathlib import Path
 from experiments.catalogue import unique_jobs
 from experiments.profiles import PROFILES, Profile
 from experiments.results import Results
-from experiments.tables import baselines, default_field, figure4, figure6, figure7, figure8, headline, table1, table2, table3
+from experiments.tables import (
+    baselines,
+    default_field,
+    figure4,
+    figure6,
+    figure7,
+    figure8,
+    headline,
+    table1,
+    table2,
+    table3,
+    today,
+)
 
-PAGES = (headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
+PAGES = (today, headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
 """In the order of the paper, for readers."""
 
 
@@ -81,6 +93,6 @@ def provenance(results: Results) -> str:
     commits = sorted({str(r.values["environment"]["commit"]) for r in found})
     return (
         f"{len(found)} of {len(jobs)} jobs have been run ({devices}; {seconds / 3600:.1f} hours of training and evaluation;"
-        f" code {', '.join(f'`{c}`' for c in commits)}). Each is a file in `experiments/results/{results.profile}/`, with its"
-        " settings; results of other settings count as not run."
+        f" code {', '.join(f'`{c}`' for c in commits)}). Each is a file in `experiments/results/{results.profile}/` or, by"
+        " today's presets, `experiments/results/curve/`, with its settings; results of other settings count as not run."
     )

@@ -12,7 +12,7 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.results import Results
 from experiments.tables import __main__ as command_line
-from experiments.tables import baselines, cells, default_field, figure8, headline, page, table1, table2, table3
+from experiments.tables import baselines, cells, default_field, figure8, headline, page, table1, table2, table3, today
 from wbgs_jax._util.files import write_json
 
 LEVELS = {
@@ -191,3 +191,14 @@ def test_pages_of_two_profiles_share_no_picture(tmp_path):
     assert "(images/results_headline.png)" in (tmp_path / "docs" / "results.md").read_text()
     assert "(images_smoke/results_headline.png)" in (tmp_path / "docs" / "results_smoke.md").read_text()
     assert (tmp_path / "docs" / "images_smoke" / "results_headline.png").exists()
+
+
+def test_todays_comparison_is_computed(everything):
+    """Wideband and WRF-GS with three seeds, 0.01 apart: 0.81 and 0.65 in the middle; pooled 0.7, with three seeds in scene 4."""
+    for scene in ("1", "2", "3", "5", "6"):
+        ours, theirs, gained, better, difference, pooled = row(today.by_scene(everything), scene)
+        assert (ours[:5], theirs[:5], gained, pooled) == ("0.810", "0.650", "+24.6 %", "0.700")
+        assert better == "100 % of 7" and difference == "+0.160"
+    assert row(today.by_scene(everything), "average of 6")[2] == "+24.6 % (+17.8 %)"
+    assert row(today.against_spectra(everything), "wideband") == ["0.810 (3 seeds)", "0.860 (3 seeds)", "0.700 (1 seed)"]
+    assert row(today.against_spectra(everything), "gain")[1] == "+13.2 %"
