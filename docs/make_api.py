@@ -25,6 +25,7 @@ TITLES = {
     "inference": "A trained field",
     "training": "A trained field",
     "measured": "Measured powers",
+    "interchange": "Other programs",
     "_util": "Writing a field",
 }
 """Headings, in their order, by the room of a name."""

@@ -26,6 +26,7 @@ from .inference.confidence import expected_power as expected_power
 from .inference.confidence import expected_ssim as expected_ssim
 from .inference.export import export_field as export_field
 from .inference.export import load_exported as load_exported
+from .inference.links import arrivals_of as arrivals_of
 from .inference.maps import map_queries as map_queries
 from .inference.maps import predict_blocks as predict_blocks
 from .inference.maps import predict_many as predict_many
@@ -33,6 +34,18 @@ from .inference.maps import predict_map as predict_map
 from .inference.predictor import at_receiver as at_receiver
 from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
+from .interchange.deepmimo import as_deepmimo as as_deepmimo
+from .interchange.deepmimo import from_deepmimo as from_deepmimo
+from .interchange.deepmimo import read_deepmimo as read_deepmimo
+from .interchange.deepmimo import write_deepmimo as write_deepmimo
+from .interchange.gaussian_ply import read_gaussians as read_gaussians
+from .interchange.gaussian_ply import write_gaussians as write_gaussians
+from .interchange.ray_paths import RayPaths as RayPaths
+from .interchange.ray_paths import from_arrivals as from_arrivals
+from .interchange.ray_paths import from_sionna as from_sionna
+from .interchange.ray_paths import load_paths as load_paths
+from .interchange.ray_paths import save_paths as save_paths
+from .interchange.scenes import scene_of_paths as scene_of_paths
 from .measured.floor_plan import load_walls as load_walls
 from .measured.power_map import learn_map as learn_map
 from .measured.power_map import received_power as received_power
