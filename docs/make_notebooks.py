@@ -29,7 +29,7 @@ CONTROL = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 def execute(notebook: Any) -> Any:
     """Returns a notebook after running all of its cells in an empty folder."""
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "3"}
     with tempfile.TemporaryDirectory() as folder:
         NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources={"metadata": {"path": folder}}).execute()
     return notebook
