@@ -103,12 +103,19 @@ def formats(names: dict) -> None:
     assert names["pas"].shape == (10, 90, 360) and names["scene"].snapshots.shape == (877, 1, 10, 16)
 
 
+def interchange(names: dict) -> None:
+    assert names["gaussians"].means.shape == (names["count"], 3) and float(names["colours"].max()) == 1
+    assert names["scene"].snapshots.shape == (8, 1, 1, 16)
+    np.testing.assert_allclose(names["again"].channel(0.0), names["paths"].channel(0.0), rtol=1e-5)
+
+
 def experiments(names: dict) -> None:
     assert {row["scene"] for row in names["ours"]} >= set("123456")
 
 
 HOLDS: dict[str, Callable[[dict], None]] = {
-    f"{check.__name__}.md": check for check in (inference, new_field, recipes, start, own_scene, measured, formats, experiments)
+    f"{check.__name__}.md": check
+    for check in (inference, new_field, recipes, start, own_scene, measured, formats, interchange, experiments)
 } | {"README.md": readme}
 """What must hold of the names that a page's blocks leave, by page."""
 
