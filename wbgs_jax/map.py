@@ -4,6 +4,7 @@ wbgs-jax map --run RUN --ghz 28 [60 ...] --out map.npz --picture map.png
 wbgs-jax map --run RUN --ghz 28 --what best-beam|k-factor|delay-spread|angular-spread --height 1.2 --step 0.1 --out map.npz
 """
 
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
