@@ -16,6 +16,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json, write_json
 
 QUESTION = "question.json"
+QUICK = 1
+"""Level of compression: spectra are hardly smaller at higher ones."""
 SHARED = ("offsets_hz", "delays_s", "tx_elements")
 """Arrays that belong to all queries alike; all others have a row a query (or several: tables of paths)."""
 
@@ -147,7 +149,7 @@ def write_archive(
         source: where they come from, JSON text in `meta`.
     """
     single = {**answers.shared(), **known, "meta": np.array(json.dumps(source))}
-    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
         for name in answers.names():
             shapes, dtypes = zip(*((piece.shape, piece.dtype) for piece in answers.pieces(name)), strict=True)
             count, dtype = sum(one[0] for one in shapes), np.result_type(*dtypes)
