@@ -41,7 +41,7 @@ def pytest_report_header(config: pytest.Config) -> str:
     return f"random seed: repeat this run with {SEED_VARIABLE}={os.environ[SEED_VARIABLE]}"
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter: "pytest.TerminalReporter", config: pytest.Config) -> None:
     if config.option.verbose < 0:  # pytest -q prints no header
         terminalreporter.write_line(pytest_report_header(config))
 
