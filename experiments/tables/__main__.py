@@ -1,7 +1,7 @@
 """Write the page of results and the table of all results: `python -m experiments.tables [--profile quick]`.
 
 docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick),
-experiments/results/results.csv, and the marked numbers of README.md and all pages (`evidence.py`).
+experiments/results/results.csv and headline.json, and the marked numbers of README.md and all pages (`evidence.py`).
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ import tyro
 
 from experiments import evidence, result_table
 from experiments.results import FOLDER, Results
+from experiments.tables import summary
 from experiments.tables.page import page
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import atomic_write
@@ -38,6 +39,8 @@ def main(arguments: list[str] | None = None) -> None:
         stream.write(text.encode())
     print(path)
     print(result_table.write(command.results))
+    if not suffix:
+        print(summary.write(Results(command.profile, command.results)))
     if command.docs == DOCS:
         for changed in evidence.fill_pages(folder=command.results):
             print(changed)

@@ -45,6 +45,12 @@ def _report(folder: Path, name: str) -> dict[str, Any] | None:
     return read_json(path) if path.exists() else None
 
 
+def median_ssim(folder: Path, scene: str) -> float | None:
+    """Returns the median SSIM of a released scene; None where it was not run."""
+    report = _report(folder, f"scene{scene}")
+    return None if report is None else float(report["median_ssim"])
+
+
 def _figures(report: dict[str, Any] | None) -> list[str]:
     if report is None:
         return [NOT_RUN] + [""] * (len(HEAD) - 2)

@@ -12,7 +12,7 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.results import Results
 from experiments.tables import __main__ as command_line
-from experiments.tables import baselines, cells, default_field, figure8, headline, page, table1, table2, table3, today
+from experiments.tables import baselines, cells, default_field, figure8, headline, page, summary, table1, table2, table3, today
 from wbgs_jax._util.files import write_json
 
 LEVELS = {
@@ -194,7 +194,7 @@ def test_pages_of_two_profiles_share_no_picture(tmp_path):
 
 
 def test_todays_comparison_is_computed(everything):
-    """Wideband and WRF-GS with three seeds, 0.01 apart: 0.81 and 0.65 in the middle; pooled 0.7, with three seeds in scene 4."""
+    """Wideband and WRF-GS have three seeds, 0.01 apart: 0.81 and 0.65 are in the middle. Pooled has one but in scene 4."""
     for scene in ("1", "2", "3", "5", "6"):
         ours, theirs, gained, better, difference, pooled = row(today.by_scene(everything), scene)
         assert (ours[:5], theirs[:5], gained, pooled) == ("0.810", "0.650", "+24.6 %", "0.700")
@@ -202,3 +202,11 @@ def test_todays_comparison_is_computed(everything):
     assert row(today.by_scene(everything), "average of 6")[2] == "+24.6 % (+17.8 %)"
     assert row(today.against_spectra(everything), "wideband") == ["0.810 (3 seeds)", "0.860 (3 seeds)", "0.700 (1 seed)"]
     assert row(today.against_spectra(everything), "gain")[1] == "+13.2 %"
+
+
+def test_the_summary_is_that_of_the_tables(everything, nothing):
+    found = summary.summary(everything)
+    assert found["wideband"] == pytest.approx(0.81) and found["wrfgs"] == pytest.approx(0.65)
+    assert found["gain_percent"] == pytest.approx(100 * (0.81 / 0.65 - 1), abs=0.01)
+    assert found["pooled"] == pytest.approx((5 * 0.70 + 0.71) / 6, abs=1e-3) and found["coherent"] == pytest.approx(0.91)
+    assert summary.summary(nothing).keys() == {"ceiling"}  # of the scene files
