@@ -126,7 +126,7 @@ def from_sionna(paths: Any, frequency_hz: float | None = None) -> RayPaths:
         valid=np.asarray(single.get("valid", (real["tau"] >= 0) & (single["a"] != 0)), bool),
         sources=_places(paths, "sources", shape[1]),
         targets=_places(paths, "targets", shape[0]),
-        frequency_hz=float(frequency),
+        frequency_hz=float(np.reshape(frequency, -1)[0]),
     )
 
 
@@ -211,16 +211,16 @@ def _first_antennas(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def _places(paths: Any, name: str, count: int) -> np.ndarray:
-    """Returns positions (n, 3); objects of Sionna have them the other way round."""
+    """Returns positions (n, 3), of several antennas at a place the first; objects of Sionna have them the other way round."""
     found = _array(paths, name)
     if found is None:
         return np.full((count, 3), np.nan)
     places = np.asarray(found, np.float64)
-    if places.shape == (3, count) and (not isinstance(paths, Mapping) or count != 3):
+    if places.ndim == 2 and (places.shape[1] != 3 or (len(places) == 3 and not isinstance(paths, Mapping))):
         places = places.T
-    if places.shape != (count, 3):
-        raise UserError(f"{name} of these paths has shape {places.shape}; expected ({count}, 3): one place an antenna")
-    return places
+    if places.ndim != 2 or places.shape[1] != 3 or not len(places) or len(places) % count:
+        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected ({count}, 3): a place for each of them")
+    return places[:: len(places) // count]
 
 
 def _angles(directions: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
