@@ -36,9 +36,6 @@ BEYOND_FREE_SPACE_DB = -100.0, 30.0
 """What received powers beyond that of free space are cut to: without any path there is no telling how deep the shadow is."""
 
 
-C = TypeVar("C", "Confidence", "PowerConfidence")
-
-
 @pytree
 class Confidence:
     """What has been learned about the scores of answers, over all receivers of the data alike."""
@@ -75,6 +72,9 @@ class PowerConfidence:
     """What r is at most, nine times out of ten."""
     surplus: Float[Array, ""]
     """Mean of exp(r)."""
+
+
+C = TypeVar("C", Confidence, PowerConfidence)
 
 
 class ExpectedPower(NamedTuple):
