@@ -24,6 +24,7 @@ TITLES = {
     "data": "Data",
     "inference": "A trained field",
     "training": "A trained field",
+    "applications": "What a trained field is for",
     "measured": "Measured powers",
     "interchange": "Other programs",
     "_util": "Writing a field",

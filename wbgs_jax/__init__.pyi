@@ -1,5 +1,16 @@
 from ._util.pytree import pytree as pytree
 from ._util.pytree import static as static
+from .applications.beams import choose_beams as choose_beams
+from .applications.beams import rank_beams as rank_beams
+from .applications.beams import score_beams as score_beams
+from .applications.coverage import mean_power as mean_power
+from .applications.coverage import place_antenna as place_antenna
+from .applications.coverage import power_at_users as power_at_users
+from .applications.coverage import soft_minimum as soft_minimum
+from .applications.coverage import tenth_percentile as tenth_percentile
+from .applications.locate import Located as Located
+from .applications.locate import Locator as Locator
+from .applications.locate import locator as locator
 from .data.load import load_dataset as load_dataset
 from .data.scene_file import load_scene as load_scene
 from .data.scene_file import save_scene as save_scene

@@ -1,0 +1,49 @@
+"""Beams against a search through all of them."""
+
+import numpy as np
+import pytest
+
+from wbgs_jax.applications.beams import RIGHT_DB, beam_directions, choose_beams, rank_beams, score_beams
+from wbgs_jax.radio.array import pas_directions
+from wbgs_jax.radio.codebook import codebook
+
+
+def test_beams_are_ranked_as_a_search_through_all_of_them_ranks_them(rng):
+    spectra = rng.random((4, 90, 360)).astype(np.float32)
+    for spectrum, ranked in zip(spectra, rank_beams(spectra, 5), strict=True):
+        heard = [spectrum[divmod(pixel, 360)] for pixel in codebook()]
+        assert ranked.tolist() == sorted(range(64), key=lambda beam: -heard[beam])[:5]
+
+
+def test_a_beam_points_where_its_pixel_is(rng):
+    row, column = divmod(int(codebook()[beam := int(rng.integers(64))]), 360)
+    np.testing.assert_array_equal(beam_directions()[beam], pas_directions()[row, column])
+
+
+def test_scores_are_those_of_a_search_through_all_beams(rng):
+    predicted, truth = rng.random((2, 30, 90, 360)).astype(np.float32) ** 0.05
+    scores, losses = score_beams(predicted, truth), []
+    for p, t in zip(predicted, truth, strict=True):
+        heard = t.reshape(-1)[codebook()].astype(float)
+        order = np.argsort(-p.reshape(-1)[codebook()], kind="stable")
+        losses.append([-20 * np.log10(heard[order[:tried]].max() / heard.max()) for tried in (1, 3)])
+    first, three = np.array(losses).T
+    assert scores == pytest.approx(
+        ((first <= RIGHT_DB).mean(), (three <= RIGHT_DB).mean(), first.mean(), three.mean()), abs=1e-5
+    )
+    assert scores.top1 <= scores.top3 and scores.loss_db >= scores.loss_top3_db
+
+
+def test_who_knows_the_truth_is_always_right(rng):
+    truth = rng.random((5, 90, 360)).astype(np.float32)
+    assert score_beams(truth, truth) == (1, 1, 0, 0)
+
+
+def test_beams_for_transmitters_are_those_of_their_spectra(rng):
+    spectra = rng.random((20, 90, 360)).astype(np.float32)
+    positions = np.arange(60.0).reshape(20, 3)
+
+    def predict(tx_position, frequency_hz):
+        return spectra[(np.asarray(tx_position)[:, 0] / 3).astype(int)]
+
+    np.testing.assert_array_equal(choose_beams(predict, positions, 28e9), rank_beams(spectra))

@@ -1,0 +1,203 @@
+"""Places are found again from what a field itself says of them; slopes against differences; two places that sound alike."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import METAL, field_of, rectangle
+from synthetic import RX, tiny_dataset
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.applications.descent import best_apart, gauss_newton, grid_over, in_blocks
+from wbgs_jax.applications.locate import Locator, locator
+from wbgs_jax.fields import Field, Observation
+from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
+from wbgs_jax.radio.channel import decibels
+from wbgs_jax.types import Query, make_receiver
+
+BEAMS = beams_of(planar_array())
+HZ = np.array([1e9, 10e9])
+BOX = np.array([[0.8, -1.7, 0.3], [2.7, 2.2, 2.5]])
+"""Ahead of the array."""
+
+
+@pytree
+class MirrorsField(Field):
+    """Powers from a transmitter and its images in a floor, a ceiling and two walls; no fringes."""
+
+    config: Any = static(default=None)
+    images: int = static(default=5)
+
+    name: ClassVar[str] = "mirrors"
+    gives: ClassVar = ("pas", "snapshots", "power")
+
+    def init(self, key):
+        return {"loss": jnp.float32(0.5)}
+
+    def plan(self, params, receiver, limits=None, cache=None):
+        return receiver
+
+    def render(self, params, plan, query):
+        sign = jnp.array([[1, 1, 1], [1, 1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], jnp.float32)
+        offset = jnp.array([[0, 0, 0], [0, 0, 0], [0, 0, 5.6], [0, 5.0, 0], [6.0, 0, 0]], jnp.float32)
+        away = query.tx_position[:, None] * sign + offset - plan.position
+        away, strength = away[:, : self.images], jnp.array([1.0, *[params["loss"]] * 4])[: self.images]
+        distance = jnp.linalg.norm(away, axis=-1)
+        power = (strength / distance) ** 2 / query.frequency_hz[:, None] * 1e9
+        waves = steering_vector(plan.element_positions, away / distance[..., None])
+        weighted = waves * (power / power.sum(-1, keepdims=True))[..., None] / 16
+        covariance = jnp.einsum("bke,bkf->bef", weighted, waves.conj())
+        pas = covariance_to_pas(covariance, BEAMS)
+        return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A field and its data."""
+
+    field: Field
+    params: Any
+
+    def dataset(self):
+        return tiny_dataset()
+
+    def origin(self):
+        return {}
+
+    neighbours = confidence = power_confidence = None
+
+
+def trained(images=5) -> Trained:
+    field = MirrorsField(images=images)
+    return Trained(field, field.init(jax.random.key(0)))
+
+
+RECEIVERS = [make_receiver(place) for place in (RX, [-2.5, 2.0, 1.5], [2.8, -1.8, 2.4], [2.5, 2.3, 0.4])]
+
+
+@pytest.fixture(scope="module")
+def by_spectra() -> Locator:
+    return locator(trained(), HZ, box=BOX)
+
+
+@pytest.fixture(scope="module")
+def by_power() -> Locator:
+    return locator(trained(), HZ[:1], "power", RECEIVERS, BOX)
+
+
+def somewhere(rng, n=5):
+    return rng.uniform(BOX[0] + 0.1, BOX[1] - 0.1, (n, 3)).astype(np.float32)
+
+
+def said(asked: Locator, place, quantity):
+    """What the field says of a place, as an observation."""
+    rows = []
+    for plan in asked.plans:
+        query = Query(jnp.tile(place, (len(asked.frequencies_hz), 1)), asked.frequencies_hz)
+        rows.append(getattr(asked.field.render(asked.params, plan, query), quantity))
+    return jnp.stack(rows)
+
+
+def test_places_are_found_again_from_spectra(by_spectra, rng):
+    for place in somewhere(rng):
+        found = by_spectra(said(by_spectra, place, "pas")[0])
+        assert np.linalg.norm(found.position - place) < 0.02 and found.loss < 1e-4
+        assert (found.other_losses >= found.loss).all()
+
+
+def test_places_are_found_again_from_powers_at_four_receivers(by_power, rng):
+    for place in somewhere(rng):
+        found = by_power(said(by_power, place, "power_db"))
+        assert np.linalg.norm(found.position - place) < 0.03
+
+
+def test_an_unknown_transmitted_power_does_not_matter(rng):
+    asked = locator(trained(), HZ[:1], "power", RECEIVERS, BOX, known_power=False)
+    place = somewhere(rng, 1)[0]
+    losses = [
+        asked.loss(jnp.asarray(place[None]), said(asked, place, "power_db").reshape(-1) + gain, 0.0)[0] for gain in (0.0, 17.0)
+    ]
+    np.testing.assert_allclose(losses, 0, atol=1e-6)
+
+
+def test_front_and_back_of_a_planar_array_sound_alike(rng):
+    asked = locator(trained(images=1), HZ, box=[RX - np.array([2, 1.5, 0.5]), RX + np.array([2, 1.5, 1.3])], step=0.7)
+    place = (RX + rng.uniform([0.8, -1, 0.2], [1.5, 1, 1.0])).astype(np.float32)
+    twin = np.array([2 * RX[0] - place[0], *place[1:]], np.float32)
+    observed = said(asked, place, "pas")[0]
+    np.testing.assert_allclose(asked.loss(jnp.stack([place, twin]), observed, 0.0), 0, atol=1e-6)
+    found = asked(observed)
+    sides = np.sign(np.concatenate([found.position[None], found.others])[:, 0] - RX[0])
+    near = np.concatenate([found.loss[None], found.other_losses]) < 1e-4
+    assert {-1.0, 1.0} <= set(sides[near].tolist())
+
+
+@pytest.mark.parametrize("what, quantity", [("spectra", "pas"), ("snapshots", "snapshots"), ("power", "power_db")])
+def test_slopes_of_the_loss_are_differences(rng, what, quantity):
+    asked = locator(trained(), HZ, what, box=BOX, step=2.0)
+    place, aside = (jnp.asarray(x) for x in somewhere(rng, 2))
+    observed = said(asked, place, quantity)[0]
+    way = jnp.asarray(rng.normal(size=3), jnp.float32)
+    slope = jax.grad(lambda x: asked.loss(x[None], observed, 0.0)[0])(aside) @ way
+    ahead, behind = (asked.loss((aside + h * way)[None], observed, 0.0)[0] for h in (0.01, -0.01))
+    assert float(slope) == pytest.approx(float(ahead - behind) / 0.02, rel=0.03, abs=2e-3)
+
+
+def test_a_wall_of_metal_gives_the_coherent_field_slopes_too(rng):
+    """One wave off a wall: the loss of a blurred and of a sharp answer has the slope that differences have."""
+    sizes = {"specular_tried": 4, "specular_kept": 4, "diffracted_tried": 4, "diffracted_kept": 4, "mirror_areas": (0.0,)}
+    field, params, plan = field_of([rectangle((-5, 3, -5), (15, 0, 0), (0, 0, 15))], (0, 0, 1), conductivity=METAL, **sizes)
+    rest = jnp.float32([1e9]), jnp.asarray(BOX, jnp.float32), jnp.zeros((1, 3)), jnp.zeros((1, 1, 324))
+    asked = Locator(field, params, (plan,), *rest, "spectra")
+    loss = jax.jit(jax.value_and_grad(lambda x, pas, blur: asked.loss(x[None], pas, blur)[0]))
+    aside = jnp.asarray(somewhere(rng, 1)[0])
+    observed, way = jnp.asarray(rng.random((1, 90, 360)), jnp.float32), jnp.asarray(rng.normal(size=3), jnp.float32)
+    for blur in (0.0, 0.2):
+        slope = loss(aside, observed, blur)[1] @ way
+        ahead, behind = (loss(aside + h * way, observed, blur)[0] for h in (0.003, -0.003))
+        assert float(slope) == pytest.approx(float(ahead - behind) / 0.006, rel=0.05, abs=2e-3)
+
+
+def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_refused(by_spectra):
+    with pytest.raises(ValueError, match="expected"):
+        by_spectra(jnp.zeros((3, 90, 360)))
+    with pytest.raises(UserError, match="says nothing"):
+        locator(trained(), HZ[:1], "power", RECEIVERS[:1], BOX, known_power=False)
+    with pytest.raises(UserError, match="knows no snapshots"):
+        locator(Trained(Silent(), None), HZ, "snapshots")
+
+
+class Silent(MirrorsField):
+    """Spectra alone."""
+
+    gives: ClassVar = ("pas",)
+
+
+def test_the_descent_finds_the_least_squares_of_a_line_and_stays_in_its_box(rng):
+    target, matrix = rng.uniform(-1, 1, 3), rng.normal(size=(5, 3))
+    box = jnp.asarray([[-1.0] * 3, [1.0] * 3])
+
+    def residuals(places, blur):
+        return (places - jnp.asarray(target, jnp.float32)) @ jnp.asarray(matrix.T, jnp.float32)
+
+    found = gauss_newton(residuals, jnp.zeros((2, 3)), box, np.float32([1.0, 0.1]), 4)
+    np.testing.assert_allclose(found.place[0], target, atol=5e-3)
+    cut = gauss_newton(residuals, jnp.zeros((1, 3)), 0.01 * box, np.float32([1.0]), 4)
+    assert jnp.abs(cut.place).max() <= 0.01
+
+
+def test_starts_stand_apart_and_blocks_are_the_whole(rng):
+    places = jnp.asarray(grid_over(np.array([[0.0, 0, 0], [3, 2, 1]]), 0.5))
+    assert len(places) == 6 * 4 * 2 and float(places.min()) == 0.25
+    losses = jnp.asarray(rng.random(len(places)), jnp.float32)
+    chosen = np.asarray(best_apart(places, losses, 4, 0.75))
+    assert chosen[0] == int(losses.argmin())
+    away = np.linalg.norm(places[chosen][:, None] - places[chosen], axis=-1)
+    assert (away[~np.eye(4, dtype=bool)] >= 0.75).all()
+    np.testing.assert_allclose(in_blocks(lambda some: some.sum(-1), places), places.sum(-1), rtol=1e-6)
+    with pytest.raises(UserError, match="lowest corner first"):
+        grid_over(np.array([[0.0, 0, 0], [1, -1, 1]]), 0.5)

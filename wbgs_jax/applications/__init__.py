@@ -1,0 +1,1 @@
+"""What a trained field is for: to locate transmitters, to choose beams, to place antennas."""

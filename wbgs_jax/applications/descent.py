@@ -1,0 +1,168 @@
+"""Multi-start descent in a box: a grid, the best places that stand apart from each other, and steps that lead on from each.
+
+A coherent field's answers have fringes: they change over a fraction of a wavelength, and slopes lead to the next fringe.
+Functions of places therefore take a blur (metres), over which answers are averaged (`Field.blurred`): the descent begins with
+a wide one, under which there are few minima, and ends with a narrow one, under which they are sharp.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.radio.array import EXACT
+
+AnyArray = Array | np.ndarray
+Loss = Callable[[Float[Array, "k n"], Any], Float[Array, " k"]]
+"""(places (k, n), blur in metres) -> loss of every place by itself; differentiable in reverse mode."""
+Residuals = Callable[[Float[Array, "k n"], Any], Float[Array, "k m"]]
+"""(places (k, n), blur in metres) -> residuals of every place by itself, whose squares add up to its loss."""
+STEP = 0.3
+"""Length of a gradient step along each axis, relative to the blur."""
+MOMENTS = 0.7, 0.9
+"""Of Adam: short memories, for tens of steps under a loss that sharpens on the way."""
+ASIDE = 0.2
+"""How far aside Gauss-Newton looks for slopes, relative to the blur ..."""
+FARTHEST = 2.0
+"""... and the longest step that it takes."""
+DAMPING, EASED, RAISED = 1e-2, 0.2, 10.0
+"""Of Gauss-Newton: relative to the mean curvature at first, after a step that helped, and after one that did not."""
+TINY = 1e-12
+MOST_PLACES = 1_000_000
+BLOCK = 16
+"""Places that are asked at a time."""
+FAR = 1e6
+"""Added to losses of places that are taken, or near one that is: the next round takes those that have least of it."""
+
+
+class Descended(NamedTuple):
+    """Where K starts have led to, the best one first."""
+
+    place: Float[Array, "k n"]
+    loss: Float[Array, " k"]
+
+
+def grid_over(box: Float[np.ndarray, "2 n"], step: float) -> Float[np.ndarray, "places n"]:
+    """Returns places (float32) of a box (its lowest and highest corner), `step` apart at most along every axis and half of that
+    from its sides.
+
+    Raises:
+        UserError: the box is empty, or there would be more than a million places.
+    """
+    low, high = np.asarray(box, float)
+    if not (low < high).all() or not step > 0:
+        raise UserError(
+            f"no places between {low} and {high}, {step:g} m apart; give the lowest corner first and a step above 0"
+        )
+    counts = np.maximum(np.ceil((high - low) / step - 1e-9), 1).astype(int)
+    if np.prod(counts.astype(float)) > MOST_PLACES:
+        raise UserError(f"a step of {step:g} m makes more than {MOST_PLACES:,} places; give a larger one or a smaller box")
+    axes = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(low)).astype(np.float32)
+
+
+def best_apart(
+    places: Float[Array, "places n"], losses: Float[Array, " places"], count: int, apart: float
+) -> Int[Array, " count"]:
+    """Returns the `count` places of least loss of which no two stand nearer than `apart`; where there are fewer, the best of
+    the rest."""
+
+    def choose(left: Float[Array, " places"], _: None) -> tuple[Float[Array, " places"], Int[Array, ""]]:
+        best = jnp.argmin(left)
+        near = jnp.sum((places - places[best]) ** 2, -1) < apart**2
+        return jnp.where(near, left + FAR, left).at[best].add(FAR), best
+
+    return jax.lax.scan(choose, losses, None, length=count)[1]
+
+
+def in_blocks(function: Callable[[Float[Array, "k n"]], Array], places: Float[Array, "places n"]) -> Array:
+    """Returns a function of K places, (k, ...), for any number of them, a block at a time: one compilation, little memory."""
+    count = places.shape[0]
+    filled = np.minimum(np.arange(-(-count // BLOCK) * BLOCK), count - 1)  # the last place fills the last block up
+    found = jax.lax.map(function, places[filled].reshape(-1, BLOCK, places.shape[1]))
+    return found.reshape(-1, *found.shape[2:])[:count]
+
+
+def shrinking(first: float, last: float, steps: int) -> Float[np.ndarray, " steps"]:
+    """Returns blurs (metres) from a wide one to a narrow one, by equal factors."""
+    return np.geomspace(first, last, steps).astype(np.float32)
+
+
+def descend(loss: Loss, starts: Float[Array, "k n"], box: Float[Array, "2 n"], blurs: Float[AnyArray, " steps"]) -> Descended:
+    """Returns where gradient steps (Adam) lead to from K starts, each by itself, ordered by the loss of the last blur.
+
+    Pure and jittable. No step leaves the box.
+    """
+    low, high = jnp.asarray(box, starts.dtype)
+    adam = optax.scale_by_adam(*MOMENTS)
+    slopes = jax.value_and_grad(lambda places, blur: jnp.sum(loss(places, blur)))
+
+    def step(carry: tuple[Array, optax.OptState], blur: Float[Array, ""]) -> tuple[tuple[Array, optax.OptState], Array]:
+        places, memory = carry
+        _, slope = slopes(places, blur)
+        slope = jnp.where(jnp.isfinite(slope), slope, 0)
+        move, memory = adam.update(slope, memory)
+        return (jnp.clip(places - STEP * blur * move, low, high), memory), places
+
+    (places, _), _ = jax.lax.scan(step, (starts, adam.init(starts)), jnp.asarray(blurs, starts.dtype))
+    found = loss(places, jnp.asarray(blurs[-1], starts.dtype))
+    order = jnp.argsort(found)
+    return Descended(places[order], found[order])
+
+
+class _Slopes(NamedTuple):
+    """What Gauss-Newton knows of K places."""
+
+    place: Float[Array, "k n"]
+    loss: Float[Array, " k"]
+    slope: Float[Array, "k n"]
+    curvature: Float[Array, "k n n"]
+
+
+def gauss_newton(
+    residuals: Residuals, starts: Float[Array, "k n"], box: Float[Array, "2 n"], blurs: Float[AnyArray, " levels"], steps: int
+) -> Descended:
+    """Returns where damped Gauss-Newton steps (Levenberg, Marquardt) lead to from K starts, each by itself, ordered by the loss
+    under the last blur: `steps` of them under every blur.
+
+    Pure and jittable. No step leaves the box, or makes the loss larger. Slopes are differences over a share of the blur: four
+    calls a step in space, and less than reverse mode costs a field that traces paths; forward mode not every field knows.
+    """
+    low, high = jnp.asarray(box, starts.dtype)
+    k, n = starts.shape
+
+    def look(place: Float[Array, "k n"], blur: Float[Array, ""]) -> _Slopes:
+        inward = jnp.where(place + ASIDE * blur > high, -1.0, 1.0) * ASIDE * blur
+        aside = place[:, None] + jnp.concatenate([jnp.zeros((k, 1, n)), inward[:, :, None] * jnp.eye(n)], 1)
+        found = residuals(aside.reshape(-1, n), blur).reshape(k, n + 1, -1)
+        here, jacobian = found[:, 0], (found[:, 1:] - found[:, :1]) / inward[:, :, None]
+        slope = jnp.einsum("knm,km->kn", jacobian, here, precision=EXACT)
+        curvature = jnp.einsum("kim,kjm->kij", jacobian, jacobian, precision=EXACT)
+        return _Slopes(place, jnp.sum(here**2, -1), slope, curvature)
+
+    def step(carry: tuple[_Slopes, Float[Array, "k n"], Float[Array, " k"]], blur: Float[Array, ""]) -> Any:
+        best, place, damping = carry
+        tried = look(place, blur)
+        helped = tried.loss < best.loss  # not where it is no number
+        best = jax.tree.map(lambda a, b: jnp.where(helped.reshape(-1, *[1] * (a.ndim - 1)), a, b), tried, best)
+        damping = damping * jnp.where(helped, EASED, RAISED)
+        scale = damping * jnp.trace(best.curvature, axis1=-2, axis2=-1) / n + TINY
+        move = -jnp.linalg.solve(best.curvature + scale[:, None, None] * jnp.eye(n), best.slope[..., None])[..., 0]
+        length = jnp.linalg.norm(move, axis=-1, keepdims=True)
+        move = move * jnp.minimum(1, FARTHEST * blur / jnp.maximum(length, TINY))
+        return (best, jnp.clip(best.place + move, low, high), damping), None
+
+    def level(place: Float[Array, "k n"], blur: Float[Array, ""]) -> Any:
+        nothing = _Slopes(place, jnp.full(k, jnp.inf), jnp.zeros((k, n)), jnp.zeros((k, n, n)))
+        begin = nothing, place, jnp.full(k, DAMPING / EASED)
+        (best, _, _), _ = jax.lax.scan(step, begin, jnp.full(steps + 1, blur))
+        return best.place, best.loss
+
+    place, losses = jax.lax.scan(level, starts, jnp.asarray(blurs, starts.dtype))
+    order = jnp.argsort(losses[-1])
+    return Descended(place[order], losses[-1][order])
