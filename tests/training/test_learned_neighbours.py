@@ -13,7 +13,7 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.inference.neighbours import correct
 from wbgs_jax.training import neighbours as module
-from wbgs_jax.training.neighbours import FEWEST, MOST, Choice, choose, learn_neighbours
+from wbgs_jax.training.neighbours import FEWEST, MOST, Choice, choices, choose, learn_neighbours
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +74,19 @@ def test_the_smoothest_within_a_standard_error_of_the_best_is_chosen(rng):
     assert choose({harmful: tried[harmful]}, tx)[0] is None
     assert choose({best: np.array([1, -0.9, 0.2, -0.2])}, np.arange(4))[0] is None  # not sure
     assert choose({}, tx) == (None, 0.0)
+
+
+def test_of_many_spectra_residuals_are_not_tried(rng, monkeypatch):
+    dataset = hold_out_validation(tiny_dataset(24))
+    assert {choice.kind for choice in choices(dataset, dataset.train)} == {"residuals", "spectra"}
+    monkeypatch.setattr(module, "MOST_RESIDUALS", len(dataset.train) - 1)
+    assert {choice.kind for choice in choices(dataset, dataset.train)} == {"spectra"}
+
+
+def test_what_gains_little_is_not_worth_it():
+    few = Choice("spectra", 1.0, 1.0)
+    assert choose({few: np.full(8, 0.004)}, np.arange(8))[0] is None
+    assert choose({few: np.full(8, 0.006)}, np.arange(8))[0] == few
 
 
 def test_the_test_part_changes_nothing(field, params, rng):

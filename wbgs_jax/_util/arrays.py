@@ -6,6 +6,7 @@ import zlib
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,6 +14,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 
 T = TypeVar("T")
+SMALL = (np.uint8, np.float16)
+"""Types that stay as they are: pictures."""
 
 
 def write_tree(path: Path, tree: Any) -> None:
@@ -26,7 +29,7 @@ def write_tree(path: Path, tree: Any) -> None:
 
 
 def read_tree(path: Path, cls: type[T], without: str) -> T | None:
-    """Returns the pytree of a file, float32 whatever was written; None if there is no file.
+    """Returns the pytree of a file, in single precision or as small as it was written; None if there is no file.
 
     Raises:
         UserError: the file is damaged; `without` says what removing it means.
@@ -35,6 +38,10 @@ def read_tree(path: Path, cls: type[T], without: str) -> T | None:
         return None
     try:
         with np.load(path) as archive:
-            return cls(**{name: jnp.asarray(value, jnp.float32) for name, value in archive.items()})
+            return cls(**{name: _in_memory(value) for name, value in archive.items()})
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is damaged ({error}); remove it to {without}, or train again") from error
+
+
+def _in_memory(value: np.ndarray) -> jax.Array:
+    return jnp.asarray(value, value.dtype if value.dtype in SMALL else jnp.float32)

@@ -1,21 +1,24 @@
 """What known spectra nearby say about a spectrum, beside the field: simple kriging over the transmitter's position.
 
-    k(x) = exp(-|x - x_j| / L) at the same frequency,   a = (K + noise)^-1
-    residuals:  f(x) + w k(x) a (y - f)
-    spectra:    f(x) + w k(x) a (y - f(x))
+    k_j = exp(-|x - x_j| / L) over the nearest known transmitters at the same frequency,   a = (K + noise)^-1 k
+    residuals:  f(x) + w a . (y - f)
+    spectra:    f(x) + w a . (y - f(x))
 
 The first adds what the field left unexplained at its neighbours; the second moves towards their spectra themselves, which helps
 where the field has learned them by heart and their residuals are zero. Which, how far (L) and how much (w) is found on the
-validation part (training/neighbours.py), nothing at all included.
+validation part (training/neighbours.py), nothing at all included. Only the nearest are asked: the others are behind them, and
+a data set may hold thousands.
 """
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Float, Num
 
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
@@ -26,6 +29,10 @@ SAME_FREQUENCY = 1e-4
 """Relative difference of two frequencies that are the same."""
 SAME_PLACE_M = 1e-3
 """Distance of two receivers that are the same."""
+NEAREST = 32
+"""Known spectra that a query asks."""
+NOISE = 1e-2
+"""Variance of what is no function of the position, beside 1."""
 FILE = "neighbours.npz"
 
 
@@ -37,10 +44,12 @@ class Neighbours:
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
-    images: Float[Array, "m 90 360"]
-    """y - f, or y."""
-    weights: Float[Array, "m m"]
-    """w a."""
+    images: Num[Array, "m 90 360"]
+    """y - f in half precision, or 255 y in bytes."""
+    scale: Float[Array, ""]
+    """What the images are multiplied by."""
+    weight: Float[Array, ""]
+    """w."""
     own: Float[Array, ""]
     """Whether the field's own spectrum gives way: 1 for spectra, 0 for residuals."""
     length: Float[Array, ""]
@@ -65,13 +74,24 @@ def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query:
     """Returns a field's spectra with what the neighbours say; at frequencies or places far from all of them they stay."""
     if neighbours is None:
         return pas
-    known = neighbours.tx_position, neighbours.frequency_hz, neighbours.length
-    k = nearness(query.tx_position, query.frequency_hz, *known)
-    shares = jnp.matmul(k, neighbours.weights, precision=EXACT)
-    said = jnp.tensordot(shares, neighbours.images, 1, precision=EXACT)
-    corrected = pas + said - (neighbours.own * shares.sum(1))[:, None, None] * pas
-    heard = jnp.any(k > 0, 1)[:, None, None]
-    return jnp.where(heard, jnp.clip(corrected, 0, 1), pas)
+    asked = query.tx_position, query.frequency_hz, pas
+    return jax.lax.map(lambda one: _corrected(neighbours, *one), asked)
+
+
+def _corrected(
+    neighbours: Neighbours, position: Float[Array, "3"], frequency_hz: Float[Array, ""], own: Float[Array, "90 360"]
+) -> Float[Array, "90 360"]:
+    known, length = (neighbours.tx_position, neighbours.frequency_hz), neighbours.length
+    near = nearness(position[None], frequency_hz[None], *known, length)[0]
+    k, index = jax.lax.top_k(near, min(NEAREST, len(near)))
+    places = known[0][index], known[1][index]
+    kernel = nearness(*places, *places, length) + NOISE * jnp.eye(len(k))
+    # Conjugate gradients: exported for any platform, unlike a factorisation; as many steps as there are unknowns are enough.
+    shares, _ = cg(lambda v: jnp.matmul(kernel, v, precision=EXACT), k, tol=1e-7, maxiter=2 * NEAREST)
+    shares = neighbours.weight * shares
+    said = jnp.tensordot(shares, neighbours.scale * neighbours.images[index].astype(own.dtype), 1, precision=EXACT)
+    corrected = own + said - neighbours.own * jnp.sum(shares) * own
+    return jnp.where(k[0] > 0, jnp.clip(corrected, 0, 1), own)
 
 
 def for_receiver(learned: Any, receiver: Receiver) -> Any:
@@ -87,9 +107,8 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
 
 
 def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:
-    """Leaves them in a run folder, or nothing; images in half precision."""
-    half = neighbours and dataclasses.replace(neighbours, images=neighbours.images.astype(jnp.float16))
-    write_tree(folder / FILE, half)
+    """Leaves them in a run folder, or nothing."""
+    write_tree(folder / FILE, neighbours)
 
 
 def read_neighbours(folder: Path) -> Neighbours | None:

@@ -1,8 +1,8 @@
 """Whether known spectra nearby are to be asked beside a trained field, and how: found on the validation part, on the host.
 
-The training part is what is asked, at the transmitters of the validation part, which the field has not seen. If the best way
-gains more than a standard error, the smoothest one is kept that gains no less by more than a standard error (Breiman et al.
-1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
+The training part is what is asked, at transmitters of the validation part, which the field has not seen. If the best way
+surely gains something that is worth it, the smoothest one is kept that gains no less by more than a standard error (Breiman
+et al. 1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
 parts are asked.
 """
 
@@ -10,28 +10,35 @@ import itertools
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int, Num, UInt8
+from scipy.spatial import cKDTree
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
-from wbgs_jax.inference.neighbours import Neighbours, correct, nearness
+from wbgs_jax.inference.neighbours import Neighbours, correct
 from wbgs_jax.inference.predictor import predict_spectra
 from wbgs_jax.training.scores import standard_error
 
 Kind = Literal["residuals", "spectra"]
-FEWEST, MOST = 4, 1000
-"""Validation spectra below which nothing is decided; known spectra above which nothing is kept (130 kB each)."""
+FEWEST, MOST = 4, 20_000
+"""Validation spectra below which nothing is decided; known spectra above which nothing is kept (32 kB each)."""
+MOST_RESIDUALS = 1000
+"""Known spectra above which residuals are not tried: they are those of spectra that the field was trained on, and of many of
+them it leaves none."""
 SCORED = 60
 """Validation spectra that are looked at."""
 SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
 """Lengths that are tried, in median distances of a training transmitter to the next one."""
 WEIGHTS = (0.5, 1.0)
-NOISE = 1e-2
-"""Variance of what is no function of the position, beside 1."""
+SURE, WORTH = 2.0, 0.005
+"""Standard errors, and SSIM, that the best of them has to gain."""
+AT_ONCE = 1024
+"""Spectra that are made of snapshots."""
 
 
 @dataclass(frozen=True)
@@ -64,23 +71,56 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     links = training_links(dataset)
     if dataset.kind == "power" or dataset.n_receivers > 1 or len(dataset.validation) < FEWEST or len(links) > MOST:
         return Learned()
-    truth, predicted = np.asarray(dataset.pas(links)), predict_spectra(field, params, dataset, links)
-    known, asked = (np.flatnonzero(np.isin(links, part)) for part in (dataset.train, dataset.validation))
-    asked = np.random.default_rng(0).permutation(asked)[:SCORED]
-    alone = ssim(predicted[asked], truth[asked])
-    query = dataset.query(links[asked])
+    asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
+    truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
+    own = predict_spectra(field, params, dataset, asked)
+    alone, of_training = ssim(own, truth), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
-        neighbours = make_neighbours(choice, dataset, links[known], truth[known], predicted[known])
-        return ssim(np.asarray(correct(neighbours, jnp.asarray(predicted[asked]), query)), truth[asked]) - alone
+        return ssim(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query)), truth) - alone
 
-    tx = dataset.tx_index[links[asked]]
-    chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, links[known])}, tx)
+    chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
         return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
     line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
-    of_training = make_neighbours(chosen, dataset, links[known], truth[known], predicted[known])
-    return Learned(make_neighbours(chosen, dataset, links, truth, predicted), line, of_training)
+    return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
+
+
+_correct = jax.jit(correct)
+
+
+class _Known:
+    """Known links, whose images are made once for all choices."""
+
+    def __init__(self, field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " m"]):
+        self._made: dict[Kind, Num[Array, "m 90 360"]] = {}
+        self._asked, self.dataset, self.index = (field, params), dataset, index
+
+    def neighbours(self, choice: Choice) -> Neighbours:
+        """Returns them as neighbours."""
+        if choice.kind not in self._made:
+            spectra = eight_bit(self.dataset, self.index)
+            predicted = None if choice.kind == "spectra" else predict_spectra(*self._asked, self.dataset, self.index)
+            self._made[choice.kind] = images_of(choice.kind, spectra, predicted)
+        return make_neighbours(choice, self.dataset, self.index, self._made[choice.kind])
+
+
+def eight_bit(dataset: Dataset, index: Int[np.ndarray, " m"]) -> UInt8[np.ndarray, "m 90 360"]:
+    """Returns observed spectra in bytes, as published data have them."""
+    if dataset.images is not None:
+        return dataset.images[index]
+    blocks = [index[start : start + AT_ONCE] for start in range(0, len(index), AT_ONCE)]
+    return np.concatenate([np.asarray(255 * dataset.pas(block)).round().astype(np.uint8) for block in blocks])
+
+
+def images_of(
+    kind: Kind, spectra: UInt8[np.ndarray, "m 90 360"], predicted: Float[np.ndarray, "m 90 360"] | None
+) -> Num[Array, "m 90 360"]:
+    """Returns what is kept of known spectra: themselves in bytes, or what a field leaves of them in half precision."""
+    if kind == "spectra":
+        return jnp.asarray(spectra)
+    assert predicted is not None, "residuals are what predictions leave"
+    return jnp.asarray(spectra / 255 - predicted, jnp.float16)
 
 
 def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
@@ -88,9 +128,8 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
     positions = np.unique(dataset.tx_positions[known], axis=0)
     if len(positions) < 2:
         return []
-    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    spacing = float(np.median(np.sort(distances, axis=1)[:, 1]))
-    kinds: tuple[Kind, ...] = ("residuals", "spectra")
+    spacing = float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1]))
+    kinds: tuple[Kind, ...] = ("residuals", "spectra") if len(known) <= MOST_RESIDUALS else ("spectra",)
     return [Choice(kind, scale * spacing, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
 
 
@@ -103,7 +142,7 @@ def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarra
         return None, 0.0
     best = max(tried, key=lambda choice: float(tried[choice].mean()))
     gain, error = standard_error(tried[best], tx_index)
-    if gain <= error:
+    if gain <= max(SURE * error, WORTH):
         return None, gain
     enough = [choice for choice, gains in tried.items() if standard_error(gains, tx_index)[0] >= gain - error]
     smoothest = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", choice.length))
@@ -111,17 +150,17 @@ def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarra
 
 
 def make_neighbours(
-    choice: Choice,
-    dataset: Dataset,
-    index: Int[np.ndarray, " m"],
-    truth: Float[np.ndarray, "m 90 360"],
-    predicted: Float[np.ndarray, "m 90 360"],
+    choice: Choice, dataset: Dataset, index: Int[np.ndarray, " m"], images: Num[Array, "m 90 360"]
 ) -> Neighbours:
-    """Returns known links as neighbours."""
-    positions = jnp.asarray(dataset.tx_positions[index], jnp.float32)
-    frequencies = jnp.asarray(dataset.frequencies_hz[index], jnp.float32)
-    kernel = np.asarray(nearness(positions, frequencies, positions, frequencies, choice.length), np.float64)
-    weights = choice.weight * np.linalg.inv(kernel + NOISE * np.eye(len(index)))
+    """Returns known links, with `images_of` them, as neighbours."""
     spectra = choice.kind == "spectra"
-    arrays = truth if spectra else truth - predicted, weights, float(spectra), choice.length
-    return Neighbours(dataset.receiver().position, positions, frequencies, *(jnp.asarray(a, jnp.float32) for a in arrays))
+    return Neighbours(
+        rx_position=dataset.receiver().position,
+        tx_position=jnp.asarray(dataset.tx_positions[index], jnp.float32),
+        frequency_hz=jnp.asarray(dataset.frequencies_hz[index], jnp.float32),
+        images=images,
+        scale=jnp.float32(1 / 255 if spectra else 1.0),
+        weight=jnp.float32(choice.weight),
+        own=jnp.float32(spectra),
+        length=jnp.float32(choice.length),
+    )
