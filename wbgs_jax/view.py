@@ -9,7 +9,7 @@ wbgs-jax view --run RUN --html scene.html --tx x,y,z --ghz 28      a page that o
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -43,6 +43,8 @@ class Command:
     """Where the transmitter stands at first, x,y,z in metres."""
     ghz: float | None = None
     """The frequency at first."""
+    up: Literal["x", "y", "z"] = "z"
+    """Which axis of the data points upwards; the published layout has y."""
     html: Path | None = None
     """Write what is seen to this .html file, which opens without Python, and end."""
 
@@ -70,7 +72,8 @@ def start(command: Command) -> "Viewer":
     trained = at_receiver(trained, receiver, dataset)
     if command.ghz is not None:
         check_frequencies(trained, float(frequencies((command.ghz,))[0]))
-    viewer = Viewer(Asker(trained, dataset, receiver), command.host, command.port, command.html or Path(f"{dataset.name}.html"))
+    page = command.html or Path(f"{dataset.name}.html")
+    viewer = Viewer(Asker(trained, dataset, receiver), command.host, command.port, page, command.up)
     if command.ghz is not None:
         viewer.set_ghz(command.ghz)
     if command.tx:

@@ -65,15 +65,15 @@ class Latest:
 class Viewer:
     """A server that shows one trained field."""
 
-    def __init__(self, asker: Asker, host: str = "localhost", port: int = 8080, html: Path = Path("scene.html")):
+    def __init__(self, asker: Asker, host: str = "localhost", port: int = 8080, html: Path = Path("scene.html"), up: str = "z"):
         self.asker, self.html, self.updates, self._ended = asker, html, 0, False
         data = asker.dataset
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table; the command says one line
             self.server = viser.ViserServer(host=host, port=port, label="wbgs-jax", verbose=False)
-        self.view = SceneView(self.server, data, asker.receiver)
+        self.view = SceneView(self.server, data, asker.receiver, up)
         self.start = np.median(data.tx_positions, axis=0)
         self.start = data.tx_positions[np.argmin(np.linalg.norm(data.tx_positions - self.start, axis=1))]
-        top = float(self.view.box[1, 2])
+        top = float(self.view.box[1, self.view.up])
         self.controls, self.said = panel.make_panel(self.server, asker, self.start, self.view.heights(), top)
         self.answer: Answer | None = None
         self.chosen: int | None = None
@@ -158,7 +158,8 @@ class Viewer:
     def _look_in(self) -> None:
         low, high = self.view.box
         middle, size = (low + high) / 2, self.view.size
-        self.server.initial_camera.position = tuple(middle + np.array([-0.08, -0.45, 0.6]) * size)
+        aside = np.roll([-0.08, -0.45, 0.6], self.view.up - 2)
+        self.server.initial_camera.position = tuple(middle + aside * size)
         self.server.initial_camera.look_at = tuple(middle)
 
     def _connect(self) -> None:

@@ -8,6 +8,7 @@ import viser
 from jaxtyping import Float
 from viser import uplot
 
+from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.confidence import LEVEL
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
 from wbgs_jax.viewer import drawing
@@ -114,7 +115,7 @@ def make_panel(
         gaussians = _gaussians(gui, asker)
         save = gui.add_button("save as HTML")
     with tabs.add_tab("Map"):
-        map_controls = _map_controls(gui, asker, heights[0], top)
+        map_controls = _map_controls(gui, asker)
     with tabs.add_tab("Materials"):
         material = _material_controls(gui, asker)
     chosen = play, speed, cut, samples, paths, by_power, gaussians, map_controls, material, save
@@ -148,10 +149,12 @@ def _gaussians(gui: viser.GuiApi, asker: Asker) -> viser.GuiDropdownHandle | Non
     return gui.add_dropdown("Gaussians", ("off", "signal", "attenuation"))
 
 
-def _map_controls(gui: viser.GuiApi, asker: Asker, floor: float, top: float) -> MapControls:
+def _map_controls(gui: viser.GuiApi, asker: Asker) -> MapControls:
+    """Returns the controls of a map over a plane of constant z."""
     off, usual = not asker.knows_power, float(np.median(asker.dataset.tx_positions[:, 2]))
+    floor, top = map(float, DatasetScene(asker.dataset).box[:, 2])
     return MapControls(
-        gui.add_slider("height [m]", floor, top, step=0.05, initial_value=usual, disabled=off),
+        gui.add_slider("z [m]", floor, top, step=0.05, initial_value=usual, disabled=off),
         gui.add_number("step [m]", 0.25, min=0.05, max=2.0, step=0.05, disabled=off),
         gui.add_button("draw received power", disabled=off),
         gui.add_button("remove", disabled=off),

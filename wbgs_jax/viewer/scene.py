@@ -1,6 +1,7 @@
 """The three-dimensional part of the viewer: the room, the receiver and what it sees, paths, Gaussians, maps."""
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import viser
@@ -33,37 +34,34 @@ SPHERE = 8
 class SceneView:
     """Everything with a place in the room."""
 
-    def __init__(self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver):
-        self.scene, self.dataset = server.scene, dataset
+    def __init__(self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver, up: str = "z"):
+        self.scene, self.dataset, self.up = server.scene, dataset, "xyz".index(up)
         self.box = DatasetScene(dataset).box
         self.size = float(np.ptp(self.box, axis=0).max())
         self.rx = np.asarray(receiver.position, float)
         self._rotation = np.asarray(rotation_matrix(receiver.orientation), float)
-        self.scene.set_up_direction("+z")
+        self.scene.set_up_direction(np.eye(3)[self.up])
         self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
         self._draw_fixed(receiver)
         self.clip(*self.heights())
 
     def heights(self) -> tuple[float, float]:
         """Returns from and up to which height the room is drawn at first: without its ceiling."""
-        low, high = self.box[:, 2]
+        low, high = self.box[:, self.up]
         return float(low), float(high - CEILING_CUT * (high - low))
 
     def _draw_fixed(self, receiver: Receiver) -> None:
         low, high = self.box
-        corner = np.array([high[0] + AXES_AWAY_M, low[1], low[2]])
+        corner = low + np.array([high[0] - low[0] + AXES_AWAY_M, 0.0, 0.0])
         self.scene.add_frame("/axes", axes_length=1.0, axes_radius=0.02, position=corner)
         for axis, name in enumerate("xyz"):
             self.scene.add_label(f"/axes/{name}", f"{name}, 1 m", position=np.eye(3)[axis] * 1.1)
-        (width, height), under = (high - low)[:2], np.array([*((low + high)[:2] / 2), low[2] - 0.01])
-        self.scene.add_grid(
-            "/grid",
-            float(width),
-            float(height),
-            cell_size=1.0,
-            position=under,
-            fade_strength=0,
-        )
+        flat = [axis for axis in range(3) if axis != self.up]
+        width, height = (high - low)[flat]
+        under = (low + high) / 2
+        under[self.up] = low[self.up] - 0.01
+        plane: Literal["xy", "xz", "yz"] = ("yz", "xz", "xy")[self.up]
+        self.scene.add_grid("/grid", float(width), float(height), plane=plane, cell_size=1.0, position=under, fade_strength=0)
         orientation = np.asarray(receiver.orientation, float)
         self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012, position=self.rx, wxyz=orientation)
         self.scene.add_label("/receiver/name", "receiver", position=(0, 0, 0.12))
@@ -74,7 +72,7 @@ class SceneView:
 
     def clip(self, low: float, high: float) -> None:
         """Draws the surfaces whose middle lies between two heights (metres), a colour a material."""
-        shown = (self._centroids[:, 2] >= low) & (self._centroids[:, 2] <= high)
+        shown = (self._centroids[:, self.up] >= low) & (self._centroids[:, self.up] <= high)
         materials = self.dataset.materials
         number = np.zeros(len(shown), int) if materials is None else materials.material
         for material in np.unique(number):
