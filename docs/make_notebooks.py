@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,23 @@ def clean(notebook: Any) -> Any:
     for number, cell in enumerate(notebook.cells):
         cell.metadata, cell.id = {}, f"cell-{number}"
         if cell.cell_type == "code":
-            cell.outputs = [o for o in cell.outputs if o.output_type != "stream" or o.name in KEPT]
-            for output in cell.outputs:
-                output.pop("metadata", None) if output.output_type == "stream" else output.update(metadata={})
-                if "text" in output:
-                    output.text = CONTROL.sub("", output.text)
+            cell.outputs = list(merged(cell.outputs))
     return notebook
+
+
+def merged(outputs: list[Any]) -> Iterator[Any]:
+    """Gives the pictures of a cell, and what is printed between two of them as one text without colours."""
+    text = ""
+    for output in [*outputs, None]:
+        if output is not None and PICTURE not in output.get("data", {}):
+            kept = output.output_type != "stream" or output.name in KEPT
+            text += CONTROL.sub("", output.get("text") or output.get("data", {}).get("text/plain", "")) if kept else ""
+            continue
+        if text.strip():
+            yield nbformat.v4.new_output("stream", name="stdout", text="\n".join(map(str.rstrip, text.splitlines())) + "\n")
+        text = ""
+        if output is not None:
+            yield nbformat.v4.new_output("display_data", data={PICTURE: output.data[PICTURE]})
 
 
 def page(notebook: Any, name: str) -> tuple[str, dict[str, bytes]]:
@@ -56,7 +68,7 @@ def page(notebook: Any, name: str) -> tuple[str, dict[str, bytes]]:
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             parts.append(cell.source)
-            about = cell.source.strip().splitlines()[-1]
+            about = " ".join(cell.source.split("\n\n")[-1].split())  # the last paragraph is what a picture shows
             continue
         parts.append(f"```python\n{cell.source}\n```")
         for output in cell.outputs:
@@ -65,8 +77,8 @@ def page(notebook: Any, name: str) -> tuple[str, dict[str, bytes]]:
                 file = f"{name}_{len(pictures) + 1}.png"
                 pictures[file] = base64.b64decode(data[PICTURE])
                 parts.append(f"![{about}]({file})")
-            elif text := output.get("text") or data.get("text/plain"):
-                parts.append(f"```text\n{text.rstrip()}\n```")
+            else:
+                parts.append(f"```text\n{output.text.rstrip()}\n```")
     return "\n\n".join([*parts, f"The notebook itself: [{name}.ipynb]({name}.ipynb)."]) + "\n", pictures
 
 

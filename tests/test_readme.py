@@ -113,14 +113,20 @@ def experiments(names: dict) -> None:
     assert {row["scene"] for row in names["ours"]} >= set("123456")
 
 
+def viewer(names: dict) -> None:
+    assert names["answer"].pas.shape == (90, 360)
+
+
+ELSEWHERE = {"applications.md": ROOT / "tests" / "applications" / "test_guide.py"}
+"""Pages whose blocks another test runs."""
 HOLDS: dict[str, Callable[[dict], None]] = {
     f"{check.__name__}.md": check
-    for check in (inference, new_field, recipes, start, own_scene, measured, formats, interchange, experiments)
+    for check in (inference, new_field, recipes, start, own_scene, measured, formats, interchange, experiments, viewer)
 } | {"README.md": readme}
 """What must hold of the names that a page's blocks leave, by page."""
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if python_blocks(p)], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [p for p in PAGES if python_blocks(p) and p.name not in ELSEWHERE], ids=lambda p: p.name)
 def test_the_examples_of_a_page_run(page, folder, monkeypatch):
     monkeypatch.setattr(base, "_FIELDS", dict(base._FIELDS))
     monkeypatch.setenv("WBGS_DATA", str(folder / "released"))
@@ -130,6 +136,11 @@ def test_the_examples_of_a_page_run(page, folder, monkeypatch):
         exec(compile(code, f"{page.name}, block {number + 1}", "exec"), names)
     assert page.name in HOLDS, f"say in HOLDS what must hold after the blocks of {page.name}"
     HOLDS[page.name](names)
+
+
+@pytest.mark.parametrize("page", ELSEWHERE)
+def test_another_test_runs_the_examples_of_a_page(page):
+    assert page in ELSEWHERE[page].read_text()
 
 
 def test_the_page_of_public_names_is_todays():
