@@ -10,52 +10,22 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax._util.progress import CountProgress
-from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at, source_of, write_answer
-from wbgs_jax.inference.floor import Plane, ask_plane, cut_at, pieces, plane_over
-from wbgs_jax.inference.predictor import at_receiver
-from wbgs_jax.radio.channel import NOT_HEARD_DB
-from wbgs_jax.training.run_folder import load_trained
+
+# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
 
 MOST_PLACES = 1_000_000
-SHOWN = 6
-"""Frequencies in a picture."""
 SUFFIXES = {"out": ".npz", "picture": ".png"}
 What = Literal["power", "best-beam", "k-factor", "delay-spread", "angular-spread"]
-
-
-class Look(NamedTuple):
-    """How a quantity is drawn."""
-
-    name: str
-    """In the answer."""
-    label: str
-    scale: float = 1.0
-    """Drawn units in one of the answer's."""
-    colors: str = "viridis"
-
-
-LOOKS: dict[str, Look] = {
-    "power": Look("power_db", "received power [dB of the transmitted]"),
-    "best-beam": Look("best_beam", "azimuth of the best beam [deg]", colors="twilight"),
-    "k-factor": Look("k_factor_db", "K-factor [dB]"),
-    "delay-spread": Look("delay_spread_s", "r.m.s. delay spread [ns]", 1e9),
-    "angular-spread": Look("angular_spread_deg", "spread of the azimuth of arrival [deg]"),
-}
 
 
 @dataclass(frozen=True)
@@ -97,8 +67,11 @@ def check(command: Command) -> None:
         raise UserError(f"--height {command.height:g} is no height; give metres, such as --height 1.5")
 
 
-def plane_of(command: Command, dataset: Dataset) -> Plane:
-    """Returns the plane that is asked for; one that is empty or has too many places is a `UserError`."""
+def plane_of(command: Command, dataset: Any) -> Any:
+    """Returns the `floor.Plane` that is asked for; one that is empty or has too many places is a `UserError`."""
+    from wbgs_jax.data.surface import DatasetScene
+    from wbgs_jax.inference.floor import plane_over
+
     low, high = DatasetScene(dataset).box[:, :2]
     if command.area:
         try:
@@ -114,53 +87,13 @@ def plane_of(command: Command, dataset: Dataset) -> Plane:
     return plane_over(low, high, height, command.step)
 
 
-def draw(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]) -> Figure:
-    """Returns a figure of the first `SHOWN` maps with the walls that the plane cuts, and the receiver as a star."""
-    look, xs, ys = LOOKS[what], answer["xs"], answer["ys"]
-    values = _drawn(look, answer)[:SHOWN]
-    half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
-    extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
-    wide = extent[1] - extent[0] > extent[3] - extent[2]
-    rows, columns = (len(values), 1) if wide and len(values) < 4 else (-(-len(values) // 2), min(2, len(values)))
-    ratio = (extent[3] - extent[2]) / (extent[1] - extent[0])
-    figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
-    for i, axis in enumerate(axes.flat):
-        if i >= len(values):
-            axis.axis("off")
-            continue
-        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=look.colors, aspect="equal", **span)
-        axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
-        axis.plot(*rx[:2], "*", color="white", markeredgecolor="black", markersize=14)
-        axis.set(xlim=extent[:2], ylim=extent[2:])
-        axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
-    figure.supxlabel("x [m]", fontsize=9)
-    figure.supylabel("y [m]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{look.label}, transmitters {answer['height']:.3g} m high")
-    return figure
+def make_maps(command: Command) -> None:
+    """Asks, and writes what is wanted."""
+    from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at, source_of, write_answer
+    from wbgs_jax.inference.floor import ask_plane, cut_at, pieces
+    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.training.run_folder import load_trained
 
-
-def _drawn(look: Look, answer: dict[str, np.ndarray]) -> Float[np.ndarray, "freq ny nx"]:
-    values = answer[look.name]
-    if look.name == "best_beam":
-        return answer["beam_azimuth_deg"][values]
-    heard = values > NOT_HEARD_DB if look.name == "power_db" else np.ones(values.shape, bool)
-    drawn = look.scale * np.where(heard, values, np.nan)
-    return drawn[..., 0] if drawn.ndim > 3 else drawn
-
-
-def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
-    """Returns limits of the colours that leave out the extreme hundredths."""
-    low, high = np.nanquantile(values, [0.01, 0.99])
-    return {"vmin": float(low), "vmax": float(high)}
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Entry point."""
-    use_compilation_cache()
-    command = tyro.cli(Command, args=arguments, prog="wbgs-jax map")
-    check(command)
     frequencies_hz = frequencies(command.ghz)
     trained = load_trained(command.run)
     dataset = trained.dataset()
@@ -178,9 +111,19 @@ def main(arguments: list[str] | None = None) -> None:
         write_answer(command.out, answer, source_of(trained, dataset, receiver) | {"what": command.what})
         say(f"map: {command.out} ({size})")
     if command.picture:
+        from wbgs_jax.inference.map_pictures import draw_maps
+
         with atomic_write(command.picture) as stream:
-            draw(command.what, answer, cut_at(dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
+            draw_maps(command.what, answer, cut_at(dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
         say(f"picture: {command.picture}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax map")
+    check(command)
+    use_compilation_cache()
+    make_maps(command)
 
 
 if __name__ == "__main__":

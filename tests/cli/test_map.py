@@ -13,6 +13,7 @@ from untrained import make_coherent_run, make_run
 from wbgs_jax import map as map_command
 from wbgs_jax import predict as predict_command
 from wbgs_jax.inference.floor import BEST_BEAM, cut_at, pieces, plane_over
+from wbgs_jax.inference.map_pictures import LOOKS
 from wbgs_jax.radio.codebook import codebook
 
 AREA = ["--area", "-1,0:1,1", "--height", "1.3"]
@@ -36,7 +37,7 @@ def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
     assert result.code == 0, result.err
     with np.load(out) as found:
         xs, ys, height = found["xs"], found["ys"], float(found["height"])
-        name = map_command.LOOKS[what].name
+        name = LOOKS[what].name
         values = found[name]
         assert values.shape[:3] == (len(ghz), 2, 4) and height == 1.3
         np.testing.assert_allclose(xs, [-0.75, -0.25, 0.25, 0.75])
