@@ -1,0 +1,38 @@
+"""The notebooks of the documentation run, and their pages are those of their last run."""
+
+import sys
+from pathlib import Path
+
+import nbformat
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "docs" / "notebooks"
+NOTEBOOKS = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
+QUICKEST = "own_data"
+
+
+@pytest.fixture(scope="module")
+def tool():
+    sys.path.insert(0, str(FOLDER.parent))
+    try:
+        import make_notebooks
+    finally:
+        sys.path.pop(0)
+    return make_notebooks
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_outputs_and_pages_belong_to_the_cells(name, tool):
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "run docs/make_notebooks.py"
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < tool.LARGEST
+    markdown, pictures = tool.page(notebook, name)
+    assert (FOLDER / f"{name}.md").read_text() == markdown, "run docs/make_notebooks.py"
+    assert pictures and all((FOLDER / file).read_bytes() == content for file, content in pictures.items())
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == QUICKEST else pytest.mark.slow) for n in NOTEBOOKS])
+def test_notebooks_run(name, tool):
+    cells = tool.execute(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)).cells  # a cell that fails raises
+    assert any(tool.PICTURE in output.get("data", {}) for cell in cells if cell.cell_type == "code" for output in cell.outputs)
