@@ -11,6 +11,12 @@ runs/downstream/SCENE_txNUMBER (used where it is there, gone on with where it wa
 number by number; those that are there are not made again. docs/applications.md quotes them.
 """
 
+import os
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read with JAX; see wbgs_jax/_util/quiet.py
+
+# isort: split
+
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +68,7 @@ class Command:
     """Training transmitters; 0: all."""
     ghz: tuple[float, ...] = (1.0, 5.0, 24.25)
     """Frequencies at which transmitters are observed that are to be located."""
-    transmitters: int = 48
+    transmitters: int = 24
     """Held-out transmitters that are located."""
     step: float = 0.5
     """Metres between places of the grid."""

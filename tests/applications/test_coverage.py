@@ -9,7 +9,6 @@ from untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.coverage import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
-from wbgs_jax.types import make_query, make_receiver
 
 HZ = 2.4e9
 BOX = np.array([[0.5, -1.0, 0.9], [3.5, 1.0, 1.1]])
@@ -32,36 +31,48 @@ def mirror():
     return field_of([WALL], (0, 0, 1), conductivity=METAL, **SMALL)[:2]
 
 
-def test_in_free_space_powers_are_friis_and_two_users_are_served_best_from_half_way(air, rng):
-    users = np.array([[0.0, 0.0, 1.0], [4.0, 0.0, 1.0]])
-    powers = power_at_users(*air, users, HZ)
-    places = rng.uniform(*BOX, (5, 3)).astype(np.float32)
-    distances = np.linalg.norm(places[:, None] - users, axis=-1)
-    np.testing.assert_allclose(powers(places, 0.0), friis(distances), atol=0.02)
-    found = place_antenna(powers, BOX, soft_minimum, step=0.8, starts=2)
-    assert abs(found.place[0, 0] - 2) < 0.05 and abs(found.place[0, 1]) < 0.15
-    assert found.loss[0] <= -soft_minimum(powers(places, 0.02)).max() + 1e-3
+def mirrored(users, reflection):
+    """Powers in closed form: the direct wave and the one off the wall at y = 2, added as powers; dB."""
+    images = users * [1, -1, 1] + [0, 4, 0]
+
+    def powers(places, blur):
+        squares = [jnp.sum((places[:, None] - jnp.asarray(ends, jnp.float32)) ** 2, -1) for ends in (users, images)]
+        return 10 * jnp.log10(1 / squares[0] + reflection**2 / squares[1])
+
+    return powers
+
+
+def test_in_free_space_powers_and_their_slopes_are_those_of_friis(air, rng):
+    powers = power_at_users(*air, [0.0, 0.0, 1.0], HZ)
+    place = rng.uniform(*BOX, 3).astype(np.float32)
+    away = place - np.array([0.0, 0.0, 1.0])
+    distance = np.linalg.norm(away)
+    found, slope = jax.jit(jax.value_and_grad(lambda x: powers(x[None], 0.0)[0, 0]))(jnp.asarray(place))
+    assert float(found) == pytest.approx(friis(distance), abs=0.02)
+    np.testing.assert_allclose(slope, -20 / np.log(10) * away / distance**2, atol=0.02)
 
 
 def test_ends_may_be_exchanged_before_a_wall(mirror, rng):
     """What a user gets from the antenna is what the antenna gets from the user."""
     field, params = mirror
     antenna, user = rng.uniform(*BOX, (2, 3)).astype(np.float32)
-    there = power_at_users(field, params, user, HZ)(jnp.asarray(antenna[None]), 0.0)[0, 0]
-    back = field.render(
-        params, field.plan(params, make_receiver(antenna, element_positions=np.zeros((1, 3)))), make_query(user, HZ)
-    ).power_db[0]
+    there, back = (power_at_users(field, params, a, HZ)(b[None], 0.0)[0, 0] for a, b in ((user, antenna), (antenna, user)))
     assert float(there) == pytest.approx(float(back), abs=0.02)
 
 
-@pytest.mark.parametrize("aim", [mean_power, tenth_percentile])
-def test_before_a_wall_a_place_is_found_that_no_other_beats(mirror, rng, aim):
-    users = rng.uniform([0, -1, 0.5], [4, 1, 1.5], (2, 3))
-    powers = power_at_users(*mirror, users, HZ)
-    found = place_antenna(powers, BOX, aim, step=0.8, starts=2)
-    others = rng.uniform(*BOX, (64, 3)).astype(np.float32)
-    best = float(jnp.max(aim(jax.jit(powers)(others, 0.02))))
-    assert -float(found.loss[0]) > best - 0.3
+def test_two_users_in_free_space_are_served_best_from_half_way():
+    users = np.array([[0.0, 0.0, 1.0], [4.0, 0.0, 1.0]])
+    found = place_antenna(mirrored(users, 0.0), BOX, soft_minimum)
+    np.testing.assert_allclose(found.place[0], [2, 0, 1], atol=0.03)
+    assert (jnp.diff(found.loss) >= 0).all()
+
+
+@pytest.mark.parametrize("aim", [mean_power, tenth_percentile, soft_minimum])
+def test_before_a_wall_a_place_is_found_that_no_other_beats(rng, aim):
+    powers = mirrored(rng.uniform([0, -1, 0.0], [4, 1, 0.4], (7, 3)), 0.8)
+    found = place_antenna(powers, BOX, aim, starts=6)
+    others = jnp.asarray(rng.uniform(*BOX, (5_000, 3)), jnp.float32)
+    assert -float(found.loss[0]) > float(jnp.max(aim(powers(others, 0.02)))) - 0.1
     assert (found.place >= BOX[0] - 1e-6).all() and (found.place <= BOX[1] + 1e-6).all()
 
 
@@ -72,14 +83,6 @@ def test_the_soft_minimum_lies_between_minimum_and_mean(rng):
         assert (found >= power.min(-1) - 1e-3).all() and (found <= power.mean(-1) + 1e-1).all()
     np.testing.assert_allclose(soft_minimum(power, 0.01), power.min(-1), atol=0.05)
     np.testing.assert_allclose(soft_minimum(power, 1e4), power.mean(-1), atol=0.1)
-
-
-def test_slopes_of_the_power_are_differences(air):
-    powers = power_at_users(*air, [0.0, 0.0, 1.0], HZ)
-    place, aside = jnp.array([[2.0, 0.5, 1.0]]), jnp.array([[0.05, 0.0, 0.0]])
-    slope = jax.grad(lambda x: powers(x, 0.0)[0, 0])(place)[0, 0]
-    difference = (powers(place + aside, 0.0) - powers(place - aside, 0.0))[0, 0] / 0.1
-    assert float(slope) == pytest.approx(float(difference), rel=0.02)
 
 
 def test_a_field_that_holds_at_its_receiver_alone_places_nothing():

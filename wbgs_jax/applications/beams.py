@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from wbgs_jax.evaluation.beams import beam_loss_db
 from wbgs_jax.inference.maps import predict_many
@@ -11,6 +11,7 @@ from wbgs_jax.inference.predictor import Predictor
 from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.radio.codebook import ALIKE, codebook
 
+AnyArray = Array | np.ndarray
 RIGHT_DB = float(-20 * np.log10(1 - ALIKE))
 """A beam that hears so little less than the best one is as good (0.45 dB): a planar array hears alike ahead and behind."""
 
@@ -28,7 +29,7 @@ class BeamScores(NamedTuple):
     """... and the best of the first three."""
 
 
-def rank_beams(spectra: Float[np.ndarray, "n 90 360"], count: int = 3) -> Int[np.ndarray, "n count"]:
+def rank_beams(spectra: Float[AnyArray, "n 90 360"], count: int = 3) -> Int[np.ndarray, "n count"]:
     """Returns the beams of the codebook (0 to 63: four rings from the zenith down, sixteen azimuths from -180 degrees on) that
     hear most in every spectrum, the best one first."""
     heard = np.asarray(spectra).reshape(len(spectra), -1)[:, codebook()]
@@ -52,7 +53,7 @@ def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, cou
     return rank_beams(predict_many(predict, tx_positions, frequencies_hz), count)
 
 
-def score_beams(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> BeamScores:
+def score_beams(predicted: Float[AnyArray, "n 90 360"], truth: Float[AnyArray, "n 90 360"]) -> BeamScores:
     """Returns what the beams that predicted spectra rank highest are worth in true spectra."""
     first, three = (beam_loss_db(np.asarray(predicted), np.asarray(truth), tried) for tried in (1, 3))
     top1, top3 = (float(np.mean(loss <= RIGHT_DB)) for loss in (first, three))
