@@ -22,8 +22,7 @@ from jaxtyping import Float
 from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.inference.queries import parse_grid
-from wbgs_jax.predict import parse_array
+from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # What takes JAX is imported where it is wanted, as in predict.py.
 

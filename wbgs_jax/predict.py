@@ -12,7 +12,6 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -46,7 +45,7 @@ What = Literal[
 ]
 SCALARS = ("power", "beamforming-gain", "k-factor", "angular-spread", "delay-spread")
 """Of `What`: a number a query, or two."""
-MOST_POINTS, MOST_ELEMENTS = 4096, 1024
+MOST_POINTS = 4096
 BLOCK = 256
 """Queries that are asked, and kept, at a time."""
 SHOWN = 12
@@ -115,7 +114,7 @@ def check(command: Command) -> None:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
-    parse_array(command.tx_array)
+    asked.parse_array(command.tx_array)
     if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
         raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
     if command.what not in ("spectra", *SCALARS) and (command.picture or (asks and not command.out)):
@@ -154,15 +153,6 @@ def lowest_asked(command: Command, queries: Queries) -> float:
 
 def _velocities(command: Command) -> dict[str, str]:
     return {"tx": command.tx_velocity, "rx": command.rx_velocity}
-
-
-def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
-    """Returns rows and columns of "4x2"; anything else is a `UserError`."""
-    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
-    rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
-    if not 0 < rows * columns <= MOST_ELEMENTS:
-        raise UserError(f"{option} {word} is no array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
-    return rows, columns
 
 
 def _load(run: Path) -> tuple[Any, list[Path]]:
@@ -227,7 +217,7 @@ def answer(command: Command, queries: Queries) -> None:
     from wbgs_jax.inference.opened import Options, open_field
 
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
-    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parse_array(command.tx_array))
+    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, asked.parse_array(command.tx_array))
     if command.what == "spectra" and command.out is None:
         queries = queries.some(shown_rows(len(queries)))  # no others are drawn
     lowest = lowest_asked(command, queries)

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import io
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ AXES = "xyz"
 UNIT = "metres"
 SHOWN = 12
 """Queries in a picture."""
+MOST_ELEMENTS = 1024
+"""Of an array."""
 
 
 class Product(NamedTuple):
@@ -140,6 +143,15 @@ def parse_sweep(word: str) -> tuple[float, ...]:
         raise UserError(f"--sweep {word[:60]} has no two frequencies; give LOWEST:HIGHEST:NUMBER in GHz, such as 1:100:50")
     swept = np.geomspace(*ends, _number(number, "--sweep", word))
     return tuple(np.clip(swept, min(ends), max(ends)).tolist())  # rounding must not leave the band
+
+
+def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
+    """Returns rows and columns of "4x2"; anything else is a `UserError`."""
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
+    rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
+    if not 0 < rows * columns <= MOST_ELEMENTS:
+        raise UserError(f"{option} {word} is no array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
+    return rows, columns
 
 
 def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...]]:
