@@ -49,6 +49,7 @@ def signature(value: Any) -> str:
         text = str(inspect.signature(value))
     except (TypeError, ValueError):
         return ""
+    text = re.sub(r"<function (\w+) at 0x\w+>", r"\1", text)  # a default that is a function
     text = re.sub(r"(?:jaxtyping\.)?(\w+)\[(?:jax\.|jaxlib\._jax\.)?Array, ['\"]([^'\"]*)['\"]\]", r"\1(\2)", text)
     return re.sub(r"\b(?:wbgs_jax|typing|collections|jax|numpy|abc|pathlib)(?:\.\w+)*\.(\w+)", r"\1", text).replace("'", "")
 
