@@ -14,7 +14,6 @@ PATHS = "paths"
 TWO = ("azimuth", "zenith")
 """What pairs of numbers are of."""
 DIGITS = ".7g"
-LINES = 12
 
 
 def write(path: Path, what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> None:
@@ -72,22 +71,23 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
 
 
 def lines(what: str, answers: Answers, queries: Queries) -> list[str]:
-    """Returns how good the first answers are expected to be, where that is known: one line each."""
+    """Returns how good some of the answers are expected to be, where that is known: one line each."""
     from wbgs_jax.inference.bounds import link_words
     from wbgs_jax.inference.confidence import LEVEL
 
     if what == PATHS or not {"expected", "within_db"} & set(answers.names()):
         return []
-    positions, frequencies = (part[:LINES] for part in queries.flat())
+    shown = shown_rows(len(queries))
+    positions, frequencies = (part[shown] for part in queries.flat())
     where = [link_words(position, float(frequency)) for position, frequency in zip(positions, frequencies, strict=True)]
     sure = f"{100 * LEVEL:.0f} %"
     if what == "spectra":
-        expected = zip(where, answers.whole("expected", LINES), strict=True)
+        expected = zip(where, answers.rows("expected", shown), strict=True)
         return [
             f"{link}: expected SSIM {ssim:.2f}, {sure} between {low:.2f} and {min(high, 1):.2f}"
             for link, (ssim, low, high) in expected
         ]
-    columns = (answers.whole(name, LINES) for name in ("power_db", "expected_error_db", "within_db"))
+    columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))
     return [
         f"{link}: {power:.1f} dB of the transmitted power; expected {error:.1f} dB off, {sure} within {within:.1f} dB"
         for link, power, error, within in zip(where, *columns, strict=True)
