@@ -74,12 +74,6 @@ class Window:
         if kind == "error" and HARMLESS not in text:
             self.errors.append(text)
 
-    def dismiss(self, words: str) -> None:
-        """Closes a notice, if there is one."""
-        with contextlib.suppress(Exception):
-            notice = self.page.locator(".mantine-Notification-root", has_text=words)
-            notice.locator("button").click(timeout=3000)
-
     def tab(self, name: str) -> None:
         """Opens a tab of the panel."""
         self.page.get_by_role("tab", name=name).click()
@@ -111,7 +105,7 @@ def window(viewer: Viewer) -> Iterator[Window]:
         page.goto(f"http://localhost:{viewer.port}")
         page.wait_for_selector("canvas")
         page.get_by_text("what the receiver sees").wait_for()
-        opened.dismiss("Software WebGL rendering detected")
+        page.add_style_tag(content=".mantine-Notifications-root {display: none}")  # that there is no graphics card
         yield opened
         browser.close()
 
@@ -161,7 +155,7 @@ def take_pictures(viewer: Viewer, opened: Window, folder: Path) -> None:
     """Takes the three pictures of the documentation: paths, Gaussians, a map of power."""
     c = viewer.controls
     opened.tab("Paths")
-    opened.shot(folder / "viewer_paths.png")
+    opened.shot(folder / "viewer_paths.png", 2 * SETTLED_S)
     if c.gaussians is not None:
         viewer.set(c.gaussians, "signal")
         viewer.set(c.paths, 0)

@@ -62,6 +62,12 @@ def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"]
     return BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
 
 
+def linear(colors: UInt8[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
+    """Returns colours as viser 1.1 wants them of lines and of many equal meshes: in proportion to light, not to how bright it
+    looks (sRGB)."""
+    return (255 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
+
+
 def path_segments(points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, "k 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the straight pieces of paths (n, 2, 3), and the colours of both ends of each (n, 2, 3)."""
     pieces = np.stack([points[:, :-1], points[:, 1:]], 2)

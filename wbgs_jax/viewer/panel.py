@@ -109,7 +109,6 @@ def make_panel(
         paths = gui.add_slider("strongest", 0, MOST_PATHS, step=1, initial_value=min(30, most), disabled=not most)
         by_power = gui.add_dropdown("color", ("by power", "by reflections"), disabled=not most)
         path = gui.add_markdown("Click a ball on a path." if most else "This field knows no paths.")
-        impulse = _impulse_plot(gui) if most else None
     with tabs.add_tab("Room"):
         cut = gui.add_multi_slider("heights [m]", heights[0], top, step=0.01, initial_value=heights)
         gaussians = _gaussians(gui, asker)
@@ -118,6 +117,7 @@ def make_panel(
         map_controls = _map_controls(gui, asker)
     with tabs.add_tab("Materials"):
         material = _material_controls(gui, asker)
+    impulse = _impulse_plot(gui) if most else None  # in a tab that is hidden at first it would have no width
     chosen = play, speed, cut, samples, paths, by_power, gaussians, map_controls, material, save
     return Controls(position, octave, ghz, *chosen), Said(summary, spectrum, truth, truth_words, impulse, path)
 
@@ -138,7 +138,7 @@ def _impulse_plot(gui: viser.GuiApi) -> viser.GuiUplotHandle:
         (uplot.Series(label="delay [ns]"), uplot.Series(label="power [dB]", stroke="#0072b2", width=1.5)),
         scales={"x": uplot.Scale(time=False)},
         axes=(uplot.Axis(label="delay [ns]"), uplot.Axis(label="power [dB]")),
-        aspect=1.8,
+        aspect=1.7,
     )
 
 

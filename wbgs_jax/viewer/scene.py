@@ -125,7 +125,7 @@ class SceneView:
     def _draw_lines(
         self, name: str, points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, "k 3"], thickness: float
     ) -> None:
-        segments, ends = drawing.path_segments(points, colors)
+        segments, ends = drawing.path_segments(points, drawing.linear(colors))
         self.scene.add_line_segments(name, segments.astype(np.float32), ends, thickness=thickness, thickness_units="screen")
 
     def _draw_handles(
@@ -134,9 +134,16 @@ class SceneView:
         vertices, faces = _ball(HANDLE_RADIUS)
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1))
         handle = self.scene.add_batched_meshes_simple(
-            "/path_handles", vertices, faces, upright.astype(np.float32), places.astype(np.float32), batched_colors=colors,
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            "/path_handles",
+            vertices,
+            faces,
+            upright.astype(np.float32),
+            places.astype(np.float32),
+            batched_colors=drawing.linear(colors),
+            lod="off",  # simplified, its poles have no normals
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
         @handle.on_click
         def _(event: viser.SceneNodePointerEvent) -> None:
