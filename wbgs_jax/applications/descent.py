@@ -102,12 +102,12 @@ def descend(loss: Loss, starts: Float[Array, "k n"], box: Float[Array, "2 n"], b
     adam = optax.scale_by_adam(*MOMENTS)
     slopes = jax.value_and_grad(lambda places, blur: jnp.sum(loss(places, blur)))
 
-    def step(carry: tuple[Array, optax.OptState], blur: Float[Array, ""]) -> tuple[tuple[Array, optax.OptState], Array]:
+    def step(carry: tuple[Array, optax.OptState], blur: Float[Array, ""]) -> tuple[tuple[Array, optax.OptState], None]:
         places, memory = carry
         _, slope = slopes(places, blur)
         slope = jnp.where(jnp.isfinite(slope), slope, 0)
         move, memory = adam.update(slope, memory)
-        return (jnp.clip(places - STEP * blur * move, low, high), memory), places
+        return (jnp.clip(places - STEP * blur * move, low, high), memory), None
 
     (places, _), _ = jax.lax.scan(step, (starts, adam.init(starts)), jnp.asarray(blurs, starts.dtype))
     found = loss(places, jnp.asarray(blurs[-1], starts.dtype))
