@@ -100,11 +100,11 @@ experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE
 tables: setup  ## write docs/results.md and the marked numbers of all pages from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
 
-docs: setup  ## write docs/api.md from the docstrings
-	$(PY) docs/make_api.py
+docs: setup  ## write docs/api.md from the docstrings, and check the spelling
+	$(PY) docs/make_api.py && $(VENV)/bin/codespell
 
 site: setup  ## build the documentation site into site/; what is broken in it is an error
-	$(PY) -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet
 
 notebooks: setup  ## execute the notebooks of docs/notebooks
 	$(PY) docs/make_notebooks.py

@@ -4,6 +4,8 @@ wbgs-jax view --run RUN [--port 8080]
 wbgs-jax view --run RUN --html scene.html --tx x,y,z --ghz 28      a page that opens without Python
 """
 
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
 # isort: split
 
 import time
