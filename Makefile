@@ -1,5 +1,5 @@
 # One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
-# `make experiments`; PYTHON for set-up.
+# `make experiments`; PYTHON for set-up; QUICK of `make test`.
 SCENE  ?= 1
 FIELD  ?= hybrid
 PRESET ?= $(if $(CUDA),gpu,cpu)
@@ -55,8 +55,8 @@ measured: setup  ## learn and score a map of measured powers: make measured DATA
 	@test -n "$(DATA)" || { echo "error: give the folder with the readings: make measured DATA=folder" >&2; exit 2; }
 	$(VENV)/bin/wbgs-jax measure --data $(DATA) --out $(MEASURED)/scores.json --picture $(MEASURED)/maps.png
 
-test: setup  ## run the tests
-	$(PY) -m pytest -n 2 --dist worksteal -m "not slow"
+test: setup  ## run the tests; QUICK=1 leaves out long searches and trainings
+	$(PY) -m pytest -n 2 --dist worksteal -m "not slow$(if $(QUICK), and not heavy)"
 
 test-slow: setup  ## run the slow tests too, in fully optimised code: larger cases of what `make test` checks
 	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal

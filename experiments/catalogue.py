@@ -18,12 +18,11 @@ from experiments.series import (
     tuning,
     wave_choices,
 )
-from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3, today
+from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
     # In the order of importance, for the runner.
     "table1": table1,
-    "today": today,
     "headline": headline,
     "figure4": figure4,
     "figure6": figure6,

@@ -104,7 +104,9 @@ def _write_gaussians(
     query = make_query(positions, np.full(len(positions), frequency_hz))
     seen = trained.field.splatted(trained.params, plan, query)
     if seen is None:
-        raise UserError(f"the {trained.field.name} field of this run has no Gaussians; train --field wideband or hybrid")
+        raise UserError(
+            f"the {trained.field.name} field of this run has no Gaussians; train a field that has (docs/which_field.md)"
+        )
     signal, attenuation = (np.abs(np.asarray(values)).mean(1) for values in (seen.signal, seen.attenuation))
     brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], BRIGHT)), 1e-12)
     colours = colormaps[COLORS](np.clip(signal / brightest, 0, 1))[:, :3]

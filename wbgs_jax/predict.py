@@ -61,15 +61,15 @@ class Command:
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
     line: str = ""
-    """Transmitters on a line, FROM:TO:NUMBER, such as 0,0,1.5:4,0,1.5:41."""
+    """Transmitters on a line: 0,0,1.5:4,0,1.5:41 (from:to:number)."""
     grid: str = ""
-    """Transmitters on a grid, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
+    """Transmitters on a grid: -2,-2,1.5:2,2,1.5:9x9x1."""
     ghz: tuple[float, ...] = ()
-    """Frequencies, 1 to 100, and from 0.3 for fields with paths; every transmitter is asked at every one of them."""
+    """Frequencies, 1 to 100 (from 0.3 with paths), all for each."""
     sweep: str = ""
-    """Frequencies, LOWEST:HIGHEST:NUMBER, such as 1:100:50, each the same factor above the last."""
+    """Frequencies at equal ratios: 1:100:50."""
     queries: Path | None = None
-    """Instead of all these a CSV file with the columns x,y,z,ghz, a row a query."""
+    """A CSV file instead, columns x,y,z,ghz."""
     rx: str = ""
     """Another receiver than the first of the data: the number of one; x,y,z in metres; or x,y,z,w,i,j,k with the quaternion
     that turns its array into the world frame. Only fields with paths know places that the data do not have."""

@@ -63,6 +63,7 @@ def test_errors_are_for_people(tmp_path, rng, options, says):
     assert_error_for_people(call(main, *(str(data) if word == "DATA" else word for word in options)), says)
 
 
+@pytest.mark.heavy
 def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
     done = call(main, "--data", shared_data("ble_flat"), "--out", tmp_path / "scores.json")
     assert done.code == 0, done.err

@@ -46,6 +46,7 @@ def parts(run, params, index):
     ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("shares", [(0.0, 0.0), (0.3, 0.8), (1.0, 1.0)])
 def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
     params, index = trusting(run.state.params, *shares), run.dataset.validation
@@ -110,6 +111,7 @@ def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
         result.field.anywhere(result.params)
 
 
+@pytest.mark.heavy
 def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
     """Its host controls act on their parts, and a run that stopped half way ends where one goes that did not."""
     config = RunConfig("box", "hybrid", "smoke", 0, None, SETTINGS)
@@ -134,6 +136,7 @@ def test_the_presets_have_both_fields_settings():
         HybridField.check(dataclasses.replace(settings.field, wave=phase_blind))
 
 
+@pytest.mark.heavy
 def test_of_several_receivers_both_fields_answer_for_each(tmp_path):
     """One set of materials, one share: what is said at a receiver is what both fields say there."""
     dataset = hold_out_validation(tiny_dataset(12, n_rx=3))

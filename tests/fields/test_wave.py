@@ -319,6 +319,20 @@ def test_a_link_without_any_path_has_gradients(coherent):
         assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB
 
 
+def test_a_transmitter_in_the_receivers_place_has_no_line_of_sight():
+    """What is left is finite, and so are its gradients."""
+    field, params, plan = field_of(room(), RX, mirror_areas=(0.0,), **SMALL)
+
+    @jax.jit
+    def power(params, position):
+        return field.render(params, plan, make_query(position[None], jnp.full(1, 28e9))).power_db[0]
+
+    here = plan.receiver.position
+    value, gradient = jax.value_and_grad(power, argnums=(0, 1))(params, here)
+    assert np.isfinite(value) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert value < power(params, here + jnp.array([0.05, 0.0, 0.0])) - 10  # five centimetres away it is heard directly
+
+
 def test_the_pattern_is_the_receivers():
     """What TR 38.901's element gains in the direction of sight, 8 dB, is in the received power."""
     field = wave.make_field(mesh_of(room()[0]), WaveConfig(mirror_areas=(), **SMALL))

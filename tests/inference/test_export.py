@@ -211,6 +211,7 @@ def test_an_export_that_fails_leaves_nothing(trained, tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("name", "unit"), [("hybrid", "wavelengths"), ("wave", "metres")])
 def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
     coherent = WaveConfig(specular_tried=32, specular_kept=8, diffracted_tried=32, diffracted_kept=8)

@@ -104,6 +104,7 @@ def test_gradients_point_to_more_power(rng):
     np.testing.assert_allclose(more - less, 4e-2 * jnp.linalg.norm(slope(away)), rtol=0.05)
 
 
+@pytest.mark.heavy
 def test_walls_tell_about_rooms_that_were_not_measured(rng):
     tx = places(rng, 400)
     found = {score.held_out: score for score in scores(readings(tx, powers(tx, 2.0, rng)), WALLS)}

@@ -1,5 +1,6 @@
 """Antennas against closed forms: the patterns' own, and what turning an antenna does."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -60,3 +61,20 @@ def test_a_half_wave_dipole_is_nearly_a_power_of_the_short_one():
     field = antenna_field(upright(jnp.array(pattern_exponents("hw_dipole"))), k)
     error_db = 20 * np.log10(np.linalg.norm(field, axis=-1) / exact)
     assert np.abs(error_db[20 * np.log10(exact) > -10]).max() < 0.45
+
+
+@pytest.mark.parametrize("exponents", [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.3, 0.4)])
+def test_straight_up_and_down_antennas_have_gradients(exponents):
+    """A transmitter straight above a receiver must not end a training."""
+
+    def strength(orientation, exponents, k):
+        field = antenna_field(Antenna(orientation, exponents), k)
+        return jnp.sum(field * jnp.array([0.3, -0.2, 0.7]))
+
+    for height in (1.0, -1.0):
+        k = jnp.array([0.0, 0.0, height])
+        given = jnp.array([1.0, 0, 0, 0]), jnp.array(exponents), k
+        for gradient in jax.grad(strength, argnums=(0, 1, 2))(*given):
+            assert np.isfinite(gradient).all()
+    beside = jnp.array([1e-4, 0.0, 1.0])
+    np.testing.assert_allclose(element_gain(beside), element_gain(jnp.array([0.0, 0.0, 1.0])), rtol=1e-3)

@@ -36,6 +36,7 @@ def searched(run, known_elements=False, **antennas):
     return search_antennas(run.state.params, score, tx, SETTINGS.search, known_elements)
 
 
+@pytest.mark.heavy
 def test_it_names_the_antennas_of_both_ends(untrained, rng):
     candidates = antenna_candidates()
     directional = [name for name in candidates if name.startswith("tr38901")]

@@ -66,6 +66,7 @@ def run_on(untrained, tmp_path):
     return make
 
 
+@pytest.mark.heavy
 def test_it_names_the_materials(run_on, tmp_path, rng):
     """All seven at random, from 1 and 94 GHz alone, all starting alike."""
     names = rng.choice([name for name in ITU_MATERIALS if name != "metal"], len(PARTS), replace=False)
@@ -167,6 +168,7 @@ def test_known_thickness_stays_where_it_is_in_training(run_on):
     assert (run.state.params.materials.log_conductivity != np.log(SETTINGS.field.conductivity)).any()
 
 
+@pytest.mark.heavy
 def test_of_powers_alone_the_unknown_gain_is_found(run_on, tmp_path, rng):
     """Nobody has said what was transmitted; what reflects well and what does not is told by powers."""
     run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS)), float(rng.uniform(-90, 40))

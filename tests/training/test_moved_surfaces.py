@@ -52,6 +52,7 @@ def learned(truth, parts, folder):
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
 
 
+@pytest.mark.heavy
 def test_walls_come_back(truth, tmp_path):
     rng = np.random.default_rng(5)
     shifts = rng.normal(0, 0.006, (len(PARTS), 3))
@@ -108,6 +109,7 @@ def test_right_surfaces_stay(truth, tmp_path):
         assert place.field is run.field
 
 
+@pytest.mark.heavy
 def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0])
     still = run.field.motion
@@ -137,6 +139,7 @@ def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, hig
         assert report.uncertain < report.certain
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("metres", [0.0, 0.01])
 def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_it(truth, metres, tmp_path, rng, monkeypatch):
     run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []

@@ -30,6 +30,7 @@ def other_materials(params, rng):
     return dataclasses.replace(params, materials=dataclasses.replace(materials, log_susceptibility=moved))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("compared", ["snapshots", "covariances", "spectra"])
 def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
     params = run.state.params

@@ -53,6 +53,7 @@ def told(room, truth, field=None):
     return Told(field or room.field, room.cache, data, np.asarray(room.dataset.train))
 
 
+@pytest.mark.heavy
 def test_they_are_found_with_the_materials(room, rng):
     names = rng.choice(["concrete", "brick", "plasterboard", "wood", "glass"], len(PARTS))
     metres = rng.uniform(0.01, 0.3, len(PARTS))
@@ -69,6 +70,7 @@ def test_they_are_found_with_the_materials(room, rng):
     assert set(report.thickness_mm) == set(range(len(PARTS)))
 
 
+@pytest.mark.heavy
 def test_what_fits_stays(room, rng):
     """Walls as thick as is usual, which is where the search begins."""
     names = rng.choice(["concrete", "brick", "plasterboard", "wood"], len(PARTS))

@@ -159,6 +159,7 @@ def test_a_page_opens_without_python(tmp_path):
     assert text.lstrip().lower().startswith("<!doctype html") and "__VISER_EMBED_DATA__" in text
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(chromium() is None, reason="there is no Chromium; apt-get install chromium brings it on Debian and Ubuntu")
 def test_a_drag_in_a_browser_changes_the_picture(tmp_path):
     viewer = view.start(view.Command(make_coherent_run(tmp_path / "box"), port=0))

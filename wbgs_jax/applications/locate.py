@@ -33,7 +33,7 @@ BLUR = 0.5
 """The blur of the grid, relative to its step."""
 NARROWEST_M = 0.06
 """The last blur, metres. Below it some wrong place fits the fringes of a field that is not right to millimetres better than the
-right one: with a last blur of 0.5 cm validation transmitters of scene 4 were located no better, at more cost."""
+right one: with a last blur of 0.5 cm transmitters of scene 4's training part were located no better, at more cost."""
 LEVELS, STEPS = 3, 3
 """Blurs down to that, by equal factors, and steps under each."""
 FAINTEST = 1e-12

@@ -155,8 +155,9 @@ def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
 
 
 def _direct(tx, rx) -> Candidates:
-    """Returns the line of sight as a candidate."""
-    return _candidates(tx, rx, [], 1 / jnp.maximum(jnp.linalg.norm(tx - rx), NEAR), 1)
+    """Returns the line of sight as a candidate; there is none to a transmitter in the receiver's own place."""
+    distance = jnp.linalg.norm(jax.lax.stop_gradient(tx - rx))
+    return _candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
 
 
 def _mirrored(tx, search: Search, chains: Chains) -> Candidates:

@@ -20,6 +20,8 @@ PATTERN_EXPONENTS = {
     "hw_dipole": (0.0, 1.2),  # within 0.41 dB wherever the half-wave dipole is above -10 dB
 }
 """Exponents of the directional element and of the dipole by the name of a pattern."""
+POLE = 1e-12
+"""Squared sine of the zenith angle below which a direction is straight up or down."""
 
 
 @pytree
@@ -52,10 +54,15 @@ def antenna_field(antenna: Antenna, direction: Float[Array, "*n 3"]) -> Float[Ar
 
 
 def element_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-    """Returns the amplitude gain of the element of 3GPP TR 38.901 (table 7.3-1) in unit directions: boresight +x, 8 dBi."""
+    """Returns the amplitude gain of the element of 3GPP TR 38.901 (table 7.3-1) in unit directions: boresight +x, 8 dBi.
+
+    Straight up and down, where there is no azimuth, it is that of azimuth 0, and so is its gradient.
+    """
     x, y, z = jnp.moveaxis(direction, -1, 0)
-    zenith = jnp.degrees(jnp.arccos(jnp.clip(z, -1, 1)))
-    azimuth = jnp.degrees(jnp.arctan2(y, x))
+    squared = x * x + y * y
+    pole = squared < POLE
+    zenith = jnp.degrees(jnp.arctan2(jnp.sqrt(jnp.maximum(squared, POLE)), z))
+    azimuth = jnp.degrees(jnp.arctan2(jnp.where(pole, 0, y), jnp.where(pole, 1, x)))
     vertical = jnp.minimum(12 * ((zenith - 90) / 65) ** 2, 30.0)
     horizontal = jnp.minimum(12 * (azimuth / 65) ** 2, 30.0)
     return 10 ** ((8 - jnp.minimum(vertical + horizontal, 30.0)) / 20)
@@ -64,11 +71,11 @@ def element_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
 def dipole_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     """Returns the amplitude gain of a short dipole along z in unit directions, sqrt(1.5) sin(zenith): 1.8 dBi."""
     x, y, _ = jnp.moveaxis(direction, -1, 0)
-    return jnp.sqrt(1.5 * jnp.maximum(x * x + y * y, 1e-12))
+    return jnp.sqrt(1.5 * jnp.maximum(x * x + y * y, POLE))
 
 
 def zenith_vector(direction: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Returns the unit vector theta-hat of a unit direction: the electric field of a vertically polarised antenna."""
     x, y, z = jnp.moveaxis(direction, -1, 0)
-    horizontal = jnp.sqrt(jnp.maximum(x * x + y * y, 1e-12))
+    horizontal = jnp.sqrt(jnp.maximum(x * x + y * y, POLE))
     return jnp.stack([z * x / horizontal, z * y / horizontal, -horizontal], -1)
