@@ -171,8 +171,9 @@ def main(arguments: list[str] | None = None) -> None:
 def opening_lines(folder: Path, config: RunConfig, done: int) -> list[str]:
     """Returns how long it will take, and where the results go."""
     steps = config.settings.optim.steps
-    share = max(steps - done, 0) / get_field(config.field).presets[config.preset].optim.steps
-    seconds = expected_seconds(config.field, config.preset, share)
+    field = get_field(config.field)
+    share = max(steps - done, 0) / field.presets[config.preset].optim.steps
+    seconds = expected_seconds(field, config.preset, share)
     lasts = "how long it takes stands in the lines below" if seconds is None else f"{duration_words(seconds)} on this machine"
     return [
         f"{steps - done} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",

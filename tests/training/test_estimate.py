@@ -2,16 +2,18 @@
 
 import pytest
 
+from wbgs_jax.fields import Field, default_field, get_field
 from wbgs_jax.training import estimate
 from wbgs_jax.training.estimate import duration_words, expected_seconds
 
 
 def test_a_slower_machine_takes_longer(monkeypatch):
     monkeypatch.setattr(estimate, "_probe", lambda: 2 * estimate.PROBE_SECONDS)
-    whole = expected_seconds("hybrid", "cpu")
-    assert whole == 2 * estimate.SECONDS["hybrid", "cpu"]
-    assert expected_seconds("hybrid", "cpu", 0.25) == whole / 4
-    assert expected_seconds("of one's own", "cpu") is None
+    field = get_field(default_field())
+    whole = expected_seconds(field, "cpu")
+    assert whole == 2 * field.seconds["cpu"]
+    assert expected_seconds(field, "cpu", 0.25) == whole / 4
+    assert expected_seconds(Field, "cpu") is None and expected_seconds(field, "gpu") is None
 
 
 def test_the_probe_takes_a_moment():

@@ -86,6 +86,7 @@ class HybridField(Field):
     presets: ClassVar = {name: _preset(name) for name in WaveField.presets}
     gives: ClassVar = WaveField.gives
     controls: ClassVar = ("wideband.density", "wave.search")
+    seconds: ClassVar = {"cpu": 700.0, "smoke": 60.0}
 
     @classmethod
     def check(cls, config: HybridConfig) -> None:

@@ -93,6 +93,7 @@ class WaveField(Field):
     presets: ClassVar = PRESETS
     gives: ClassVar = ("pas", "snapshots", "power", "paths")
     controls: ClassVar = ("search",)
+    seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
 
     @classmethod
     def check(cls, config: WaveConfig) -> None:

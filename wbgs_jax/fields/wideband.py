@@ -86,6 +86,7 @@ class WidebandField(Field):
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
     gives: ClassVar = ("pas", "power")
     controls: ClassVar = ("density",)
+    seconds: ClassVar = {"cpu": 180.0, "smoke": 30.0}
 
     @classmethod
     def check(cls, config: WidebandConfig) -> None:

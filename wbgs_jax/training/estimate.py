@@ -1,4 +1,5 @@
-"""About how long a training will take on this machine: what it takes on a known one, and how this one compares."""
+"""About how long a training will take on this machine: what it takes on a known one (`Field.seconds`), and how this one
+compares."""
 
 import time
 
@@ -6,29 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-SECONDS = {
-    ("hybrid", "cpu"): 700.0,
-    ("wave", "cpu"): 170.0,
-    ("wideband", "cpu"): 180.0,
-    ("hybrid", "smoke"): 60.0,
-    ("wave", "smoke"): 35.0,
-    ("wideband", "smoke"): 30.0,
-}
-"""Of trainings on two cores of an AMD EPYC, by field and preset, search and compilation included (scenes 1 to 6)."""
+from wbgs_jax.fields import Field
+
 PROBE_SECONDS = 0.0095
-"""What `_probe` takes there."""
+"""What `_probe` takes there: two cores of an AMD EPYC."""
 SIZE, PRODUCTS, TRIALS = 512, 8, 15
 
 
-def expected_seconds(field: str, preset: str, share: float = 1.0) -> float | None:
+def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> float | None:
     """Returns about how long a training takes here; None where no training like it has been timed.
 
     Args:
-        field: by name.
+        field: what is trained.
         preset: by name.
         share: of the preset's steps that are still to do.
     """
-    known = SECONDS.get((field, preset))
+    known = field.seconds.get(preset)
     return None if known is None or jax.default_backend() != "cpu" else known * share * _probe() / PROBE_SECONDS
 
 
