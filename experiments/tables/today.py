@@ -23,8 +23,8 @@ CURVE = {
 }
 """What is on the curve: a field, and its variants with one, five and ten times the spectra."""
 NOTE = (
-    "The presets that a user gets now, with 1,000 Gaussians and 8,000 spectra seen (1,000 steps of 8). Optimisers, rates, layers and"
-    " loss were chosen on a validation part of the training transmitters; inputs and octaves are older, and were chosen on"
+    "The presets that a user gets now, with 1,000 Gaussians and 8,000 spectra seen (1,000 steps of 8). Optimisers, rates,"
+    " layers and loss were chosen on a validation part of the training transmitters; inputs and octaves are older, chosen on"
     " held-out transmitters of scenes 1 and 4. *Pooled* is one WRF-GS model for all frequencies that is told none of them."
     " Averages over ten frequencies of the medians over transmitters; in parentheses the paper's gain. The paired test is"
     " Wilcoxon's, over held-out transmitters."
