@@ -214,7 +214,7 @@ class Viewer:
         if paths is None or not len(paths.power_db):
             return
         if self.said.impulse is not None:
-            delay, power = drawing.stems(paths.length / 0.299792458, paths.power_db)
+            delay, power = drawing.stems(paths.delay_ns, paths.power_db)
             self.said.impulse.data = (delay, power)
         if self.chosen is not None and self.chosen < len(paths.power_db):
             self.said.path.content = panel.path_words(paths, self.chosen)

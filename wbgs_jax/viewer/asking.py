@@ -19,9 +19,10 @@ from wbgs_jax.inference.answers import doubts
 from wbgs_jax.inference.confidence import Expected, expected_ssim
 from wbgs_jax.inference.floor import Plane, ask_plane, pieces
 from wbgs_jax.inference.links import describe_interactions, names_of
-from wbgs_jax.inference.neighbours import correct, for_receiver
+from wbgs_jax.inference.neighbours import SAME_PLACE_M, correct, for_receiver
 from wbgs_jax.inference.predictor import Trained, check_power
-from wbgs_jax.radio.channel import Arrivals, decibels
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
+from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
 from wbgs_jax.types import Query, Receiver, make_query
 
 
@@ -41,6 +42,13 @@ class PathList:
     """Types, as `propagation.paths` has them."""
     words: tuple[str, ...]
     """What each path meets: "off concrete, through glass"."""
+    k_factor_db: float
+    delay_spread_s: float
+
+    @property
+    def delay_ns(self) -> Float[np.ndarray, " k"]:
+        """Delays, nanoseconds."""
+        return self.length / SPEED_OF_LIGHT * 1e9
 
 
 @dataclass(frozen=True)
@@ -105,13 +113,13 @@ class Asker:
         query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
         learned = self._neighbours, self._confidence
         found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
-        pas, power, expected, arrived = jax.tree.map(np.asarray, found)
+        pas, power, expected, paths = jax.tree.map(np.asarray, found)
         unsure = doubts(self.dataset, np.asarray(self.receiver.position), np.asarray(position)[None], np.array([frequency_hz]))
         return Answer(
             pas,
             float(power) if power is not None and self.knows_power else None,
             None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
-            None if arrived is None else self._listed(arrived),
+            None if paths is None else self._listed(*paths),
             tuple(unsure),
         )
 
@@ -173,7 +181,7 @@ class Asker:
             return np.zeros(0, int)
         places = np.asarray(self.dataset.receivers.position)
         away = np.linalg.norm(places - np.asarray(self.receiver.position), axis=1)
-        return np.flatnonzero((self.dataset.receiver_index == np.argmin(away)) & (away.min() < 1e-3))
+        return np.flatnonzero((self.dataset.receiver_index == np.argmin(away)) & (away.min() < SAME_PLACE_M))
 
     def _sample(self, link: int) -> Sample:
         data, index = self.dataset, np.array([link])
@@ -184,7 +192,7 @@ class Asker:
         part = next((name for name, links in parts.items() if link in links), "other")
         return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said[None], truth)[0]))
 
-    def _listed(self, arrived: Arrivals) -> PathList:
+    def _listed(self, arrived: Arrivals, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
         power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
         order = np.argsort(-power, kind="stable")
         order = order[np.abs(arrived.amplitude[order]) > 0]
@@ -193,18 +201,22 @@ class Asker:
         words = tuple(describe_interactions(*met, names) for met in zip(kinds, materials, strict=True))
         points = np.asarray(arrived.points)[order]
         amplitude, length, direction = (np.asarray(a)[order] for a in (arrived.amplitude, arrived.length, arrived.direction))
-        return PathList(points, amplitude, power[order], length, direction, kinds, words)
+        return PathList(points, amplitude, power[order], length, direction, kinds, words, float(k_factor), float(spread))
 
 
 def _answer(
     field: Field, params: Any, plan: Any, query: Query, neighbours: Any, confidence: Any, with_paths: bool
 ) -> tuple[Any, Any, Any, Any]:
-    """Returns spectrum, power, expected SSIM and arrivals of a batch of one query, without its axis."""
+    """Returns spectrum, power, expected SSIM, and arrivals with K-factor and delay spread, of a batch of one query, without its
+    axis."""
     seen = field.render(params, plan, query)
     pas = correct(neighbours, seen.pas, query)
     expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
-    arrived = field.arrivals(params, plan, query) if with_paths else None
-    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, arrived))
+    paths = None
+    if with_paths:
+        arrived = field.arrivals(params, plan, query)
+        paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
+    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, paths))
 
 
 _ask = jax.jit(_answer, static_argnames="with_paths")

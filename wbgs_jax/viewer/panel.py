@@ -197,11 +197,8 @@ def summary_words(answer: Answer, frequency_hz: float) -> str:
 
 def channel_words(paths: PathList) -> str:
     """Returns K-factor and delay spread."""
-    power = np.abs(paths.amplitude) ** 2
-    weight, delay = power / power.sum(), paths.length / 0.299792458
-    others = max(power.sum() - power.max(), 1e-30)
-    spread = float(np.sqrt(max(weight @ delay**2 - (weight @ delay) ** 2, 0)))
-    return f"K-factor {10 * np.log10(power.max() / others):.1f} dB · delay spread {spread:.1f} ns · {len(power)} paths"
+    spread = f"delay spread {1e9 * paths.delay_spread_s:.1f} ns"
+    return f"K-factor {paths.k_factor_db:.1f} dB · {spread} · {len(paths.power_db)} paths"
 
 
 def sample_words(sample: Sample | None) -> str:
@@ -219,7 +216,7 @@ def path_words(paths: PathList, number: int) -> str:
     return "  \n".join(
         [
             f"**{paths.words[number]}**",
-            f"{paths.power_db[number]:.1f} dB · {paths.length[number]:.2f} m · {paths.length[number] / 0.299792458:.2f} ns",
+            f"{paths.power_db[number]:.1f} dB · {paths.length[number]:.2f} m · {paths.delay_ns[number]:.2f} ns",
             f"arrives from zenith {zenith:.1f}°, azimuth {azimuth:.1f}°",
         ]
     )
