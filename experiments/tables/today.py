@@ -9,7 +9,6 @@ from experiments.markdown import markdown
 from experiments.paper import GAIN, GHZ_10, SCENES
 from experiments.results import Results
 from experiments.series import curve
-from experiments.series.series import jobs_of_all
 from experiments.statistics import gain, level
 from experiments.tables.cells import NOT_RUN, Scores, median_cell, paired_cells, percent, scores, summary_cells
 
@@ -36,7 +35,7 @@ CURVE_NOTE = (
 
 def jobs() -> list[Job]:
     """Returns the jobs of the curve."""
-    return jobs_of_all(curve.SERIES)
+    return curve.jobs()
 
 
 def render(results: Results, images: Path) -> str:

@@ -19,15 +19,7 @@ def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.
     Raises:
         UserError: the file is missing, truncated, not a PLY, without points, or its numbers make no mesh.
     """
-    path = Path(path)
-    try:
-        ply = PlyData.read(path)
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
-    except (PlyParseError, ValueError, EOFError, MemoryError) as error:  # sizes in a damaged header can be anything
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path} is not a PLY file or is truncated ({reason}); export it again") from error
-    elements = {element.name: element.data for element in ply.elements}
+    path, elements = Path(path), read_elements(path)
     corners = elements.get("vertex", np.zeros(0))
     if not {"x", "y", "z"} <= set(corners.dtype.names or ()) or len(corners) == 0:
         raise UserError(f"{path} holds no points: it needs a 'vertex' element with x, y and z; export the mesh again")
@@ -38,6 +30,21 @@ def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
         raise UserError(f"{path} has faces that point at vertices that do not exist; export the mesh again")
     return vertices, faces.astype(np.int32)
+
+
+def read_elements(path: Path | str) -> dict[str, np.ndarray]:
+    """Returns the elements of a PLY file by name, each a structured array.
+
+    Raises:
+        UserError: the file is missing, truncated, or not a PLY.
+    """
+    try:
+        return {element.name: element.data for element in PlyData.read(path).elements}
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
+    except (PlyParseError, ValueError, EOFError, MemoryError) as error:  # sizes in a damaged header can be anything
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path} is not a PLY file or is truncated ({reason}); export it again") from error
 
 
 def write_ply(path: Path | str, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:

@@ -10,10 +10,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax.data.ply import read_elements
 from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814
@@ -71,14 +72,7 @@ def read_gaussians(path: Path | str) -> tuple[Gaussians, Float[np.ndarray, "n 3"
     Raises:
         UserError: the file is missing, damaged, or holds no Gaussians.
     """
-    path = Path(path)
-    try:
-        rows = {element.name: element.data for element in PlyData.read(path).elements}.get("vertex")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
-    except (PlyParseError, ValueError, EOFError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path} is not a PLY file or is truncated ({reason}); export it again") from error
+    rows = read_elements(path).get("vertex")
     found = () if rows is None else rows.dtype.names or ()
     missing = [name for name in NEEDED if name not in found]
     if rows is None or missing:
