@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments.faults import Fault, faulty
 from experiments.paper import COMBINATIONS, DENSE_SCENE, GHZ_10, GHZ_21, SCENES
-from experiments.profiles import PROFILES, SCORED_SLOW, TABLE_PROFILES
+from experiments.profiles import PROFILES, TABLE_PROFILES
 from experiments.variants import VARIANTS
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_box, hold_out_validation, select_frequencies, unseen_frequencies
@@ -35,8 +35,6 @@ ONE_FREQUENCY = ("wrfgs",)
 """Fields that know one frequency: a model for each, all of them one job."""
 BASELINES = "baselines"
 """In the place of a field: the predictors that learn nothing."""
-SLOW = ("nerf2",)
-"""Fields that are slow to ask: the tables score them on fewer transmitters."""
 SCORED_TRAINED = 200
 """Transmitters that are scored where all have trained; drawn once for all."""
 ROOMS = {
@@ -46,7 +44,7 @@ ROOMS = {
     "5": ((0.35, -4.0, 0), (5.25, 0.0, 3.6)),
 }
 """A room of each flat that the receiver does not stand in: lowest and highest corner, metres."""
-PICTURED_SCENES, PICTURED_VARIANTS = ("1", "4"), ("", "fast", "long")
+PICTURED_SCENES = ("1", "4")
 """What is kept in pictures (figure 4)."""
 PICTURED_GHZ = (1, 10, 24.25, 37, 47, 60, 77, 94)
 
@@ -106,8 +104,8 @@ class Job:
     @property
     def pictured(self) -> bool:
         """Whether predicted pictures are kept."""
-        shown = self.scene in PICTURED_SCENES and self.variant in PICTURED_VARIANTS and not self.combination
-        return shown and self.seed == 0 and self.field not in (BASELINES, *SLOW) and self.profile in TABLE_PROFILES
+        shown = self.scene in PICTURED_SCENES and not self.variant and not self.combination
+        return shown and self.seed == 0 and self.field != BASELINES and self.profile in TABLE_PROFILES
 
     def sized(self, profile: str) -> "Job":
         """Returns the job of the tables in another size. Jobs of series keep theirs, but `smoke` makes every job small."""
@@ -130,8 +128,7 @@ class Job:
             dataset = dataclasses.replace(dataset, train=everything, test=everything)
         if self.combination:
             dataset = unseen_frequencies(dataset, self.train_ghz)
-        few = SCORED_SLOW if self.field in SLOW and self.profile in TABLE_PROFILES else PROFILES[self.profile].scored_tx
-        return some_test_transmitters(dataset, SCORED_TRAINED if self.all_tx else few)
+        return some_test_transmitters(dataset, SCORED_TRAINED if self.all_tx else PROFILES[self.profile].scored_tx)
 
     def models(self) -> Iterator[tuple[str, Dataset]]:
         """Yields a name and the data set of every model that is trained."""

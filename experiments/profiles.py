@@ -26,8 +26,8 @@ class Profile:
     """Whether it makes a choice: the validation part is scored, and the test is not looked at."""
 
 
-SCORED_SLOW = 24
-"""Transmitters that are scored with a slow field, and wherever it is compared with; drawn once for all."""
+SCORED_FEW = 24
+"""Transmitters that are scored where many trainings are compared; drawn once for all."""
 GAUSSIANS = {"gaussians": 1000}
 TINY = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance_widths": (8,)}
 QUICK: dict[str, Any] = {
@@ -55,7 +55,7 @@ BEFORE = BY_ADAM | {"network_lr": 1e-3, "fusion": 0}
 """What the `cpu` preset had when its inputs and sizes were chosen."""
 PROFILES = {
     # Of the tables, whose jobs can have any of these.
-    "quick": Profile("cpu", 1000, 600, **QUICK_BY_ADAM),
+    "quick": Profile("cpu", 1000, 600, **QUICK),
     "paper": Profile("gpu", 14_000, 4000),
     # Proves within minutes that everything works.
     "smoke": Profile(
@@ -65,11 +65,10 @@ PROFILES = {
         changes={"optim": {"batch": 2}, "loop": {"epoch_steps": 2}},
         fields={"wideband": TINY, "wrfgs": TINY},
     ),
-    # Of the series, each its own. `rates`, `curve` and `rooms` are of today's presets.
-    "tuning": Profile("cpu", 1000, 600, **QUICK_BY_ADAM, scored_tx=SCORED_SLOW),
+    # Of the series, each its own. `rates` and `rooms` are of today's presets.
+    "tuning": Profile("cpu", 1000, 600, **QUICK_BY_ADAM, scored_tx=SCORED_FEW),
     "main": Profile("cpu", 2400, 600, validation=True),
-    "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_SLOW),
-    "curve": Profile("cpu", 1000, 600, **QUICK),
+    "rates": Profile("cpu", 1000, 600, **QUICK, validation=True, scored_tx=SCORED_FEW),
     "rooms": Profile("cpu", 1000, 600, **QUICK),
     # What a user gets who asks for nothing.
     "robustness": Profile("cpu", 2400, 2000),

@@ -42,13 +42,12 @@ TABLES = {
     "": Variant(),
     "long": Variant(budget=5),
     "longest": Variant(budget=10),
-    "fast": _of_field(network_lr=HIGHER_RATE),
     "no_attenuation": _of_field(attenuation_frequency=False),
     "no_radiance": _of_field(radiance_frequency=False),
-    "no_frequency": _of_field(attenuation_frequency=False, radiance_frequency=False),
 }
 GAUSSIANS_AND_NETWORKS = {
     "paper_inputs": _of_field(relative=False),
+    "no_frequency": _of_field(attenuation_frequency=False, radiance_frequency=False),
     "raw_gigahertz": _of_field(frequency_scale="ghz"),
     "sphere": _of_field(projection="sphere"),
     "area": _of_field(sampling="area"),

@@ -10,7 +10,7 @@ from experiments.results import Results
 from experiments.series.series import Series, jobs_of_all, render_all
 
 TITLE = "Spectra seen"
-PROFILE, SCENE = "curve", "4"
+PROFILE, SCENE = "quick", "4"
 OTHERS = tuple(scene for scene in SCENES if scene != SCENE)
 SERIES = (
     Series("Wideband", "wideband", ("", "long"), PROFILE, (SCENE,), seeds=SEEDS),
@@ -19,10 +19,11 @@ SERIES = (
     Series("WRF-GS, pooled, ten times as many", "wideband", ("pooled_longest",), PROFILE, (SCENE,)),
     Series("WRF-GS, a model a frequency", "wrfgs", ("", "long"), PROFILE, (SCENE,), seeds=SEEDS),
     Series("WRF-GS, a model a frequency, ten times as many", "wrfgs", ("longest",), PROFILE, (SCENE,)),
-    Series("NeRF2", "nerf2", ("", "long"), PROFILE, (SCENE,)),
+    Series("NeRF2", "nerf2", ("",), PROFILE, (SCENE,), seeds=SEEDS),
+    Series("NeRF2, five times as many", "nerf2", ("long",), PROFILE, (SCENE,)),
     Series("Wideband, other scenes", "wideband", ("",), PROFILE, OTHERS, seeds=SEEDS),
     Series("WRF-GS, a model a frequency, other scenes", "wrfgs", ("",), PROFILE, OTHERS, seeds=SEEDS),
-    Series("WRF-GS, pooled, other scenes", "wideband", ("pooled",), PROFILE, OTHERS),
+    Series("WRF-GS, pooled, other scenes", "wideband", ("pooled",), PROFILE, OTHERS, seeds=SEEDS),
 )
 
 

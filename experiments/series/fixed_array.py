@@ -10,10 +10,10 @@ from wbgs_jax.data.scene_file import load_scene
 
 TITLE = "An array of fixed size"
 SERIES = (
-    Series("wideband (ours)", "wideband", ("",), "curve", (FIXED_SCENE,), seeds=SEEDS),
-    Series("wideband, not told the frequency", "wideband", ("pooled",), "curve", (FIXED_SCENE,), seeds=SEEDS),
-    Series("WRF-GS, a model a frequency", "wrfgs", ("",), "curve", (FIXED_SCENE,), seeds=SEEDS),
-    Series("coherent (ours)", "wave", ("",), "curve", (FIXED_SCENE,)),
+    Series("wideband (ours)", "wideband", ("",), "quick", (FIXED_SCENE,), seeds=SEEDS),
+    Series("wideband, not told the frequency", "wideband", ("pooled",), "quick", (FIXED_SCENE,), seeds=SEEDS),
+    Series("WRF-GS, a model a frequency", "wrfgs", ("",), "quick", (FIXED_SCENE,), seeds=SEEDS),
+    Series("coherent (ours)", "wave", ("",), "quick", (FIXED_SCENE,)),
 )
 NAMES_OF_BASELINES = {
     "mean_image": "mean image",

@@ -17,12 +17,10 @@ NOT_RUN = "not run yet"
 Scores = Float[np.ndarray, "seeds tx ghz"]
 NAMES = {
     ("wideband", ""): "wideband (ours)",
-    ("wideband", "fast"): "wideband (ours), higher rate",
     ("wideband", "long"): "wideband (ours), 5x samples",
-    ("wideband", "no_frequency"): "wideband, not told the frequency",
+    ("wideband", "pooled"): "WRF-GS, pooled",
     ("wave", ""): "coherent (ours)",
     ("wrfgs", ""): "WRF-GS",
-    ("wrfgs", "fast"): "WRF-GS, higher rate",
     ("wrfgs", "long"): "WRF-GS, 5x samples",
     ("wrfgs", "longest"): "WRF-GS, 10x samples",
     ("nerf2", ""): "NeRF2-style",

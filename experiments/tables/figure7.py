@@ -16,7 +16,7 @@ from experiments.tables.plots import STYLES, save
 from experiments.variants import VARIANTS
 
 TITLE = "Figure 7: scene 1 at 21 frequencies"
-MODELS = (("wideband", ""), ("wideband", "long"), ("wideband", "no_frequency"), ("wrfgs", ""), ("wrfgs", "long"), ("wave", ""))
+MODELS = (("wideband", ""), ("wideband", "long"), ("wideband", "pooled"), ("wrfgs", ""), ("wrfgs", "long"), ("wave", ""))
 
 
 def jobs() -> list[Job]:

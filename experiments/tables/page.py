@@ -20,10 +20,9 @@ from experiments.tables import (
     table1,
     table2,
     table3,
-    today,
 )
 
-PAGES = (today, headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
+PAGES = (headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
 """In the order of the paper, for readers."""
 
 
@@ -46,8 +45,9 @@ published and the data here are others: compare orders and ratios, not single va
 * **WRF-GS**: what the paper compares with, a splatting field without frequency; *one model for every frequency*, all of which
   together see as many spectra as ours does. Rebuilt here with the same inputs as ours; not its authors' code
   ([baselines](baselines.md)).
-* **5x, 10x samples**: trained on so many times the usual number of spectra. WRF-GS with 10x has, at ten frequencies, as many
-  for every frequency as ours has for all of them.
+* **WRF-GS, pooled**: one model for all frequencies that is not told which one it is asked for: our field without its frequency
+  inputs.
+* **5x samples**: trained on so many times the usual number of spectra.
 * **coherent (ours)**: the [coherent field](wave.md); one model for all frequencies. It is told more than the others: complex
   snapshots in training, the exact mesh and the walls' thickness, the list that the materials come from, and the physics that
   made the data. Its rows in tables 1 and 2 and figures 7 and 8 are of before it learned how far surfaces may stand elsewhere.
@@ -60,7 +60,8 @@ Effort (profile `{name}`): {effort}.
 Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over
 seeds. They, and the p-values, take neighbouring transmitters for independent, which they are not quite. Where several seeds
 were run a value is their median. Except where a table says otherwise, all models of a scene train on the same transmitters and
-are tested on the same others. Learning rates and inputs were chosen on held-out transmitters of scenes 1 and 4.
+are tested on the same others. Optimisers, rates, layers and loss were chosen on a validation part of the training transmitters;
+inputs and octaves are older, chosen on held-out transmitters of scenes 1 and 4.
 
 ```
 make experiments PROFILE={name}    # runs what is missing, goes on where it was cut; MINUTES=60 sets a limit
@@ -94,5 +95,5 @@ def provenance(results: Results) -> str:
     return (
         f"{len(found)} of {len(jobs)} jobs have been run ({devices}; {seconds / 3600:.1f} hours of training and evaluation;"
         f" code {', '.join(f'`{c}`' for c in commits)}). Each is a file in `experiments/results/{results.profile}/`, with its"
-        " settings; results of other settings count as not run. The headline's are in `experiments/results/curve/`."
+        " settings; results of other settings count as not run."
     )

@@ -14,10 +14,10 @@ matplotlib.use("Agg")
 STYLES: dict[tuple[str, str], dict[str, Any]] = {
     ("wideband", ""): {"color": "C0", "lw": 1.4, "marker": "o", "ms": 3, "ls": "--"},
     ("wideband", "long"): {"color": "C0", "lw": 2, "marker": "o", "ms": 4},
-    ("wideband", "no_frequency"): {"color": "C4", "lw": 1.2, "marker": "d", "ms": 3, "ls": ":"},
+    ("wideband", "pooled"): {"color": "C4", "lw": 1.2, "marker": "d", "ms": 3, "ls": ":"},
     ("wrfgs", ""): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3, "ls": "--"},
     ("wrfgs", "long"): {"color": "C1", "lw": 1.4, "marker": "s", "ms": 3},
-    ("wrfgs", "longest"): {"color": "C1", "lw": 1, "marker": "x", "ms": 3},
+    ("nerf2", ""): {"color": "C3", "lw": 1, "marker": "x", "ms": 3},
     ("wave", ""): {"color": "C2", "lw": 2, "marker": "^", "ms": 4},
 }
 

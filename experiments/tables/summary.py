@@ -9,7 +9,7 @@ import numpy as np
 from experiments.paper import GHZ_10, SCENES
 from experiments.results import Results
 from experiments.statistics import gain, level
-from experiments.tables import default_field, table1, today
+from experiments.tables import default_field, headline, table1
 from experiments.tables.cells import ceiling, scores
 from wbgs_jax._util.files import write_json
 
@@ -18,9 +18,9 @@ FILE = "headline.json"
 
 def summary(results: Results) -> dict[str, Any]:
     """Returns averages over the six scenes, and the gains along the curve; what was not run everywhere is left out."""
-    models = {"wideband": today.WIDEBAND, "wrfgs": today.BY_FREQUENCY, "pooled": today.POOLED}
+    models = {"wideband": headline.WIDEBAND, "wrfgs": headline.BY_FREQUENCY, "pooled": headline.POOLED}
     known: dict[str, float | None] = {
-        name: _average([_level(today.found(results, scene, *model)) for scene in SCENES]) for name, model in models.items()
+        name: _average([_level(headline.found(results, scene, *model)) for scene in SCENES]) for name, model in models.items()
     }
     known["coherent"] = _average([_level(scores(results, table1.jobs_of(scene, "wave"), GHZ_10)) for scene in SCENES])
     known["default"] = _average([default_field.median_ssim(results.folder, scene) for scene in SCENES])
@@ -28,7 +28,7 @@ def summary(results: Results) -> dict[str, Any]:
     ours, theirs = known["wideband"], known["wrfgs"]
     known["gain_percent"] = None if ours is None or theirs is None else 100 * (ours / theirs - 1)
     for name, variant in (("5x", "long"), ("10x", "longest")):
-        pair = (today.found(results, today.curve.SCENE, field, variant) for field in ("wideband", "wrfgs"))
+        pair = (headline.found(results, headline.curve.SCENE, field, variant) for field in ("wideband", "wrfgs"))
         ratio = gain(*pair)
         known[f"gain_percent_{name}"] = None if ratio is None else 100 * ratio
     return {name: round(value, 4) for name, value in known.items() if value is not None}

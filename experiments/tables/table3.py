@@ -9,7 +9,7 @@ from experiments.results import Results
 from experiments.tables.cells import ceiling, cell, scores, summary_cells
 
 TITLE = "Table 3: the two frequency embeddings, scene 1 at 21 frequencies"
-VARIANTS = {(True, True): "", (False, True): "no_attenuation", (True, False): "no_radiance", (False, False): "no_frequency"}
+VARIANTS = {(True, True): "", (False, True): "no_attenuation", (True, False): "no_radiance", (False, False): "pooled"}
 """(attenuation embedding, radiance embedding): variant."""
 
 
