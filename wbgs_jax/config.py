@@ -82,6 +82,8 @@ class SearchConfig:
     """Standard errors by which another antenna must fit better than the one that is there."""
     ideal_spectra: int = 96
     """Training spectra that are looked at for what ray tracers leave out."""
+    tuning_spectra: int = 320
+    """Training spectra that are looked at for how far the elements of arrays are out of tune; 0: they are in tune."""
     geometry: bool = True
     """Whether surfaces of a doubtful mesh are moved."""
     geometry_snapshots: int = 640

@@ -23,7 +23,7 @@ SERIES = (
     Series("NeRF2, five times as many", "nerf2", ("long",), PROFILE, (SCENE,)),
     Series("Wideband, other scenes", "wideband", ("",), PROFILE, OTHERS, seeds=SEEDS),
     Series("WRF-GS, a model a frequency, other scenes", "wrfgs", ("",), PROFILE, OTHERS, seeds=SEEDS),
-    Series("WRF-GS, pooled, other scenes", "wideband", ("pooled",), PROFILE, OTHERS, seeds=SEEDS),
+    Series("WRF-GS, pooled, other scenes", "wideband", ("pooled",), PROFILE, OTHERS),
 )
 
 

@@ -62,8 +62,8 @@ def volume(results: Results) -> str:
         better, _, p = paired_cells(values["wideband"], values["nerf2"])
         rows.append([scene, *(median_cell(v) for v in values.values()), better, p])
     note = (
-        "A NeRF2-style volume marches rays. It has the frequency as an input and sees as many spectra as ours, but few pixels of"
-        " each, and with an L1 loss alone: SSIM, which is scored, needs whole images. First seed of all models."
+        "A NeRF2-style volume marches rays. It has the frequency as an input and sees as many spectra as ours, but few pixels"
+        " of each, and with an L1 loss alone: SSIM, which is scored, needs whole images. First seed of all models."
     )
     head = ["scene", *(NAMES[name, ""] for name in fields), "ours better at", "p"]
     return note + "\n\n" + markdown(head, rows)

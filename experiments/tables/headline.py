@@ -40,9 +40,9 @@ CURVE = {
 """What is on the curve: a field, and its variants with one, five and ten times the spectra."""
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
 NOTE = (
-    "**Gain over WRF-GS** with equal numbers of spectra seen; *pooled* is one WRF-GS model for all frequencies that is told none"
-    " of them. Averages over ten frequencies of the medians over transmitters; in parentheses the paper's, which trains all"
-    " models in full. The paired test is Wilcoxon's, over held-out transmitters."
+    "**Gain over WRF-GS** with equal numbers of spectra seen; *pooled* is one WRF-GS model for all frequencies that is told"
+    " none of them. Averages over ten frequencies of the medians over transmitters; in parentheses the paper's, which trains"
+    " all models in full. The paired test is Wilcoxon's, over held-out transmitters."
 )
 CURVE_NOTE = (
     "**Gain against spectra seen**: WRF-GS starts anew at every frequency and needs more samples than one model for all of"

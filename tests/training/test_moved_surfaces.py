@@ -68,6 +68,13 @@ def test_walls_come_back(truth, tmp_path):
     walls = np.bincount(mover)[mover] == 1
     print(np.round(1e3 * along[walls], 2), np.round(1e3 * left[walls], 2))
     assert np.median(left[walls]) < 5e-4 < np.median(along[walls])
+    assert len(report.bodies) == len(np.asarray(place.field.motion.shift))
+    for body in report.bodies:
+        assert 0 < body["best_known_mm"] <= body["least_known_mm"] <= 1e3 * SETTINGS.search.geometry_width + 1e-3
+    known = np.array([report.bodies[m]["best_known_mm"] for m in mover[walls]])
+    z = 1e3 * left[walls] / known  # the posterior is no narrower than what is left
+    print(np.round(known, 3), np.round(z, 1))
+    assert np.median(z) < 3 and np.median(known) < 0.25e3 * SETTINGS.search.geometry_width
 
 
 def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_path, rng):

@@ -87,6 +87,9 @@ class WaveField(Field):
     motion: Motion
     """How far things and those receivers stand from where the data say, as far as that has been found out; the facets are
     there already."""
+    tuning: Float[Array, "r elements 2"] | None
+    """Logarithm of amplitude, and phase (radians), by which elements of those receivers differ from what their positions say,
+    as far as that has been found out; None: they are in tune."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -126,9 +129,9 @@ class WaveField(Field):
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
         check_receiver(receiver)
-        receiver = self._where_it_stands(receiver)
+        receiver, tuning = self._as_found(receiver)
         surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
-        return WavePlan(surfaces, receiver, self.known_thickness, None, beams, self.config)
+        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
         """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
@@ -146,16 +149,20 @@ class WaveField(Field):
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
         return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
 
-    def _where_it_stands(self, receiver: Receiver) -> Receiver:
-        """Returns a receiver of the data where it has been found to stand; any other one as it is."""
+    def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
+        """Returns a receiver of the data where it has been found to stand, and its tuning; any other one as it is, in tune."""
         if not len(self.receivers):
-            return receiver
+            return receiver, None
         away = jnp.linalg.norm(self.receivers - receiver.position, axis=-1)
         own = jnp.argmin(away)
-        shift, turn = (
-            jnp.where(away[own] < SAME_PLACE_M, far[own], 0) for far in (self.motion.receiver, self.motion.receiver_turn)
-        )
-        return dataclasses.replace(receiver, position=receiver.position + shift, orientation=turned(receiver.orientation, turn))
+
+        def found(of_all: Array) -> Array:
+            return jnp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
+
+        position = receiver.position + found(self.motion.receiver)
+        orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
+        tuning = None if self.tuning is None else found(self.tuning)
+        return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
         """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
@@ -193,6 +200,11 @@ class WaveField(Field):
         total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
         places = {"facets": facets, "edges": edges_of_facets(facets), "motion": total}
         return dataclasses.replace(self, **{name: _to_device(place) for name, place in places.items()})
+
+    def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
+        """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
+        further = jnp.asarray(np.stack([np.log(np.abs(gains)), np.angle(gains)], -1), jnp.float32)
+        return dataclasses.replace(self, tuning=further if self.tuning is None else self.tuning + further)
 
     def electrical(self, params: WaveParams) -> Electrical:
         """Returns the properties of the materials, as far as they were learned."""
@@ -271,7 +283,7 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
     motion = _to_device(still(movers, len(known)))
-    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, known, motion, config)
+    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, known, motion, None, config)
 
 
 def _beams(receiver: Receiver) -> Beams | None:

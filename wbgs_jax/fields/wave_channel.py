@@ -25,6 +25,7 @@ from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
 from wbgs_jax.radio.array import (
+    EXACT,
     SPEED_OF_LIGHT,
     Beams,
     covariance_to_pas,
@@ -87,6 +88,8 @@ class WavePlan:
     surfaces: Surfaces
     """A `Search` of the receiver where paths have still to be found."""
     receiver: Receiver
+    tuning: Float[Array, "elements 2"] | None
+    """Logarithm of amplitude, and phase (radians), of its elements; None: they are in tune."""
     known_thickness: Float[Array, " m"]
     motion: Motion | None
     """How far things, and this receiver, stand from where paths were found, while that is being learned."""
@@ -111,7 +114,13 @@ def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, freque
 def _snapshots(
     params: WaveParams, plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]
 ) -> Complex[Array, "b elements"]:
-    return jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
+    y = jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
+    return y if plan.tuning is None else y * element_gains(plan.tuning)
+
+
+def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elements"]:
+    """Returns the complex gains of elements that are out of tune."""
+    return jnp.exp(tuning[:, 0] + 1j * tuning[:, 1])
 
 
 def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
@@ -141,6 +150,9 @@ def path_covariances(
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
         left = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
         covariance = covariance_from_paths(arrived, plan.receiver, f, left)
+        if plan.tuning is not None:
+            gains = element_gains(plan.tuning)
+            covariance = covariance * gains[:, None] * gains.conj()
         trace = jnp.trace(covariance).real
         return covariance / jnp.maximum(trace, FAINTEST_SUM), trace / len(covariance) * strongest**2
 
@@ -189,4 +201,5 @@ def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "
     reflects = kind == REFLECTED
     correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
     total = jnp.where(reflects[..., None], correction, 0).sum(-2)
-    return jnp.exp(total[:, 0] - counts @ params.excess_loss[row] + 1j * total[:, 1])
+    losses = jnp.matmul(counts.astype(total.dtype), params.excess_loss[row], precision=EXACT)
+    return jnp.exp(total[:, 0] - losses + 1j * total[:, 1])

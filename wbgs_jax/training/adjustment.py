@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Inexact, Int
 
 from wbgs_jax.fields.losses import GOOD_MATCH
-from wbgs_jax.fields.wave_channel import arrivals_at
+from wbgs_jax.fields.wave_channel import arrivals_at, element_gains
 from wbgs_jax.propagation.motion import Motion, length_jacobian
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
@@ -142,6 +142,8 @@ def normal_equations(
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[cache.place(asked)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
+        if plan.tuning is not None:
+            voltages = voltages * element_gains(plan.tuning)
         lengths = _jacobian(cache, paths, len(motion.shift)).astype(voltages.dtype)
         changes = -1j * wavenumber * jnp.matmul(voltages.T, lengths, precision=EXACT)
         changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))

@@ -11,13 +11,14 @@ the mesh as it was, each with as much doubt as suits it.
 
 import dataclasses
 from dataclasses import dataclass
+from dataclasses import field as having
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.propagation.motion import Motion
@@ -64,6 +65,9 @@ class GeometryReport:
     """How far the receiver, or that of several which was moved furthest, was moved ..."""
     receiver_deg: float
     """... and turned."""
+    bodies: list[dict[str, float]] = having(default_factory=list)
+    """Of every mover: how far it was shifted (mm), and the standard deviations (mm) of where it stands along the direction in
+    which that is known best, and along the one in which it is known least; where snapshots were heard."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,8 @@ class Place:
     """A field that can be `moved`."""
     params: Any
     cache: Any
+    covariance: Float[np.ndarray, "p p"] | None = None
+    """Of the motion that led there, as `ravel_pytree` orders its numbers; None where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -118,19 +124,19 @@ def learn_geometry(
     heard, all_heard = _Heard(data, own, config, rng), _Heard(data, train, config, rng)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
     start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds, sized=True)
-    field, params = _followed(start, heard, links, named=True)
-    now = _traced(field, _fresh(params, place.params), data.links, data)
+    now = _followed(start, heard, links, named=True)
+    now = _retraced(now, _fresh(now.params, place.params), data.links, data)
     now = all_heard.named(all_heard.guessed(now), 1)
     moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
     if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
-        field, params = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, named=False)
-        moved.append(all_heard.named(_traced(field, params, data.links, data), 1, "snapshots"))
+        now = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, named=False)
+        moved.append(all_heard.named(_retraced(now, now.params, data.links, data), 1, "snapshots"))
     return _judged(place, moved, all_heard)
 
 
-def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> tuple[Any, Any]:
-    """Returns the field with things moved as spectra say, from low frequencies to high ones, and its parameters. Paths are
-    traced again on the way, and materials named, if they are.
+def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
+    """Returns the field with things moved as spectra say, from low frequencies to high ones; its paths are those of before.
+    Paths are traced again on the way, and materials named, if they are.
 
     Args:
         now: with the paths of the transmitters of `links`.
@@ -156,7 +162,8 @@ def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> tuple[Any
             count = config.geometry_steps
             params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
             now = dataclasses.replace(now, params=params)
-    return now.field.moved(motion), now.params
+    known = covariance if data.snapshots is not None else None
+    return Place(now.field.moved(motion), now.params, now.cache, known)
 
 
 def _widths(motion: Motion, shift: float) -> Motion:
@@ -176,9 +183,10 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
     )
     best = int(np.argmin([own.mean() for own in after]))
     kept = surely_better(before - after[best], np.asarray(heard.data.links.tx_index)[spectra], SURE)
-    sizes = _sizes(others[best].field.motion)
-    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes)
-    return others[best] if kept else as_it_was, report
+    chosen = others[best]
+    sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.covariance)
+    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes, bodies=bodies)
+    return chosen if kept else as_it_was, report
 
 
 def _sizes(motion: Motion) -> dict[str, float]:
@@ -191,6 +199,22 @@ def _sizes(motion: Motion) -> dict[str, float]:
         "receiver_mm": float(1e3 * size.receiver.max()),
         "receiver_deg": float(np.rad2deg(size.receiver_turn.max())),
     }
+
+
+def _bodies(motion: Motion, covariance: Float[np.ndarray, "p p"] | None) -> list[dict[str, float]]:
+    """Returns how far every mover was shifted, and how well it is known where it stands."""
+    if covariance is None:
+        return []
+    shifts, found = 1e3 * np.linalg.norm(np.asarray(motion.shift), axis=-1), []
+    for mover, shift in enumerate(shifts.tolist()):
+        own = slice(3 * mover, 3 * mover + 3)  # shifts come first
+        best, _, least = 1e3 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[own, own]), 0))
+        found.append({"shift_mm": round(shift, 3), "best_known_mm": round(best, 3), "least_known_mm": round(least, 3)})
+    return found
+
+
+def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
+    return dataclasses.replace(_traced(now.field, params, links, data), covariance=now.covariance)
 
 
 def _traced(field: Any, params: Any, links: Links, data: TrainingData) -> Place:

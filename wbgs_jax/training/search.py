@@ -1,4 +1,5 @@
-"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, idealisations, places.
+"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, idealisations, tuning,
+places.
 
 The first two are a choice among known ones by how well they explain some training spectra; surfaces are moved where the mesh is
 doubtful, and how far they may still be off is guessed. Training goes on from there.
@@ -21,6 +22,7 @@ from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Scores, Told
 from wbgs_jax.training.thicknesses import search_slabs
+from wbgs_jax.training.tuning import search_tuning
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
 """How far a gain may be from the one before, and the steps in which it is tried."""
@@ -86,11 +88,15 @@ class Search:
                 params, _ = search_materials(params, told.scores(config.ideal_spectra), config)
             _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
+            field = self._tuning(params, told, report)
+            told = dataclasses.replace(told, field=field)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng)
                 report["geometry"] = dataclasses.asdict(moved)
                 params, field, cache = place.params, place.field, place.cache
                 told = Told(field, cache, data, spectra)
+                field = self._tuning(params, told, report)
+                told = dataclasses.replace(told, field=field)
             params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
             report["placement"] = dataclasses.asdict(guessed)
         return Edit(params, (), None, report, field, cache)
@@ -102,6 +108,14 @@ class Search:
         before = report.get("antennas", dataclasses.asdict(found))
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
         return params, bool(found.taken)
+
+    def _tuning(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+        """Returns the field with arrays that are out of tune as spectra say."""
+        if told.data.snapshots is None or not self.config.tuning_spectra:
+            return told.field
+        field, found = search_tuning(params, told, self.config.tuning_spectra)
+        report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
+        return field
 
     def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
         """Returns parameters without the idealisations that spectra contradict."""
