@@ -30,11 +30,13 @@ def table():
 # Results of the first version
 
 
-def test_all_results_of_the_first_version_count_as_run():
+def test_results_of_the_first_version_count_as_run():
+    """Those whose settings are still what a job has, under names that they had by then."""
     quick, paper = Results("quick"), Results("paper")
-    jobs = unique_jobs()
-    assert len(jobs) == len(quick.all(jobs)) == 336
-    assert {job.name for job in jobs if paper.get(job)} == {f"scene{scene}_wave_seed0" for scene in range(1, 7)}
+    for field in ("wave", BASELINES):
+        jobs = [job for job in unique_jobs() if job.field == field]
+        assert len(jobs) == len(quick.all(jobs)) > 50
+    assert {job.name for job in unique_jobs() if paper.get(job)} == {f"scene{scene}_wave_seed0" for scene in range(1, 7)}
 
 
 def test_settings_that_have_moved_are_found_under_todays_names():
@@ -91,7 +93,7 @@ def test_a_result_read_twice_is_read_again_where_it_has_changed(tmp_path):
 
 
 def test_what_was_moved_is_part_of_what_makes_a_result():
-    assert differences(dataclasses.replace(JOB, variant="fast"))["wideband.network_lr"] == 0.016
+    assert differences(dataclasses.replace(JOB, variant="lr_1.6e-2"))["wideband.network_lr"] == 0.016
     assert differences(Job("4", "wave", variant="mesh_moved_1m", profile="choices"))["mesh.displacement"] == 1
 
 
