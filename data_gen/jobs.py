@@ -24,6 +24,7 @@ from jaxtyping import Float
 from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
+from wbgs_jax._util.archives import read_arrays
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 
@@ -178,5 +179,4 @@ def collect(job: Job, folder: Path) -> Results:
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    with np.load(file, allow_pickle=False) as archive:
-        return dict(archive)
+    return read_arrays(file, "batch", "remove it, and the same command makes it again")

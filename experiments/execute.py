@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.settings import settings
+from wbgs_jax._util.archives import read_arrays
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.config import Settings
 from wbgs_jax.data import Dataset
@@ -72,8 +73,7 @@ def part(job: Job, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: 
     prepare_folder(folder, config, resume=True)  # refuses what other settings have begun
     done = folder / "part.npz"
     if done.exists():
-        with np.load(done) as archive:
-            return Part(**dict(archive))
+        return Part(**read_arrays(done, "finished part", "remove it, and the same command makes it again"))
     trained = train(dataset, job.field, chosen, job.seed, folder, resume=True)
     may_go_on()
     begin = time.perf_counter()

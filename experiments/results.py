@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from experiments.jobs import PICTURED_GHZ, Job
+from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.old_names import EDITION, todays
 from experiments.settings import differences, unlike_preset
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json
 
 FOLDER = Path(__file__).parent / "results"
@@ -106,8 +107,24 @@ class Results:
 
 @functools.lru_cache(maxsize=1000)
 def _read(path: Path, modified_ns: int) -> Result:
-    """Returns the content of a file, read once for each time that it was written."""
-    return Result(read_json(path))
+    """Returns the content of a file, read once for each time that it was written; what is no result is a `UserError`."""
+    values = read_json(path)
+    if not _is_result(values):
+        raise UserError(f"{path} is no result of an experiment; remove it, and the runner makes it again")
+    return Result(values)
+
+
+def _is_result(values: Any) -> bool:
+    if not isinstance(values, dict) or not (BASELINES in values or {"ssim", "tx"} <= set(values)):
+        return False
+    kinds = {"settings": dict, "presets": int, "tx": list, "ssim": dict, "training_seconds": float | int}
+    if any(name in values and not isinstance(values[name], kind) for name, kind in kinds.items()):
+        return False
+    scores = values.get("ssim", {})
+    try:
+        return np.array([*map(float, scores)]).shape == np.array([*scores.values()], float).shape[:1]
+    except (TypeError, ValueError):
+        return False
 
 
 def one_line_lists(text: str) -> str:

@@ -18,10 +18,11 @@ from untrained import make_coherent_run
 
 from wbgs_jax import eval as evaluation
 from wbgs_jax import predict
+from wbgs_jax._util import archives
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import safe_name
 from wbgs_jax._util.yaml_files import read_yaml
-from wbgs_jax.data import load_dataset, save_scene, scene_file
+from wbgs_jax.data import load_dataset, save_scene
 from wbgs_jax.data.checksum import checksum
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.training import checkpoint
@@ -173,7 +174,7 @@ def test_a_pipe_is_no_file(tmp_path):
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(scene_file, "MOST_BYTES", 10_000_000)
+    monkeypatch.setattr(archives, "MOST_BYTES", 10_000_000)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.npy", b"\0" * 20_000_000)
     assert (tmp_path / "bomb.npz").stat().st_size < 100_000

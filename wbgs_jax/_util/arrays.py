@@ -1,8 +1,6 @@
 """A pytree of arrays as one file of a run folder: a compressed .npz, written whole or not at all."""
 
 import dataclasses
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.archives import read_arrays, told
 from wbgs_jax._util.files import atomic_write
 
 T = TypeVar("T")
@@ -36,11 +34,10 @@ def read_tree(path: Path, cls: type[T], without: str) -> T | None:
     """
     if not path.exists():
         return None
-    try:
-        with np.load(path) as archive:
-            return cls(**{name: _in_memory(value) for name, value in archive.items()})
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged ({error}); remove it to {without}, or train again") from error
+    advice = f"remove it to {without}, or train again"
+    arrays = read_arrays(path, "", advice)
+    with told(str(path), advice):
+        return cls(**{name: _in_memory(value) for name, value in arrays.items()})
 
 
 def _in_memory(value: np.ndarray) -> jax.Array:

@@ -77,8 +77,6 @@ def read_json(path: Path | str) -> Any:
     """Returns the content of a JSON file; a missing or broken one is a `UserError`."""
     path = Path(path)
     try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid JSON ({error}); it may be truncated: make it again") from error

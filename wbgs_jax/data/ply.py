@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
@@ -38,12 +38,13 @@ def read_elements(path: Path | str) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is missing, truncated, or not a PLY.
     """
+    # Read, not mapped into memory: a mapped file that becomes shorter meanwhile would end the process (SIGBUS).
     try:
-        return {element.name: element.data for element in PlyData.read(path).elements}
+        return {element.name: element.data for element in PlyData.read(path, mmap=False).elements}
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
-    except (PlyParseError, ValueError, EOFError, MemoryError) as error:  # sizes in a damaged header can be anything
-        reason = " ".join(str(error).split())
+    except Exception as error:  # sizes, types and names in a damaged header can be anything
+        reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path} is not a PLY file or is truncated ({reason}); export it again") from error
 
 

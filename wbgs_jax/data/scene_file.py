@@ -9,7 +9,6 @@ Files are written in format 2. Format 1 knew snapshots of one receiver only; its
 
 import json
 import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int, UInt8
 
+from wbgs_jax._util.archives import read_arrays, told
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, safe_name
 from wbgs_jax.data.scene_checks import ARRAYS, OBSERVATIONS, TEST, TEXTS, TRAIN, VALIDATION, check_arrays
@@ -26,8 +26,6 @@ __all__ = ["FORMAT", "TEST", "TRAIN", "VALIDATION", "SceneFile", "load_scene", "
 
 FORMAT = 2
 """Of files that are written; older ones are read."""
-MOST_BYTES = 8 * 2**30
-"""That a file may unfold to."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,6 @@ class SceneFile:
         return observed
 
 
-# What NumPy, zipfile and zlib raise on damaged bytes; TypeError is a plain .npy array, RuntimeError an unknown compression.
-_DAMAGED = (ValueError, TypeError, EOFError, RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error)
-
-
 def save_scene(path: Path | str, scene: SceneFile) -> None:
     """Checks and writes a scene file; equal scenes give equal bytes."""
     arrays = {key: getattr(scene, key) for key in (*ARRAYS, *OBSERVATIONS, *TEXTS)}
@@ -95,38 +89,20 @@ def load_scene(path: Path | str) -> SceneFile:
         UserError: the file is missing, truncated, of another format, or its content is not a scene.
     """
     path = Path(path)
-    try:
-        check_size(path)
-        with np.load(path, allow_pickle=False) as archive:
-            if "meta" not in archive:
-                raise UserError(f"{path} is not a scene file: it lacks meta; make one with `save_scene` (docs/formats.md)")
-            meta = json.loads(str(archive["meta"]))
-            known = (*ARRAYS, *OBSERVATIONS, *TEXTS)
-            arrays = {key: archive[key] for key in known if key in archive}
-    except OSError as error:
-        reason = error.strerror or "not an .npz archive"
-        raise UserError(f"cannot read scene file {path}: {reason}; check the path or make it again with `make data`") from error
-    except _DAMAGED as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"scene file {path} is damaged or not a scene file ({reason}); copy it or make it again") from error
+    advice = "check the path, copy it again, or make it again (docs/formats.md)"
+    arrays = read_arrays(path, "scene file", advice, {"meta", *ARRAYS, *OBSERVATIONS, *TEXTS})
+    if "meta" not in arrays:
+        raise UserError(f"{path} is not a scene file: it lacks meta; make one with `save_scene` (docs/formats.md)")
+    with told(f"meta of scene file {path}", advice):
+        meta = json.loads(str(arrays.pop("meta")))
     found = meta.get("format") if isinstance(meta, dict) else None
     if found not in (1, FORMAT):
-        raise UserError(f"{path} has scene format {found}, this version reads 1 and {FORMAT}; update wbgs-jax")
+        raise UserError(f"{path} has scene format {str(found)[:20]}, this version reads 1 and {FORMAT}; update wbgs-jax")
     if found == 1:
         arrays = _from_format_1(arrays, meta)
     arrays = check_arrays(arrays, str(path))
     texts = {"element_unit": str(arrays.pop("element_unit")), "element_pattern": _text(arrays.pop("element_pattern"))}
     return SceneFile(name=safe_name(str(meta.get("name", path.stem))), meta=meta, **texts, **arrays)  # type: ignore[arg-type]
-
-
-def check_size(path: Path) -> None:
-    """Raises a `UserError` for an archive that would fill the memory: a few kilobytes can unfold to terabytes."""
-    if not zipfile.is_zipfile(path):
-        return
-    with zipfile.ZipFile(path) as archive:
-        unfolded = sum(entry.file_size for entry in archive.infolist())
-    if unfolded > MOST_BYTES:
-        raise UserError(f"{path} unfolds to {unfolded / 2**30:.1f} GiB, more than {MOST_BYTES / 2**30:g}; split it")
 
 
 def _from_format_1(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -5,13 +5,13 @@ import contextlib
 import json
 import shutil
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wbgs_jax._util.archives import opened_archive, told
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json, write_json
 
@@ -63,7 +63,7 @@ class Answers:
             parts.append(piece)
             if most is not None and sum(map(len, parts)) >= most:
                 break
-        return np.concatenate(parts)[:most]
+        return _joined(parts)[:most]
 
     def rows(self, name: str, wanted: np.ndarray) -> np.ndarray:
         """Returns some rows of an array, by their numbers in ascending order."""
@@ -72,7 +72,7 @@ class Answers:
             inside = wanted[(wanted >= start) & (wanted < start + len(piece))]
             found.append(piece[inside - start])
             start += len(piece)
-        return np.concatenate(found)
+        return _joined(found)
 
     def remove(self) -> None:
         """Forgets what is no longer needed."""
@@ -99,11 +99,8 @@ class PartFiles(Answers):
     def opened(self, number: int) -> Iterator[Mapping[str, np.ndarray]]:
         """Gives a block; its arrays are read when they are asked for."""
         path = _file(self.folder, number)
-        try:
-            with np.load(path) as archive:
-                yield archive
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise UserError(f"{path} is damaged ({error}); remove it and all after it, and go on with --resume") from error
+        with opened_archive(path, "", "remove it and all after it, and go on with --resume") as block:
+            yield block
 
     def remove(self) -> None:
         """Removes the folder."""
@@ -162,6 +159,11 @@ def write_archive(
         for name, values in single.items():
             with archive.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+
+
+def _joined(pieces: list[np.ndarray]) -> np.ndarray:
+    with told("a block of kept answers", "remove the folder of blocks, and ask again"):
+        return np.concatenate(pieces)
 
 
 def _file(folder: Path, number: int) -> Path:

@@ -8,7 +8,6 @@ that it wants. The next one needs neither the run's data nor the model's code, a
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from wbgs_jax._util.archives import opened_archive
 from wbgs_jax._util.compilation import cache_folder, load_program, source_digest, trace_program
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
@@ -68,14 +68,14 @@ def load_ready(run: Path, rx: str, count: int) -> Ready | None:
     if path is None or not path.exists():
         return None
     try:
-        with np.load(path) as archive:
+        with opened_archive(path, "", "") as archive:
             meta = json.loads(str(archive[META]))
             if meta["state"] != _state(meta["watched"]):
                 return None
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
         return Ready(meta, arrays, load_program(path.parents[1], meta["program"]))
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-        return None  # damaged: it is made again
+    except Exception:
+        return None  # damaged, in whatever way: it is made again
 
 
 def make_ready(

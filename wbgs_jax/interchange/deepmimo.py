@@ -7,18 +7,15 @@ paths. A scenario is a folder with a file each, such as power_t001_tx000_r000.np
 """
 
 import re
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
+from wbgs_jax._util.archives import read_arrays
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
-from wbgs_jax.data.scene_file import check_size
+from wbgs_jax.interchange.matlab import read_mat
 from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTION, SPECULAR, RayPaths
 
 PATHS = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
@@ -45,11 +42,31 @@ def read_deepmimo(
     arrays = _of_folder(path, (tx_set, tx, rx_set)) if path.is_dir() else _read(path)
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{path} has no {missing[0]}; it must hold a DeepMIMO scenario: {', '.join(NEEDED)}")
-    users = len(np.atleast_2d(arrays["rx_pos"]))
-    for name in PATHS:
-        if arrays[name].ndim != 2 or len(arrays[name]) != users or arrays[name].shape != arrays["power"].shape:
-            raise UserError(f"{name} in {path} has shape {arrays[name].shape}; expected ({users} users, paths)")
+    _check_shapes(path, arrays)
     return arrays
+
+
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raises a `UserError` for arrays that are no numbers, or do not fit each other."""
+    shape = np.shape(arrays["power"])
+    users, paths = (*shape, 0, 0)[:2]
+    of_paths = dict.fromkeys((*PATHS, "inter"), ((users, paths),))
+    places = {"rx_pos": ((users, 3),), "tx_pos": ((1, 3), (3,)), "inter_pos": ((users, paths, _depth(arrays), 3),)}
+    for name, allowed in (of_paths | places).items():
+        if name not in arrays:
+            continue
+        found = arrays[name]
+        if found.dtype.kind not in "fiu":
+            raise UserError(f"{name} in {path} holds no numbers but {found.dtype}; write the scenario again")
+        if len(shape) != 2 or found.shape not in allowed:
+            expected = " or ".join(map(str, allowed))
+            raise UserError(f"{name} in {path} has shape {found.shape}; expected {expected}: users, paths, ...")
+
+
+def _depth(arrays: dict[str, np.ndarray]) -> int:
+    """Returns how many interactions a scenario keeps the places of."""
+    places = arrays.get("inter_pos")
+    return places.shape[2] if places is not None and places.ndim == 4 else 0
 
 
 def is_deepmimo(path: Path) -> bool:
@@ -137,17 +154,7 @@ def _of_folder(folder: Path, wanted: tuple[int | None, ...]) -> dict[str, np.nda
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Returns the numbers of an .npz or .mat file by name."""
-    try:
-        if path.suffix == ".mat":
-            found = loadmat(path)
-            return {name: values for name, values in found.items() if isinstance(values, np.ndarray) and values.dtype != object}
-        check_size(path)
-        with np.load(path) as archive:
-            return dict(archive.items())
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or 'not an archive of arrays'}; check the path") from error
-    except (ValueError, TypeError, NotImplementedError, MatReadError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged or of a kind that is not read ({error}); give an .npz or a .mat file") from error
+    return read_mat(path) if path.suffix == ".mat" else read_arrays(path, "", "check the path; give an .npz or a .mat file")
 
 
 def _filled(values: Any, valid: np.ndarray) -> np.ndarray:

@@ -5,8 +5,6 @@ world frame, theta from +z, phi from +x, at both ends outwards: where the wave l
 `a` lack the carrier phase of the delay: the channel at frequency f is the sum of a exp(-2 pi j f tau).
 """
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,11 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from wbgs_jax._util.archives import read_arrays
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
-from wbgs_jax.data.scene_file import check_size
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
+from wbgs_jax.types import HIGHEST_FREQUENCY_HZ, LOWEST_FREQUENCY_HZ
 
 NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
 """`sionna.rt.InteractionType`."""
@@ -110,8 +109,17 @@ def from_sionna(paths: Any, frequency_hz: float | None = None) -> RayPaths:
         raise UserError("these paths do not say their frequency; give it: that of the scene that they were traced in")
     single = {name: _first_antennas(name, values) for name, values in found.items()}
     shape = single["a"].shape
+    if "interactions" not in single:
+        single.pop("vertices", None)  # places of nobody knows what
+    for name, values in single.items():
+        if values.dtype.kind not in ("cfiu" if name == "a" else "fiub"):
+            raise UserError(f"{name} of these paths holds no numbers but {values.dtype}; write them again")
+    if len(shape) != SINGLE:
+        raise UserError(f"a of these paths has shape {found['a'].shape}; expected receivers, transmitters and paths")
     for name, values in single.items():
         axes = values.shape[1:] if name == "interactions" else values.shape[1:-1] if name == "vertices" else values.shape
+        if name == "vertices" and (values.shape[-1:] != (3,) or len(values) != len(single.get("interactions", values))):
+            axes = ()
         if axes != shape:
             raise UserError(
                 f"{name} of these paths has shape {found[name].shape}, which does not fit a with {found['a'].shape}"
@@ -126,7 +134,7 @@ def from_sionna(paths: Any, frequency_hz: float | None = None) -> RayPaths:
         valid=np.asarray(single.get("valid", (real["tau"] >= 0) & (single["a"] != 0)), bool),
         sources=_places(paths, "sources", shape[1]),
         targets=_places(paths, "targets", shape[0]),
-        frequency_hz=float(np.reshape(frequency, -1)[0]),
+        frequency_hz=_frequency(frequency),
     )
 
 
@@ -178,15 +186,7 @@ def load_paths(path: Path | str, frequency_hz: float | None = None) -> RayPaths:
     Raises:
         UserError: the file is missing, damaged, or holds no paths.
     """
-    path = Path(path)
-    try:
-        check_size(path)
-        with np.load(path) as archive:
-            arrays = dict(archive.items())
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or 'not an .npz archive'}; check the path") from error
-    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged or no archive of arrays ({error}); write it again") from error
+    arrays = read_arrays(Path(path), "", "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
         arrays["a"] = arrays.pop("a_real") + 1j * arrays.pop("a_imag")
     return from_sionna(arrays, frequency_hz)
@@ -202,6 +202,17 @@ def _array(paths: Any, name: str) -> np.ndarray | None:
     return np.asarray(value)
 
 
+def _frequency(value: Any) -> float:
+    """Returns hertz, of several the first."""
+    try:
+        found = float(np.reshape(value, -1)[0])
+    except (ValueError, TypeError, IndexError):
+        found = np.nan
+    if not LOWEST_FREQUENCY_HZ <= found <= HIGHEST_FREQUENCY_HZ:
+        raise UserError(f"the frequency of these paths is {found:g} Hz; give hertz, 28e9 for 28 GHz")
+    return found
+
+
 def _first_antennas(name: str, values: np.ndarray) -> np.ndarray:
     """Returns an array without axes of antennas, which stand behind receivers and transmitters."""
     before, after = (1, 0) if name == "interactions" else (1, 1) if name == "vertices" else (0, 0)
@@ -215,6 +226,8 @@ def _places(paths: Any, name: str, count: int) -> np.ndarray:
     found = _array(paths, name)
     if found is None:
         return np.full((count, 3), np.nan)
+    if found.dtype.kind not in "fiu":
+        raise UserError(f"{name} of these paths holds no numbers but {found.dtype}; write them again")
     places = np.asarray(found, np.float64)
     if places.ndim == 2 and (places.shape[1] != 3 or (len(places) == 3 and not isinstance(paths, Mapping))):
         places = places.T

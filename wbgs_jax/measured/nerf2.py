@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from wbgs_jax._util.archives import check_file, told
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.yaml_files import read_yaml
 from wbgs_jax.measured.tables import found, numbers, read_table
@@ -64,10 +65,10 @@ def _rssi(path: Path) -> Float[np.ndarray, "n r"]:
 
 
 def _csi(path: Path) -> Float[np.ndarray, "n r"]:
-    try:
+    advice = "it must hold complex numbers (transmitter, antenna, subcarrier)"
+    with told(str(path), advice):
+        check_file(path, str(path), advice)
         state = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"cannot read {path}: {error}") from None
     if not isinstance(state, np.ndarray) or state.ndim != 3 or not np.iscomplexobj(state):
         raise UserError(f"{path} must hold complex numbers (transmitter, antenna, subcarrier)")
     power = np.mean(np.abs(state.astype(np.complex128)) ** 2, -1)

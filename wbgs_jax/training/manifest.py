@@ -1,5 +1,6 @@
 """`manifest.json` of a run folder: everything that somebody else needs to know of a run, in one file."""
 
+import contextlib
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,7 +28,8 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
     known: dict[str, Any] = {}
     if path.exists():
         before = read_json(path)
-        known = before.get("scores", {}) if before.get("training", {}).get("steps") == trained.step else {}
+        with contextlib.suppress(AttributeError, TypeError):  # what is no manifest has no scores
+            known = dict(before.get("scores", {})) if before.get("training", {}).get("steps") == trained.step else {}
     config, origin = trained.config, provenance(trained)
     scores = known | ({} if report is None else {report["part"]: _figures(report)})
     write_json(

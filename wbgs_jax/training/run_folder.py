@@ -16,7 +16,9 @@ import jax.numpy as jnp
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
-from wbgs_jax.config import Settings, from_dict, sections, to_dict
+from wbgs_jax._util.pytree import replaced
+from wbgs_jax._util.typed import misfit
+from wbgs_jax.config import Settings, check, from_dict, sections, to_dict
 from wbgs_jax.data.checksum import check_data
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset, source_paths
@@ -28,7 +30,7 @@ from wbgs_jax.data.splits import (
     select_receivers,
     unseen_frequencies,
 )
-from wbgs_jax.fields import Field, get_field
+from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.inference import confidence, neighbours
 from wbgs_jax.inference.confidence import Confidence, PowerConfidence, read_confidence, read_power_confidence
 from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
@@ -127,11 +129,23 @@ def read_config(folder: Path) -> RunConfig:
         values = {f.name: values[f.name] for f in dataclasses.fields(RunConfig)}
     except (KeyError, TypeError) as error:
         raise UserError(f"{path} lacks {error}; it belongs to another version of wbgs-jax: train again") from error
-    default = get_field(values["field"]).presets[FIRST_PRESET]
-    settings = from_dict(values["settings"], default, values["field"])
-    return RunConfig(
-        **values | {"settings": settings, "train_ghz": tuple(values["train_ghz"]), "test_box": tuple(values["test_box"])}
-    )
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    if values["field"] not in field_names():
+        raise UserError(f"{path} names a field that is not known, {str(values['field'])[:40]!r}; mend it, or train again")
+    kind = get_field(values["field"])
+    settings = from_dict(values.pop("settings"), kind.presets[FIRST_PRESET], kind.name)
+    for section, part in sections(settings, kind.name).items():
+        _demand_types(path, part, f"{section}.")
+    check(settings)
+    kind.check(settings.field)
+    config = replaced(RunConfig("", "", "", 0, None, settings), **values)  # unchecked, until the next line
+    _demand_types(path, config, "")
+    return config
+
+
+def _demand_types(path: Path, value: Any, prefix: str) -> None:
+    if wrong := misfit(value):
+        raise UserError(f"{path} is damaged ({prefix}{wrong}); mend it, or train again")
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:

@@ -1,0 +1,101 @@
+"""Arrays of numbers from MATLAB's files (.mat of version 5, as SciPy and DeepMIMO write them), and nothing else from there.
+
+SciPy's own reader follows damaged sizes out of its memory and takes the process with it; this one looks at every size first.
+"""
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from wbgs_jax._util.archives import MOST_BYTES, check_file, told
+
+HEADER, MATRIX, COMPRESSED = 128, 14, 15
+STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+"""Types of elements."""
+CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+"""Types of arrays; characters, cells and structures are left out."""
+COMPLEX = 0x08
+MOST_AXES = 16
+ADVICE = "give a .mat file of version 5 (MATLAB: save -v7), or an .npz file"
+
+
+class Element(NamedTuple):
+    """A piece of a file."""
+
+    type: int
+    content: memoryview
+
+
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays of numbers of a .mat file by name.
+
+    Raises:
+        UserError: the file is missing, damaged, or of another version.
+    """
+    with told(str(path), ADVICE):
+        check_file(path, str(path), ADVICE)
+        whole = memoryview(path.read_bytes())
+        order = {b"IM": "<", b"MI": ">"}.get(bytes(whole[126:HEADER]))
+        if order is None:
+            raise ValueError("it is no .mat file of version 5")
+        return dict(_arrays(whole[HEADER:], order))
+
+
+def _arrays(content: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
+    for element in _elements(content, order):
+        if element.type == COMPRESSED:
+            yield from _arrays(_unfolded(element.content), order)
+        elif element.type == MATRIX and (found := _array(element.content, order)):
+            yield found
+
+
+def _unfolded(content: memoryview) -> memoryview:
+    machine = zlib.decompressobj()
+    found = machine.decompress(content, MOST_BYTES)
+    if machine.unconsumed_tail:
+        raise ValueError("it unfolds to more than fits the memory")
+    return memoryview(found)
+
+
+def _elements(content: memoryview, order: str) -> Iterator[Element]:
+    """Gives the elements of a piece: a type, a size and so many bytes; those of four bytes and fewer are packed."""
+    place = 0
+    while place + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, place)
+        start = place + 8
+        if kind >> 16:
+            kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
+        if start + size > len(content) or (start == place + 4 and size > 4):
+            raise ValueError("it ends before its content does")
+        yield Element(kind, content[start : start + size])
+        # Compressed elements follow each other without a gap, all others start at multiples of eight bytes.
+        place = place + 8 if start == place + 4 else start + size + (0 if kind == COMPRESSED else -size % 8)
+
+
+def _array(content: memoryview, order: str) -> tuple[str, np.ndarray] | None:
+    """Returns name and values of an array of numbers, None of anything else."""
+    flags, sizes, name, *parts = _elements(content, order)
+    kind = struct.unpack_from(f"{order}I", flags.content)[0]
+    dtype = CLASSES.get(kind & 0xFF)
+    if dtype is None:
+        return None
+    shape = np.frombuffer(sizes.content, f"{order}i4").tolist()
+    if not 2 <= len(shape) <= MOST_AXES or min(shape) < 0:
+        raise ValueError(f"an array in it has the shape {shape[:MOST_AXES]}")
+    values = [_numbers(part, order, dtype, shape) for part in parts[: 1 + bool(kind >> 8 & COMPLEX)]]
+    label = bytes(name.content).decode("ascii", errors="replace")
+    return label, values[0] if len(values) == 1 else values[0] + 1j * values[1]
+
+
+def _numbers(element: Element, order: str, dtype: str, shape: list[int]) -> np.ndarray:
+    if element.type not in STORED:
+        raise ValueError(f"numbers in it are of the unknown type {element.type}")
+    found = np.frombuffer(element.content, order + STORED[element.type])
+    if len(found) != math.prod(shape):
+        raise ValueError(f"an array in it has {len(found)} numbers, and should have {math.prod(shape)}")
+    return found.astype(dtype).reshape(shape, order="F")
