@@ -11,6 +11,14 @@ from .applications.coverage import tenth_percentile as tenth_percentile
 from .applications.locate import Located as Located
 from .applications.locate import Locator as Locator
 from .applications.locate import locator as locator
+from .applications.reflector import Reflector as Reflector
+from .applications.reflector import place_reflector as place_reflector
+from .applications.reflector import reflector as reflector
+from .applications.reflector import straight_powers as straight_powers
+from .applications.turning import arrivals_anywhere as arrivals_anywhere
+from .applications.turning import boresight_quaternion as boresight_quaternion
+from .applications.turning import power_when_turned as power_when_turned
+from .applications.turning import turn_array as turn_array
 from .data.load import load_dataset as load_dataset
 from .data.scene_file import load_scene as load_scene
 from .data.scene_file import save_scene as save_scene

@@ -10,7 +10,8 @@ from synthetic import tiny_dataset
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
-from wbgs_jax.radio.channel import decibels
+from wbgs_jax.propagation.paths import REFLECTED
+from wbgs_jax.radio.channel import Arrivals, decibels
 
 BEAMS = beams_of(planar_array())
 
@@ -23,7 +24,7 @@ class MirrorsField(Field):
     images: int = static(default=5)
 
     name: ClassVar[str] = "mirrors"
-    gives: ClassVar = ("pas", "snapshots", "power")
+    gives: ClassVar = ("pas", "snapshots", "power", "paths")
 
     def init(self, key):
         return {"loss": jnp.float32(0.5)}
@@ -34,18 +35,30 @@ class MirrorsField(Field):
     def anywhere(self, params):
         return self, params
 
-    def render(self, params, plan, query):
+    def waves(self, params, plan, query):
+        """Ways to the images, (b, images, 3), and powers."""
         sign = jnp.array([[1, 1, 1], [1, 1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]], jnp.float32)
         offset = jnp.array([[0, 0, 0], [0, 0, 0], [0, 0, 5.6], [0, 5.0, 0], [6.0, 0, 0]], jnp.float32)
         away = query.tx_position[:, None] * sign + offset - plan.position
         away, strength = away[:, : self.images], jnp.array([1.0, *[params["loss"]] * 4])[: self.images]
         distance = jnp.linalg.norm(away, axis=-1)
-        power = (strength / distance) ** 2 / query.frequency_hz[:, None] * 1e9
+        return away, (strength / distance) ** 2 / query.frequency_hz[:, None] * 1e9
+
+    def render(self, params, plan, query):
+        away, power = self.waves(params, plan, query)
+        distance = jnp.linalg.norm(away, axis=-1)
         waves = steering_vector(jnp.asarray(planar_array(), jnp.float32), away / distance[..., None])
         weighted = waves * (power / power.sum(-1, keepdims=True))[..., None] / 16
         covariance = jnp.einsum("bke,bkf->bef", weighted, waves.conj())
         pas = covariance_to_pas(covariance, BEAMS)
         return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance)
+
+    def arrivals(self, params, plan, query):
+        away, power = self.waves(params, plan, query)
+        distance, amplitude = jnp.linalg.norm(away, axis=-1), jnp.sqrt(power).astype(jnp.complex64)
+        polarised = jnp.stack([amplitude, 0 * amplitude], -1)
+        met = jnp.zeros((*distance.shape, 5), jnp.int32).at[:, 1:, 0].set(REFLECTED)
+        return Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
 
 
 @dataclass(frozen=True)
@@ -67,3 +80,9 @@ class Trained:
 def trained(images=5) -> Trained:
     field = MirrorsField(images=images)
     return Trained(field, field.init(jax.random.key(0)))
+
+
+class Blind(MirrorsField):
+    """One that knows no paths."""
+
+    gives: ClassVar = ("pas", "snapshots", "power")

@@ -1,0 +1,266 @@
+"""Where to hang a flat metal plate so that places are covered which see the transmitter badly.
+
+The wave off a plate comes from the transmitter's mirror image in the plate's plane, as far as the plate reaches over the point
+where it is reflected. That point, the length of the path and the share of the wave that the plate catches are closed forms of
+the plate's pose, and so is their gradient; what stands between plate and ends is asked of a trained field. The plate is no part
+of the field's mesh: waves that meet it and another wall are not counted.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.applications.coverage import NARROWEST_M, Powers, soft_minimum
+from wbgs_jax.applications.descent import Descended, best_apart, descend, grid_over, in_blocks, shrinking
+from wbgs_jax.fields import Field
+from wbgs_jax.propagation.paths import TRANSMITTED
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, squared_magnitude
+from wbgs_jax.radio.channel import decibels, free_space_db
+from wbgs_jax.radio.patterns import zenith_vector
+from wbgs_jax.types import Query, make_receiver
+
+STEPS = 60
+STEEPEST = 1.45
+"""Largest angle of the normal above or below the horizon, radians: straight up its azimuth would mean nothing."""
+NEAREST_M = 1e-3
+"""Smallest distance that counts, so that gradients stay finite."""
+
+
+@dataclass(frozen=True)
+class Reflector:
+    """A flat rectangular plate of metal between one transmitter and some users. Make it with `reflector`.
+
+    A pose is (5,): the plate's centre x, y, z (world frame, metres), and azimuth and elevation of its normal (radians). Two of
+    its sides are level.
+    """
+
+    transmitter: Float[Array, "3"]
+    users: Float[Array, "users 3"]
+    size: Float[Array, "2"]
+    """Length of the level sides and of the others, metres."""
+    frequencies_hz: Float[Array, " f"]
+    legs: Powers | None
+    """(places of the plate (k, 3), blur) -> powers (dB) straight from there to the transmitter and to every user; None: nothing
+    is in the way."""
+
+    def power_db(self, poses: Float[Array, "k 5"], blur: Any = 0.0) -> Float[Array, "k users"]:
+        """Returns the power that every user gets over the plate (dB, relative to the transmitted power, mean over the
+        frequencies); differentiable in reverse mode.
+
+        Args:
+            poses: of the plate.
+            blur: metres by which the plate's edges are washed out, so that a plate that just misses a user feels it.
+        """
+        return self._over(poses, self._in_the_way(poses[:, :3], blur), blur)
+
+    def aimed(self, centres: Float[Array, "k 3"]) -> Float[Array, "k users 5"]:
+        """Returns the poses of plates at K places that send the transmitter's wave to one user each: the normal halves the
+        angle between the ways to the two."""
+        to_tx = _unit(self.transmitter - centres)[:, None]
+        normal = _unit(to_tx + _unit(self.users - centres[:, None]))
+        angles = [jnp.arctan2(normal[..., 1], normal[..., 0]), jnp.arcsin(jnp.clip(normal[..., 2], -1, 1))]
+        at = jnp.broadcast_to(centres[:, None], normal.shape)
+        return jnp.concatenate([at, angles[0][..., None], jnp.clip(angles[1], -STEEPEST, STEEPEST)[..., None]], -1)
+
+    def best_aimed(self, centres: Float[Array, "k 3"], loss: Callable[[Array], Array], blur: Any) -> Any:
+        """Returns of K places the pose (k, 5) of least loss among those that are aimed at one user, and that loss (k,)."""
+        poses, in_the_way = self.aimed(centres), self._in_the_way(centres, blur)
+        tried = jax.vmap(lambda some: loss(self._over(some, in_the_way, blur)), 1, 1)(poses)
+        best = jnp.argmin(tried, 1)[:, None]
+        return jnp.take_along_axis(poses, best[..., None], 1)[:, 0], jnp.take_along_axis(tried, best, 1)[:, 0]
+
+    def _in_the_way(self, centres: Float[Array, "k 3"], blur: Any) -> Float[Array, "k users"]:
+        """Returns what walls take away from a plate at K places (dB, 0 or less), on both legs together."""
+        if self.legs is None:
+            return jnp.zeros((len(centres), len(self.users)))
+        ends = jnp.concatenate([self.transmitter[None], self.users])
+        away = _length(centres[:, None] - ends)
+        free = jnp.mean(_friis(away, self.frequencies_hz), -1)
+        lost = jnp.minimum(self.legs(centres, blur) - free, 0)
+        return lost[:, :1] + lost[:, 1:]
+
+    def _over(self, poses: Float[Array, "k 5"], in_the_way: Float[Array, "k users"], blur: Any) -> Float[Array, "k users"]:
+        one = jax.vmap(self._share_of_one, (None, 0, 0, None))  # over users
+        power = jax.vmap(one, (0, None, 0, None))(poses, self.users, in_the_way, jnp.asarray(blur, poses.dtype))
+        return jnp.mean(power, -1)
+
+    def _share_of_one(
+        self, pose: Float[Array, "5"], user: Float[Array, "3"], in_the_way: Float[Array, ""], blur: Array
+    ) -> Float[Array, " f"]:
+        """Returns the power of one user from one plate at all frequencies, dB."""
+        normal, level, up = plate_axes(pose[3:])
+        here, there = (end - pose[:3] for end in (self.transmitter, user))
+        before, behind = here @ normal, there @ normal
+        image = here - 2 * before * normal
+        # Where the straight way from the mirror image to the user meets the plane; weights alone, so that nothing divides by 0.
+        share = jnp.abs(before) / jnp.maximum(jnp.abs(before) + jnp.abs(behind), NEAREST_M)
+        point = image + share * (there - image)
+        first, second, whole = _length(point - here), _length(there - point), _length(there - image)
+        arriving = (point - here) / first
+        caught = [
+            _caught(point @ axis, half, arriving @ axis, first * second / whole, self.frequencies_hz, blur)
+            for axis, half in ((level, self.size[0] / 2), (up, self.size[1] / 2))
+        ]
+        leaving = (there - point) / second
+        field = zenith_vector(arriving)
+        mirrored = 2 * (field @ normal) * normal - field  # of the electric field off a metal
+        turned = mirrored @ zenith_vector(-leaving)
+        amplitude = jnp.where(before * behind > 0, caught[0] * caught[1] * turned, 0)
+        return decibels(amplitude**2) + _friis(whole, self.frequencies_hz) + in_the_way
+
+
+def reflector(
+    transmitter: Any,
+    users: Any,
+    size: tuple[float, float],
+    frequencies_hz: Any,
+    field: Field | None = None,
+    params: Any = None,
+) -> Reflector:
+    """Returns a metal plate between a transmitter and users, whose powers are a function of its pose.
+
+    Antennas are isotropic and vertically polarised.
+
+    Args:
+        transmitter: (3,), world frame, metres.
+        users: (users, 3), the same.
+        size: of the plate, metres: level sides, and the others.
+        frequencies_hz: (f,) or one, hertz.
+        field, params: a trained field that knows paths, to be asked for the walls between plate and ends; without them there
+            are none. Every end is planned and compiled by itself: a dozen take a minute.
+
+    Raises:
+        UserError: a side is not longer than 0, or the field knows no paths or none elsewhere than at its receivers.
+    """
+    if not min(size) > 0:
+        raise UserError(f"a plate of {size[0]:g} m x {size[1]:g} m reflects nothing; give two sides above 0")
+    ends = np.concatenate([np.reshape(transmitter, (1, 3)), np.atleast_2d(users)]).astype(np.float32)
+    frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
+    legs = None if field is None else straight_powers(field, params, ends, frequencies)
+    return Reflector(jnp.asarray(ends[0]), jnp.asarray(ends[1:]), jnp.asarray(size, jnp.float32), frequencies, legs)
+
+
+def straight_powers(field: Field, params: Any, ends: Any, frequencies_hz: Any) -> Powers:
+    """Returns the powers (dB, mean over the frequencies) that go straight from any place to some ends, through whatever walls
+    stand between: no reflections, no diffraction.
+
+    Args:
+        field, params: a trained field that knows paths; of it the part that holds anywhere.
+        ends: (ends, 3), world frame, metres.
+        frequencies_hz: (f,) or one, hertz.
+
+    Raises:
+        UserError: the field knows no paths, or holds nowhere else than at its receivers.
+    """
+    if "paths" not in field.known():
+        raise UserError(f"the {field.name} field knows no paths, and so not what stands in the way; train --field wave or hybrid")
+    field, params = field.anywhere(params)
+    one = np.zeros((1, 3))  # an antenna, no array
+    plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]
+    frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
+
+    def at(plan: Any, places: Float[Array, "k 3"], frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
+        arrived = field.arrivals(params, plan, Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1])))
+        assert arrived.interaction is not None, "arrivals of traced paths have them"
+        straight = jnp.all(arrived.interaction <= TRANSMITTED, -1)
+        return decibels(jnp.sum(jnp.where(straight, squared_magnitude(arrived.amplitude), 0), -1))
+
+    def powers(places: Any, blur: Any = 0.0) -> Float[Array, "k ends"]:
+        places = jnp.asarray(places, jnp.float32)
+        each = [jnp.mean(jax.vmap(lambda f, plan=plan: at(plan, places, f))(frequencies), 0) for plan in plans]
+        return jnp.stack(each, -1)
+
+    return powers
+
+
+def place_reflector(
+    plate: Reflector,
+    without_db: Any,
+    box: Any,
+    aim: Callable[[Float[Array, "k users"]], Float[Array, " k"]] = soft_minimum,
+    step: float = 0.5,
+    starts: int = 4,
+) -> Descended:
+    """Returns where a plate serves its users best: `place` (starts, 5), poses, the best one first, and `loss`, minus the aim (dB).
+
+    At every place of a grid the plate is aimed at one user after the other; the best poses that stand apart are followed by
+    gradient steps of all five numbers, under edges that are ever less washed out.
+
+    Args:
+        plate: of `reflector`.
+        without_db: (users,), what every user gets without the plate, dB (`power_at_users` at the transmitter); powers add up.
+        box: (2, 3), lowest and highest corner of where its centre may be, metres.
+        aim: of the users' powers, to be as large as possible, as in `place_antenna`.
+        step: metres between places of the grid.
+        starts: poses that gradient steps begin from.
+    """
+    before = 10 ** (jnp.asarray(without_db, jnp.float32) / 10)
+    centres = grid_over(np.asarray(box, np.float32), step)
+    low_high = jnp.concatenate([jnp.asarray(box, jnp.float32), jnp.array([[-10.0, -STEEPEST], [10.0, STEEPEST]])], 1)
+    count = min(starts, len(centres))
+
+    def loss_of(over_plate_db: Float[Array, "k users"]) -> Float[Array, " k"]:
+        return -aim(decibels(before + 10 ** (over_plate_db / 10)))
+
+    def loss(poses: Float[Array, "k 5"], blur: Any) -> Float[Array, " k"]:
+        return loss_of(plate.power_db(poses, blur))
+
+    @jax.jit
+    def search(centres: Float[Array, "n 3"]) -> Descended:
+        def tried(block: Float[Array, "k 3"]) -> Float[Array, "k 6"]:
+            poses, losses = plate.best_aimed(block, loss_of, step / 2)
+            return jnp.concatenate([poses, losses[:, None]], -1)
+
+        found = in_blocks(tried, centres)
+        chosen = best_apart(centres, found[:, 5], count, 1.5 * step)
+        return descend(loss, found[chosen, :5], low_high, shrinking(step / 2, min(NARROWEST_M, step / 2), STEPS))
+
+    return search(jnp.asarray(centres))
+
+
+def plate_axes(angles: Float[Array, "2"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Returns unit vectors of a plate whose normal has this azimuth and elevation (radians): the normal, along the level sides,
+    and along the others."""
+    (ca, ce), (sa, se) = jnp.cos(angles), jnp.sin(angles)
+    zero = jnp.zeros_like(ca)
+    return jnp.stack([ce * ca, ce * sa, se]), jnp.stack([-sa, ca, zero]), jnp.stack([-se * ca, -se * sa, ce])
+
+
+def _caught(
+    aside: Array, half: Array, slant: Array, focal: Array, frequencies_hz: Float[Array, " f"], blur: Array
+) -> Float[Array, " f"]:
+    """Returns the share of the wave's amplitude that a plate catches along one axis: 1 where it reaches many Fresnel zones to
+    both sides, 1/2 at its edge.
+
+    The Fresnel integral without its ripples: an error function of the same limits for plates that are large and for plates that
+    are small against the first Fresnel zone, whose square is the radar equation of a flat plate.
+
+    Args:
+        aside: metres along the axis from the plate's centre to the point of reflection.
+        half: of the side, metres.
+        slant: cosine between the axis and the wave's direction.
+        focal: product of both ways over their sum, metres.
+        frequencies_hz: hertz.
+        blur: metres.
+    """
+    zone = SPEED_OF_LIGHT / frequencies_hz * focal / jnp.maximum(1 - slant**2, NEAREST_M)
+    width = jnp.sqrt(zone / jnp.pi + blur**2)
+    return (jax.scipy.special.erf((half - aside) / width) + jax.scipy.special.erf((half + aside) / width)) / 2
+
+
+def _friis(metres: Float[Array, "*n"], frequencies_hz: Float[Array, " f"]) -> Float[Array, "*n f"]:
+    return free_space_db(*jnp.broadcast_arrays(metres[..., None], frequencies_hz))
+
+
+def _length(vectors: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+    return jnp.sqrt(jnp.maximum(jnp.sum(vectors**2, -1), NEAREST_M**2))
+
+
+def _unit(vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    return vectors / _length(vectors)[..., None]
