@@ -4,6 +4,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
+import contextlib
 import dataclasses
 import sys
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import tyro
 from wbgs_jax._util.command import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.processes import by_first, connect, is_first
 from wbgs_jax.config import Settings, check, from_sections, sections
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import source_names
@@ -67,6 +69,10 @@ class Command:
     """Look at this receiver alone, of data that have several."""
     neighbours: bool = True
     """Ask known spectra nearby beside the field, where that gains on validation (docs/inference.md)."""
+    devices: int = 0
+    """Devices of this machine that share every batch, at most; 0: all that can share it evenly (docs/scaling.md)."""
+    distributed: bool = False
+    """One of several processes that train together, started by srun or mpirun (docs/scaling.md)."""
 
 
 def default_preset() -> str:
@@ -147,25 +153,34 @@ def default_folder(dataset: Dataset, config: RunConfig) -> Path:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     use_compilation_cache()
-    command, settings = parse(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if "--distributed" in arguments:  # before JAX looks for devices, for which `parse` asks
+        connect()
+    command, settings = parse(arguments)
     config = run_config(command, settings)
     dataset = config.dataset()
     check_data(dataset, get_field(config.field))
     folder = command.out or default_folder(dataset, config)
-    prepare_folder(folder, config, command.resume)
+    by_first(lambda: prepare_folder(folder, config, command.resume))
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
-    say(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
-    with locked(folder):
+    tell = say if is_first() else _nothing
+    tell(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
+    with contextlib.ExitStack() as stack:
+        by_first(lambda: stack.enter_context(locked(folder)))
         steps = checkpoint_steps(folder / "checkpoints")
         if steps:
-            say(f"going on from the checkpoint of step {steps[-1]}")
+            tell(f"going on from the checkpoint of step {steps[-1]}")
         for line in opening_lines(folder, config, steps[-1] if steps else 0):
-            say(line)
-        result = train(dataset, config.field, config.settings, config.seed, folder, command.resume)
-        learn_beside(result, dataset, config, folder)
-        write_manifest(folder, load_trained(folder))
-    say(summary(result, folder))
-    say(f"next: wbgs-jax eval --run {folder}   (scores on held-out transmitters, and pictures)")
+            tell(line)
+        result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
+        by_first(lambda: learn_beside(result, dataset, config, folder))
+        by_first(lambda: write_manifest(folder, load_trained(folder)))
+    tell(summary(result, folder))
+    tell(f"next: wbgs-jax eval --run {folder}   (scores on held-out transmitters, and pictures)")
+
+
+def _nothing(line: str) -> None:
+    """Keeps a line to itself."""
 
 
 def opening_lines(folder: Path, config: RunConfig, done: int) -> list[str]:

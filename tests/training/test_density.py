@@ -15,7 +15,8 @@ from wbgs_jax.config import DensityConfig
 from wbgs_jax.fields.wideband import WidebandField, WidebandParams
 from wbgs_jax.training.controls import Context, Edit
 from wbgs_jax.training.density import DensityControl, DensityStatistics, choose, control_density, reset_attenuation
-from wbgs_jax.training.loop import Run, _map_like
+from wbgs_jax.training.loop import Run
+from wbgs_jax.training.moments import map_moments
 from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.step import TrainState
 from wbgs_jax.types import Gaussians
@@ -74,7 +75,7 @@ def edited(state, config, seed=0) -> Edit:
 def control(state, config=CONFIG, seed=0) -> Done:
     """As the loop does it."""
     edit = edited(state, config, seed)
-    new = TrainState(edit.params, _map_like(state, edit.moments), (edit.statistics,), state.step)
+    new = TrainState(edit.params, map_moments(state.optimizer, state.params, edit.moments), (edit.statistics,), state.step)
     return Done(new, edit.report["density"])
 
 
@@ -192,7 +193,10 @@ def test_a_reset_lowers_the_high_and_forgets_their_moments_only(state):
     old = np.asarray(state.params.gaussians.opacity_logits)
     np.testing.assert_allclose(edit.params.gaussians.opacity_logits, np.minimum(old, ceiling), rtol=1e-6)
     assert float(edit.params.gaussians.opacity_logits[USELESS]) == -9
-    before, after = per_gaussian(state), per_gaussian(dataclasses.replace(state, optimizer=_map_like(state, edit.moments)))
+    before, after = (
+        per_gaussian(state),
+        per_gaussian(dataclasses.replace(state, optimizer=map_moments(state.optimizer, state.params, edit.moments))),
+    )
     assert before.keys() == after.keys()
     for path, moments in after.items():
         if "opacity_logits" in path.split(".gaussians.")[1]:

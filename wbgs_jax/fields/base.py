@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, Key
 
+from wbgs_jax._util.devices import over_all_links
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves
 from wbgs_jax.config import PRESETS, Settings
@@ -178,6 +179,10 @@ class Field(ABC):
         """Returns parameters in which one material has another relative permittivity and conductivity at 1 GHz, S/m (host)."""
         raise NotImplementedError("a field without `electrical` has no materials")
 
+    def with_thickness(self, plan: Any, material: int, metres: float) -> tuple["Field", Any]:
+        """Returns the field and a plan in which all walls of one material are this thick, whatever data or training say (host)."""
+        raise NotImplementedError("a field without `electrical` has no materials")
+
     def blurred(self, params: Any, metres: Float[Array, ""] | float) -> Any:
         """Returns parameters whose spectra and powers are means over transmitters that stand about so many metres (standard
         deviation along each axis) from where they are asked for: without the fringes of interference that change over less.
@@ -245,7 +250,8 @@ def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
     if seen.power_db is None or received is None:
         return None
     heard = received > NOT_HEARD_DB
-    return jnp.sum(jnp.abs(seen.power_db - received) * heard) / jnp.maximum(jnp.sum(heard), 1)
+    error, count = jnp.sum(jnp.abs(seen.power_db - received) * heard), jnp.sum(heard)
+    return over_all_links(error) / jnp.maximum(over_all_links(count), 1)
 
 
 def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any = None) -> Float[Array, "b 90 360"]:

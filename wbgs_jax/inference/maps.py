@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from wbgs_jax._util.devices import own_devices
 from wbgs_jax.inference.predictor import BLOCK, Predictor
 
 
@@ -14,11 +15,12 @@ def predict_blocks(
 ) -> Iterator[Float[np.ndarray, " k *answer"]]:
     """Returns spectra or powers (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
 
-    Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation.
+    Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation. Where there
+    are several devices a block is for each of them, and `predictor` divides it.
     """
     positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
-    n = len(positions)
+    n, block = len(positions), block * own_devices().count
 
     def part(start: int) -> Float[np.ndarray, " k *answer"]:
         index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up

@@ -8,8 +8,10 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
+from wbgs_jax._util.devices import Devices, own_devices, spread
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
@@ -102,7 +104,7 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
-    return on_any_shape(lambda query: render_pas(trained.field, trained.params, plan, query, neighbours))
+    return on_any_shape(_shared(render_pas, (trained.field, trained.params, plan), (neighbours,)))
 
 
 def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
@@ -115,7 +117,7 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
     dataset = trained.dataset()
     check_power(trained.field, dataset)
     plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
-    return on_any_shape(lambda query: _render_power(trained.field, trained.params, plan, query), ())
+    return on_any_shape(_shared(_render_power, (trained.field, trained.params, plan)), ())
 
 
 def check_power(field: Field, dataset: Dataset) -> None:
@@ -126,6 +128,31 @@ def check_power(field: Field, dataset: Dataset) -> None:
         raise UserError(
             f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
         )
+
+
+def _shared(render: Callable[..., Any], before: tuple[Any, ...], after: tuple[Any, ...] = ()) -> Callable[[Query], Any]:
+    """Returns a function of a query, which stands between other arguments of `render`. Several devices divide more than `BLOCK`
+    queries, if that goes evenly and nobody differentiates, transforms or compiles them."""
+    devices = own_devices()
+
+    def ask(query: Query) -> Any:
+        count, traced = query.frequency_hz.shape[0], isinstance(query.tx_position, jax.core.Tracer)
+        if devices.count == 1 or count <= BLOCK or count % devices.count or traced:
+            return render(*before, query, *after)
+        *known, beside = devices.kept(*before, after)
+        return _divided(*known, query, beside, render, devices.mesh)
+
+    return ask
+
+
+@partial(jax.jit, static_argnums=(5, 6))
+def _divided(
+    field: Field, params: Any, plan: Any, query: Query, beside: tuple[Any, ...], render: Callable[..., Any], mesh: Mesh
+) -> Any:
+    def own(query: Query, field: Field, params: Any, plan: Any, beside: tuple[Any, ...]) -> Any:
+        return render(field, params, plan, query, *beside)
+
+    return spread(own, mesh, divided=0)(query, field, params, plan, beside)
 
 
 @jax.jit
@@ -143,13 +170,23 @@ def render_pas(
     return correct(neighbours, field.render(params, plan, query).pas, query)
 
 
-@partial(jax.jit, static_argnames=("quantity",))
+@partial(jax.jit, static_argnames=("quantity", "mesh"))
 def _observe(
-    field: Field, params: Any, plan: Any, cache: Any, links: Links, neighbours: Neighbours | None, quantity: str | None
+    field: Field,
+    params: Any,
+    plan: Any,
+    cache: Any,
+    neighbours: Neighbours | None,
+    links: Links,
+    quantity: str | None,
+    mesh: Mesh | None,
 ) -> Any:
-    seen = field.render_links(params, plan, cache, links)
-    seen = seen._replace(pas=correct(neighbours, seen.pas, links.query))
-    return getattr(seen, quantity) if quantity else seen
+    def own(links: Links, field: Field, params: Any, plan: Any, cache: Any, neighbours: Neighbours | None) -> Any:
+        seen = field.render_links(params, plan, cache, links)
+        seen = seen._replace(pas=correct(neighbours, seen.pas, links.query))
+        return getattr(seen, quantity) if quantity else seen
+
+    return spread(own, mesh, divided=0)(links, field, params, plan, cache, neighbours)
 
 
 def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:
@@ -175,16 +212,18 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
     """Returns what a field says of some of a dataset's links, as NumPy arrays in their order.
 
     What it can know of links beforehand is prepared once; links are rendered in blocks of one shape, receiver by receiver.
+    Several devices divide every block.
     """
-    links = dataset.links(index)
+    links, devices = dataset.links(index), _devices(len(index))
     cache = field.prepare(links, dataset.receivers)
 
     def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Observation]]:
         for number in np.unique(dataset.receiver_index[index]):
             plan = field.plan(params, dataset.receiver(int(number)), None, cache)
             of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
-            for block, filled in _blocks(of_receiver, BLOCK):
-                yield block, _observe(field, params, plan, cache, _taken(links, filled), None, None)
+            known = devices.replicated((field, params, plan, cache))
+            for block, filled in _blocks(of_receiver, BLOCK * devices.count):
+                yield block, _observe(*known, None, _taken(links, filled), None, devices.mesh)
 
     return _gathered(answers(), len(index))
 
@@ -194,9 +233,11 @@ def observe_queries(trained: Trained, receiver: Receiver, query: Query, quantity
     with what the neighbours say, or one of its quantities by name (nothing else is computed then).
 
     What is known of a transmitter serves all of its frequencies. Powers have no scale where the data had none (`check_power`).
+    Several devices divide the queries.
     """
     field, params, neighbours = trained.field, trained.params, for_receiver(trained.neighbours, receiver)
     count = len(query.frequency_hz)
+    devices = _devices(count)
     tx_index = jnp.asarray(group_transmitters(np.asarray(query.tx_position)), jnp.int32)
     links = Links(query, jnp.zeros(count, jnp.int32), tx_index)
 
@@ -205,10 +246,16 @@ def observe_queries(trained: Trained, receiver: Receiver, query: Query, quantity
             some = np.arange(start, min(start + PREPARED, count))
             cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
             plan = field.plan(params, receiver, None, cache)
-            for block, filled in _blocks(some, min(BLOCK, count)):
-                yield block, _observe(field, params, plan, cache, _taken(links, filled), neighbours, quantity)
+            known = devices.replicated((field, params, plan, cache, neighbours))
+            for block, filled in _blocks(some, min(BLOCK, count) * devices.count):
+                yield block, _observe(*known, _taken(links, filled), quantity, devices.mesh)
 
     return _gathered(answers(), count)
+
+
+def _devices(count: int) -> Devices:
+    """Returns the devices that divide so many queries: of a block's worth there is nothing to divide."""
+    return own_devices() if count > BLOCK else Devices()
 
 
 def _gathered(answers: Iterator[tuple[Int[np.ndarray, " k"], Any]], count: int) -> Any:

@@ -11,6 +11,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax._util.pytree import pytree
@@ -24,7 +25,7 @@ TILE_ROWS, TILE_COLUMNS = PAS_HEIGHT // TILE_HEIGHT, PAS_WIDTH // TILE_WIDTH
 N_TILES = TILE_ROWS * TILE_COLUMNS
 CHUNK = 16
 """Gaussians in a job."""
-NO_ENTRY = jnp.uint32(0xFFFFFFFF)
+NO_ENTRY = np.uint32(0xFFFFFFFF)
 
 
 @dataclass(frozen=True)

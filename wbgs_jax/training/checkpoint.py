@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.processes import is_first
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 STATE = "state"
@@ -59,7 +60,8 @@ def checkpoint_steps(folder: Path) -> list[int]:
 
 
 def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, Any], keep: int) -> None:
-    """Writes a checkpoint (replacing one of the same step) and removes the oldest beyond `keep`."""
+    """Writes a checkpoint (replacing one of the same step) and removes the oldest beyond `keep`. Of several processes all call
+    it with the same state; the first one writes."""
     from orbax.checkpoint import v1 as ocp
 
     target = (folder / str(step)).absolute()
@@ -82,8 +84,9 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
         raise UserError(
             f"cannot write checkpoint {target}: {reason}; {left}. Free some space and go on with --resume"
         ) from error
-    for old in checkpoint_steps(folder)[:-keep]:
-        shutil.rmtree(folder / str(old))
+    if is_first():
+        for old in checkpoint_steps(folder)[:-keep]:
+            shutil.rmtree(folder / str(old))
 
 
 def read(folder: Path, step: int) -> Saved:
@@ -93,10 +96,11 @@ def read(folder: Path, step: int) -> Saved:
     path = folder / str(step)
     with _explained(path), _quiet():
         _read_every_value(path / STATE)
-        metadata = ocp.metadata(path.absolute()).custom_metadata
-        if not metadata:  # Orbax gives None for a file that it cannot read
-            raise ValueError("no metadata")
-        found = {key: np.asarray(value) for key, value in ocp.load(path.absolute()).items()}
+        with _alone():
+            metadata = ocp.metadata(path.absolute()).custom_metadata
+            if not metadata:  # Orbax gives None for a file that it cannot read
+                raise ValueError("no metadata")
+            found = {key: np.asarray(value) for key, value in ocp.load(path.absolute()).items()}
         metadata = dict(metadata)
         expected = metadata.pop(DIGEST, None)  # older checkpoints have none
         found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.get(EMPTY, {}).items()}
@@ -134,6 +138,18 @@ def fill_like(saved: Saved, like: Any, prefix: str = "") -> Any:
 def _demand(fits: bool, saved: Saved) -> None:
     if not fits:
         raise UserError(f"checkpoint {saved.path} does not fit this configuration; start a new run in another OUT")
+
+
+def _alone() -> contextlib.AbstractContextManager[Any]:
+    """Lets Orbax read without waiting for other processes: one may be the only one to do so."""
+    from orbax.checkpoint import v1 as ocp
+
+    if jax.process_count() == 1:
+        return contextlib.nullcontext()
+    own = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"p{own}")
+    context: contextlib.AbstractContextManager[Any] = ocp.Context(multiprocessing_options=options)
+    return context
 
 
 @contextlib.contextmanager

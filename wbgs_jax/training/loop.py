@@ -6,6 +6,7 @@ made of is the field's business; the loop knows the seam alone (`fields.base.Fie
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Int
 
+from wbgs_jax._util.devices import devices_for
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.processes import any_process, by_first, check_alike, is_first
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.checksum import checksum
 from wbgs_jax.data.dataset import Dataset
@@ -30,6 +32,7 @@ from wbgs_jax.training.controls import Context, Control, Edit, OfPart
 from wbgs_jax.training.data import TrainingData, training_data
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
+from wbgs_jax.training.moments import map_moments
 from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.progress import TrainingProgress
 from wbgs_jax.training.search import Search
@@ -72,7 +75,7 @@ class TrainResult:
 class Run:
     """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
 
-    def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path):
+    def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, devices: int = 0):
         self.numbers = training_links(dataset)  # of the links, as the data count them
         self.checksum = checksum(dataset)
         dataset = without_test(dataset)  # nothing in a training can look at the test
@@ -90,6 +93,14 @@ class Run:
         rng = np.random.default_rng([seed, 1])
         watched = min(settings.loop.evaluate_spectra, len(dataset.validation))
         self.watched = np.sort(rng.choice(dataset.validation, watched, replace=False))
+        self.devices, idle = devices_for(self.batch, devices)
+        if idle and is_first():
+            warnings.warn(idle, stacklevel=2)
+
+    @property
+    def batch(self) -> int:
+        """Links a step."""
+        return min(self.settings.optim.batch, len(self.dataset.train))
 
     @property
     def step(self) -> int:
@@ -101,8 +112,7 @@ class Run:
         the same ones."""
         rng = np.random.default_rng([self.seed, 2, epoch])
         pool = self.pool(epoch * steps / self.settings.optim.steps)
-        batch = min(self.settings.optim.batch, len(self.dataset.train))
-        return np.stack([self._draw(rng, pool, batch) for _ in range(steps)]).astype(np.int32)
+        return np.stack([self._draw(rng, pool, self.batch) for _ in range(steps)]).astype(np.int32)
 
     def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, " n"], batch: int) -> Int[np.ndarray, " b"]:
         if self.dataset.n_receivers > 1:  # a receiver as often as its share of the links
@@ -127,18 +137,16 @@ class Run:
         batches = self.batches(self.step // length, length)
         done, figures = 0, dict[str, list[float]]()
         while done < length:
-            self.state, report = run_epoch(
-                self.state,
-                self.field,
-                self.cache,
-                self.data,
-                jnp.asarray(batches),
-                jnp.asarray(done, jnp.int32),
-                self.key,
+            state, report = run_epoch(
+                self.devices.replicated(self.state),
+                *self.devices.kept(self.field, self.cache, self.data),
+                *self.devices.replicated((jnp.asarray(batches), jnp.asarray(done, jnp.int32), self.key)),
                 optimizer=self.optimizer,
                 controls=self.controls,
                 limits=self.limits,
+                mesh=self.devices.mesh,
             )
+            self.state, report = self.devices.own((state, report))
             ran = slice(done, done + int(report.good_steps))
             for name, values in ({"loss": report.loss} | report.metrics).items():
                 figures.setdefault(name, []).extend(np.asarray(values)[ran].tolist())
@@ -170,6 +178,7 @@ class Run:
                 context = Context(self.data, self.cache, self.dataset.train)
                 edit = control.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
+                check_alike(self.state, f"what the {type(control).__name__} made of the parameters")
                 self.seconds += time.perf_counter() - begin
                 if edit.report:
                     self.log({"step": step} | edit.report)
@@ -180,7 +189,8 @@ class Run:
         if _shapes(edit.params) != _shapes(old.params):
             self.compilations += 1
             statistics = [control.statistics(edit.params) for control in self.controls]  # what others saw is of other shapes
-        moments = self.optimizer.init(edit.params) if edit.moments is None else _map_like(old, edit.moments)
+        follow = edit.moments
+        moments = map_moments(old.optimizer, old.params, follow) if follow else self.optimizer.init(edit.params)
         statistics[number] = edit.statistics
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
         if edit.field is not None:
@@ -208,18 +218,21 @@ class Run:
 
     def log(self, entry: dict[str, Any]) -> None:
         """Appends a line to metrics.jsonl."""
-        curves.append(self.folder / "metrics.jsonl", entry)
+        if is_first():
+            curves.append(self.folder / "metrics.jsonl", entry)
 
     def save(self) -> None:
         """Writes a checkpoint of the present step."""
         limits = dataclasses.asdict(self.limits) if self.limits else None
         metadata = {"limits": limits, "seconds": self.seconds, "data": self.checksum}
-        checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, self.settings.loop.keep_checkpoints)
+        keep = self.settings.loop.keep_checkpoints
+        check_alike(self.state, f"the state of step {self.step}")
+        checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, keep)
 
     def restore(self) -> bool:
         """Loads the newest checkpoint, if there is one, and returns whether there was."""
         steps = checkpoint.checkpoint_steps(self.checkpoints)
-        curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1)
+        by_first(lambda: curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1))
         if not steps:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
@@ -240,24 +253,6 @@ def _shapes(tree: Any) -> list[tuple[int, ...]]:
     return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-def _map_like(state: TrainState, function: Callable[[Any], Any]) -> Any:
-    """Returns the optimiser's state with every tree in it that is like the parameters transformed. In the tree of a group the
-    leaves of all others are masked."""
-    leaves, structure = jax.tree.flatten(state.params)
-    known: Any = structure
-
-    def alike(value: Any) -> bool:
-        own, found = jax.tree.flatten(value, is_leaf=_is_masked)
-        same = (_is_masked(a) or (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in zip(own, leaves, strict=False))
-        return bool(found == known) and not _is_masked(value) and all(same)
-
-    return jax.tree.map(lambda leaf: function(leaf) if alike(leaf) else leaf, state.optimizer, is_leaf=alike)
-
-
-def _is_masked(node: Any) -> bool:
-    return isinstance(node, optax.MaskedNode)
-
-
 def check_data(dataset: Dataset, field: type[Field]) -> None:
     """Raises a `UserError` for data that a field cannot be trained on, before any work is done."""
     if len(dataset.train) == 0:
@@ -269,8 +264,13 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
         )
 
 
-def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False) -> TrainResult:
+def train(
+    dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False, devices: int = 0
+) -> TrainResult:
     """Trains a field, by its name, and leaves checkpoints and curves in `folder`.
+
+    Every batch is shared by so many devices of every process, evenly; by default by all that can. Where there are several
+    processes (`jax.distributed`), all of them call this, and the first one writes.
 
     Raises:
         UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder,
@@ -280,11 +280,12 @@ def train(dataset: Dataset, field: str, settings: Settings, seed: int, folder: P
     """
     check_data(dataset, get_field(field))
     settings = limit_steps(settings, len(dataset.train))
-    run = Run(dataset, field, settings, seed, folder)
+    run = Run(dataset, field, settings, seed, folder, devices)
     if resume:
         run.restore()
+    check_alike((run.state, run.field), "what training begins with")
     total = settings.optim.steps
-    with deferred_interrupt() as interrupt, TrainingProgress(total, run.step) as progress:
+    with deferred_interrupt() as interrupt, TrainingProgress(total, run.step, is_first()) as progress:
         if run.step == 0:
             run.control()
         while run.step < total:
@@ -296,6 +297,7 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
     """Runs an epoch and all that is due after it."""
     before, loop = run.step, run.settings.loop
     figures = run.epoch()
+    interrupted = any_process(interrupt["set"])
     run.control()
     if run.step == total:
         run.calibrate()
@@ -305,9 +307,9 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
         entry |= run.evaluate()
     run.log(entry)
     progress.update(entry)
-    if _crosses(before, run.step, loop.checkpoint_every) or run.step == total or interrupt["set"]:
+    if _crosses(before, run.step, loop.checkpoint_every) or run.step == total or interrupted:
         run.save()
-    if interrupt["set"] and run.step < total:
+    if interrupted and run.step < total:
         raise Interrupted(
             f"stopped at step {run.step} of {total}; the state is saved: run the same command with --resume to go on"
         )

@@ -25,8 +25,8 @@ UNSHOWN = ("step", "seconds")
 class TrainingProgress:
     """Shows the figures of a training, steps a second and the time left, on stderr."""
 
-    def __init__(self, total: int, done: int = 0):
-        self.total, self.done, self.start_step = total, done, done
+    def __init__(self, total: int, done: int = 0, shown: bool = True):
+        self.total, self.done, self.start_step, self.shown = total, done, done, shown
         self.held_out: dict[str, float] = {}
         self.started = self.last_line = time.monotonic()
         self.console = Console(file=sys.stderr)
@@ -39,7 +39,7 @@ class TrainingProgress:
             TextColumn("left"),
             TimeRemainingColumn(),
             console=self.console,
-            disable=not self.console.is_terminal,
+            disable=not (shown and self.console.is_terminal),
         )
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
 
@@ -60,7 +60,8 @@ class TrainingProgress:
         rate = (step - self.start_step) / elapsed
         status = "  ".join([*figures, f"{rate:.1f} steps/s"])
         self.bar.update(self.task, completed=step, status=status)
-        if not self.console.is_terminal and (time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total):
+        due = time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total
+        if due and self.shown and not self.console.is_terminal:
             self.last_line = time.monotonic()
             left = (self.total - step) / max(rate, 1e-9)
             print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)

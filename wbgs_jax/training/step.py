@@ -11,8 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from wbgs_jax._util.devices import averaged
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields import Aux, Field
 from wbgs_jax.training.controls import Control
@@ -55,12 +57,25 @@ def init_state(params: Any, optimizer: optax.GradientTransformation, controls: t
 
 
 def loss_and_gradients(
-    field: Field, params: Any, cache: Any, data: TrainingData, index: Int[Array, " b"], limits: Any, key: Key[Array, ""]
+    field: Field,
+    params: Any,
+    cache: Any,
+    data: TrainingData,
+    index: Int[Array, " b"],
+    limits: Any,
+    key: Key[Array, ""],
+    mesh: Mesh | None = None,
 ) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
-    """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch."""
+    """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch. The devices of a mesh divide
+    the links evenly; the loss is the mean of theirs."""
+
+    def loss(index, params, probe, field, cache, data, key):
+        return field.loss(params, cache, data.batch(index, key), limits, probe)
+
+    shared = averaged(loss, mesh, divided=0)
 
     def objective(params, probe):
-        return field.loss(params, cache, data.batch(index, key), limits, probe)
+        return shared(index, params, probe, field, cache, data, key)
 
     return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, field.probe(params))
 
@@ -73,7 +88,7 @@ def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-@partial(jax.jit, static_argnames=("optimizer", "controls", "limits"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("optimizer", "controls", "limits", "mesh"), donate_argnames="state")
 def run_epoch(
     state: TrainState,
     field: Field,
@@ -86,12 +101,14 @@ def run_epoch(
     optimizer: optax.GradientTransformation,
     controls: tuple[Control, ...] = (),
     limits: Any = None,
+    mesh: Mesh | None = None,
 ) -> tuple[TrainState, EpochReport]:
-    """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away."""
+    """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away. With a mesh all
+    arguments are on all of its devices, and so are the results."""
 
     def run(state: TrainState, index: Int[Array, " b"]):
         (loss, aux), (gradients, probe) = loss_and_gradients(
-            field, state.params, cache, data, index, limits, jax.random.fold_in(key, state.step)
+            field, state.params, cache, data, index, limits, jax.random.fold_in(key, state.step), mesh
         )
         overflow = jnp.zeros((), bool) if aux.overflow is None else aux.overflow
         ok = _all_finite((loss, gradients)) & ~overflow
