@@ -11,7 +11,7 @@ from untrained import make_coherent_run, make_run
 from experiments.viewer_pictures import chromium, drag, window
 from wbgs_jax import view
 from wbgs_jax.inference.predictor import predictor
-from wbgs_jax.radio.array import pas_directions
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.viewer import drawing, panel, walk
 from wbgs_jax.viewer.app import Latest
@@ -68,6 +68,23 @@ def test_another_material_is_seen_at_once_and_taken_back(coherent):
     assert abs(metal - before) > 0.1
     coherent.restore(trained)
     assert coherent.ask(PLACE, HZ).power_db == before
+
+
+def test_another_thickness_is_seen_at_once_where_the_data_know_one_and_taken_back(coherent):
+    """Of panes that are half a wavelength thick, which reflect least, and a quarter of one, which reflect most."""
+    before, trained, plan = coherent.ask(PLACE, HZ).power_db, coherent.trained, coherent.plan
+    found = []
+    for share in (0.5, 0.25):
+        for number in range(len(coherent.materials()[0])):
+            coherent.change_material(number, 6.0, 1e-3)
+            coherent.change_thickness(number, share * SPEED_OF_LIGHT / HZ / np.sqrt(6))
+        found.append(coherent.ask(PLACE, HZ).power_db)
+    assert abs(found[1] - found[0]) > 0.01
+    assert coherent.materials()[1].thickness == pytest.approx(0.25 * SPEED_OF_LIGHT / HZ / np.sqrt(6))
+    anew = Asker(coherent.trained, coherent.dataset, coherent.receiver)  # as maps are asked: planned with that thickness
+    assert anew.ask(PLACE, HZ).power_db == pytest.approx(found[1], abs=1e-4)
+    coherent.restore(trained)
+    assert coherent.ask(PLACE, HZ).power_db == before and coherent.plan is plan
 
 
 def test_gaussians_have_what_blending_uses(splatting, coherent):
@@ -171,6 +188,10 @@ def test_a_drag_in_a_browser_changes_the_picture(tmp_path):
         updates = drag(viewer, opened, 60.0, 3.0)
         opened.page.wait_for_timeout(1500)
         assert updates > 0 and np.linalg.norm(viewer.position - place) > 0.05
+        assert (viewer.said.spectrum.image != before).mean() > 0.01
+        before = viewer.said.spectrum.image.copy()
+        viewer.set(viewer.controls.material.thickness, 7.0)
+        viewer.wait()
         assert (viewer.said.spectrum.image != before).mean() > 0.01
         assert opened.errors == []
     viewer.stop()

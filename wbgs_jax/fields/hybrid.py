@@ -208,6 +208,12 @@ class HybridField(Field):
         wave = self.wave.with_material(params.wave, material, permittivity, conductivity)
         return dataclasses.replace(params, wave=wave)
 
+    def with_thickness(self, plan: HybridPlan, material: int, metres: float) -> tuple["HybridField", HybridPlan]:
+        """Returns the field and the plan in which a material of the coherent field is that thick."""
+        assert self.wave is not None, "a field without `electrical` has no materials"
+        wave, planned = self.wave.with_thickness(plan.wave, material, metres)
+        return dataclasses.replace(self, wave=wave), dataclasses.replace(plan, wave=planned)
+
     def portable(self, plan: HybridPlan) -> HybridPlan:
         """Returns the plan without what is cheaply computed again."""
         return dataclasses.replace(plan, wideband=self.wideband.portable(plan.wideband))

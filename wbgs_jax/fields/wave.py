@@ -223,6 +223,11 @@ class WaveField(Field):
         )
         return dataclasses.replace(params, materials=changed)
 
+    def with_thickness(self, plan: WavePlan, material: int, metres: float) -> tuple["WaveField", WavePlan]:
+        """Returns the field and the plan in which one material has a thickness that is known."""
+        known = self.known_thickness.at[material].set(metres)
+        return tuple(dataclasses.replace(one, known_thickness=known) for one in (self, plan))  # type: ignore[return-value]
+
     def blurred(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
         """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
         variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2

@@ -181,6 +181,7 @@ class Viewer:
             m.chosen.on_update(lambda _: self._show_material(m))
             for slider in (m.permittivity, m.conductivity):
                 slider.on_update(lambda _: None if self._syncing else self._change_material(m))
+            m.thickness.on_update(lambda _: None if self._syncing else self._change_thickness(m))
             m.reset.on_click(lambda _: self._as_trained(m))
 
     def _quietly(self, control: Any, value: Any) -> None:
@@ -246,9 +247,14 @@ class Viewer:
         epsilon, sigma = (float(values[m.number]) for values in (found[1].permittivity, found[1].conductivity))
         self._quietly(m.permittivity, round(epsilon, 2))
         self._quietly(m.conductivity, round(float(np.log10(sigma)), 2))
+        self._quietly(m.thickness, round(1e3 * float(found[1].thickness[m.number]), 1))
 
     def _change_material(self, m: panel.MaterialControls) -> None:
         self.asker.change_material(m.number, float(m.permittivity.value), 10 ** float(m.conductivity.value))
+        self._spectrum.request()
+
+    def _change_thickness(self, m: panel.MaterialControls) -> None:
+        self.asker.change_thickness(m.number, 1e-3 * float(m.thickness.value))
         self._spectrum.request()
 
     def _as_trained(self, m: panel.MaterialControls) -> None:

@@ -82,12 +82,12 @@ class Sample:
 class Asker:
     """A trained field, asked about single transmitters.
 
-    Materials may be changed; everything else is as it was trained.
+    Materials and thicknesses may be changed; everything else is as it was trained.
     """
 
     def __init__(self, trained: Trained, dataset: Dataset, receiver: Receiver):
         self.trained, self.dataset, self.receiver = trained, dataset, receiver
-        self.plan = trained.field.plan(trained.params, receiver)
+        self.plan = self._planned = trained.field.plan(trained.params, receiver)
         self._neighbours, self._confidence = (
             for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence)
         )
@@ -170,9 +170,15 @@ class Asker:
         self.trained = dataclasses.replace(self.trained, params=params)  # type: ignore[type-var]
         self._samples.clear()
 
+    def change_thickness(self, number: int, metres: float) -> None:
+        """Makes all walls of a material this thick from now on."""
+        field, self.plan = self.trained.field.with_thickness(self.plan, number, metres)
+        self.trained = dataclasses.replace(self.trained, field=field)  # type: ignore[type-var]
+        self._samples.clear()
+
     def restore(self, trained: Trained) -> None:
         """Asks a field as it was trained from now on."""
-        self.trained = trained
+        self.trained, self.plan = trained, self._planned
         self._samples.clear()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:

@@ -18,6 +18,7 @@ BLACK = np.zeros((90, 360))
 MOST_PATHS = 200
 PERMITTIVITY, LOG_CONDUCTIVITY = (1.01, 12.0), (-6.0, 7.0)
 """Ends of the sliders; log10 of S/m."""
+THICKNESS_MM = (0.5, 500.0)
 LABEL_ROOM = 0.27
 """Decades between two frequencies that are written below the slider."""
 
@@ -43,6 +44,8 @@ class MaterialControls:
     permittivity: viser.GuiSliderHandle
     conductivity: viser.GuiSliderHandle
     """log10 of S/m at 1 GHz."""
+    thickness: viser.GuiSliderHandle
+    """Millimetres."""
     reset: viser.GuiButtonHandle
 
     @property
@@ -164,8 +167,8 @@ def _map_controls(gui: viser.GuiApi, asker: Asker) -> MapControls:
 
 
 def _material_controls(gui: viser.GuiApi, asker: Asker) -> MaterialControls | None:
-    """Returns the material that is chosen, its permittivity and conductivity, and a button that takes changes back; None
-    where the field knows no materials."""
+    """Returns the material that is chosen, its permittivity, conductivity and thickness, and a button that takes changes back;
+    None where the field knows no materials."""
     found = asker.materials()
     if found is None:
         gui.add_markdown("This field knows no materials.")
@@ -173,10 +176,12 @@ def _material_controls(gui: viser.GuiApi, asker: Asker) -> MaterialControls | No
     names, properties = found
     epsilon = float(np.clip(properties.permittivity[0], *PERMITTIVITY))
     log_sigma = float(np.clip(np.log10(properties.conductivity[0]), *LOG_CONDUCTIVITY))
+    millimetres = float(np.clip(1e3 * properties.thickness[0], *THICKNESS_MM))
     return MaterialControls(
         gui.add_dropdown("material", tuple(f"{number}: {name}" for number, name in enumerate(names))),
         gui.add_slider("relative permittivity", *PERMITTIVITY, step=0.01, initial_value=epsilon),
         gui.add_slider("log10 S/m at 1 GHz", *LOG_CONDUCTIVITY, step=0.01, initial_value=log_sigma),
+        gui.add_slider("thickness [mm]", *THICKNESS_MM, step=0.5, initial_value=round(2 * millimetres) / 2),
         gui.add_button("as trained"),
     )
 
