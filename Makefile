@@ -20,7 +20,7 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-slow lowest newest simulator data lint typecheck bench experiments tables \
+.PHONY: help setup train eval view measured test test-slow lowest newest simulator data lint typecheck bench gpu-check experiments tables \
 	docs site notebooks package clean
 .DEFAULT_GOAL := help
 
@@ -93,6 +93,9 @@ typecheck: setup  ## mypy
 
 bench: setup  ## measure this machine, compare: make bench [GATE=1 to fail on a regression] [ARGS="--only renderer --update"]
 	$(PY) -m experiments.bench $(if $(filter-out 0,$(GATE)),--gate) $(ARGS)
+
+gpu-check: setup  ## check a GPU in nine minutes: parity with the CPU, times, memory, one JSON [OUT=folder]; without one a stand-in
+	$(PY) -m experiments.gpu_check $(if $(OUT),--out $(OUT)) $(ARGS)
 
 experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE=quick|paper MINUTES=60 ARGS="--only table1"]
 	$(PY) -m experiments.runner --profile $(PROFILE) $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)

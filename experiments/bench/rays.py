@@ -39,7 +39,7 @@ RIVAL_CONFIG = WaveConfig(
 def measure(report: Report, effort: Effort) -> None:
     """All of it."""
     for number in SCENES[:1] if effort.quick else SCENES:
-        _measure_scene(report, effort, number)
+        measure_scene(report, effort, number)
     for facets in FACETS[:1] if effort.quick else FACETS:
         _measure_hall(report, effort, facets)
     for number in RIVAL_SCENES[:1] if effort.quick else RIVAL_SCENES:
@@ -55,7 +55,7 @@ def answer(params: Any, plan: Any, paths: Any, place: Any, frequency_hz: Float[j
 trace = jax.jit(wave.trace)
 
 
-def _measure_scene(report: Report, effort: Effort, number: str) -> None:
+def measure_scene(report: Report, effort: Effort, number: str) -> None:
     """A released scene by its own numbers: everything that does not depend on the query is planned."""
     say(f"rays: scene {number}")
     dataset = load_dataset(number)

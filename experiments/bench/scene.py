@@ -52,12 +52,12 @@ class Scene:
 
     def lower_gradient(self, render: Render, b: int) -> jax.stages.Lowered:
         """Returns a renderer's forward and backward, ready to be compiled."""
-        return jax.jit(_gradient(render)).lower(*self.inputs(b))
+        return jax.jit(gradient_of(render)).lower(*self.inputs(b))
 
     def lower_gradient_one_by_one(self, render: Render, b: int) -> jax.stages.Lowered:
         """Returns the same, query after query: for a renderer that keeps every (Gaussian, pixel, query) for its backward
         pass."""
-        gradient = _gradient(render)
+        gradient = gradient_of(render)
 
         def gradients(gaussians, *queries):
             def add(total, query):
@@ -71,7 +71,9 @@ class Scene:
         return jax.jit(gradients).lower(*self.inputs(b))
 
 
-def _gradient(render: Render) -> Callable[..., tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"]]]:
+def gradient_of(render: Render) -> Callable[..., tuple[Gaussians, Float[Array, "n b"], Float[Array, "n b"]]]:
+    """Returns the gradients of Gaussians, attenuation and signal, given those and a cotangent of the image."""
+
     def objective(gaussians, attenuation, signal, cotangent):
         return jnp.sum(render(gaussians, attenuation, signal) * cotangent)
 

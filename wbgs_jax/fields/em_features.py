@@ -109,7 +109,7 @@ def query_features(
         delta_f, signal = (jnp.sum(heads * powers, -1) for heads in (delta_f, signal))
     delta = attenuation_activation(gaussians.opacity_logits, delta_f, MAX_ATTENUATION)
     shares = gaussians.alive / jnp.sum(gaussians.alive)
-    return QueryFeatures(delta, signal_activation(signal), jnp.einsum("n,nbw->bw", shares, hidden))
+    return QueryFeatures(delta, signal_activation(signal), jnp.einsum("n,nbw->bw", shares, hidden, precision=EXACT))
 
 
 def received_power_db(

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields.base import Observation
+from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query
 
@@ -62,7 +63,8 @@ def constant(share: float) -> Share:
 
 def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
     """Returns the coherent field's share, 0 to 1, of B queries."""
-    return jax.nn.sigmoid(share.bias + (features - share.mean) / share.scale @ share.weights)
+    scaled = (features - share.mean) / share.scale
+    return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
 
 
 def features(

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query
 
@@ -173,7 +174,8 @@ def expected_power(
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:
     """Returns the logarithm of the error that features let expect."""
-    return (known - confidence.mean) / confidence.scale @ confidence.weights[:-1] + confidence.weights[-1]
+    scaled = (known - confidence.mean) / confidence.scale
+    return jnp.matmul(scaled, confidence.weights[:-1], precision=EXACT) + confidence.weights[-1]
 
 
 def expect_many(

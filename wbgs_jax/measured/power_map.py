@@ -11,6 +11,7 @@ distance from what was measured (exponential covariance; Rasmussen and Williams 
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,6 +25,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.measured.floor_plan import NO_WALLS, Walls, crossings, namespace
 from wbgs_jax.measured.readings import Readings
+from wbgs_jax.radio.array import EXACT
 
 LAW = np.array([-45.0, 2.0, 6.0])
 """Power at one metre (dBm), exponent and loss of a wall (dB) before anything was measured, ..."""
@@ -123,9 +125,10 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     room, wall = learned.scales[:2]
     walls = -features[..., 2]
     k = alike(tx_position, learned.places)[:, None] * (room**2 + wall**2 * walls[..., None] * learned.features.T)
-    mean = features @ learned.law + jnp.einsum("brn,rn->br", k, learned.weights)
-    known = jnp.sum(jnp.einsum("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
-    of_law = jnp.einsum("bri,ij,brj->br", features, learned.law_covariance, features)
+    exact = partial(jnp.einsum, precision=EXACT)  # the variance is a difference of large numbers
+    mean = exact("bri,i->br", features, learned.law) + exact("brn,rn->br", k, learned.weights)
+    known = jnp.sum(exact("rmn,brn->brm", learned.inverse_root, k) ** 2, -1)
+    of_law = exact("bri,ij,brj->br", features, learned.law_covariance, features)
     variance = room**2 + wall**2 * walls**2 - known + of_law
     return mean, jnp.sqrt(jnp.maximum(variance, 0))
 
