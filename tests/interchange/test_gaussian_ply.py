@@ -4,9 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from plyfile import PlyData
+
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.ply import write_ply
 from wbgs_jax.interchange.gaussian_ply import NAMES, read_gaussians, write_gaussians
+from wbgs_jax.radio.geometry import covariance_factor, rotation_matrix
 from wbgs_jax.types import Gaussians
 
 
@@ -24,8 +27,9 @@ def test_there_and_back(gaussians, rng, tmp_path):
     assert write_gaussians(tmp_path / "a.ply", gaussians, colours) == 6
     read, back = read_gaussians(tmp_path / "a.ply")
     alive = np.arange(7) != 3
-    for name in ("means", "log_scales", "quats", "opacity_logits"):
+    for name in ("means", "log_scales", "opacity_logits"):
         np.testing.assert_array_equal(getattr(read, name), np.asarray(getattr(gaussians, name))[alive])
+    np.testing.assert_allclose(rotation_matrix(read.quats), rotation_matrix(gaussians.quats[alive]), atol=1e-6)
     np.testing.assert_allclose(back, colours[alive], atol=1e-6)
 
 
@@ -40,7 +44,26 @@ def test_the_layout_is_that_of_splat_viewers(gaussians, tmp_path):
     np.testing.assert_array_equal(rows[:, :3], np.asarray(gaussians.means)[np.arange(7) != 3])
     np.testing.assert_array_equal(rows[:, 3:54], 0)  # normals, grey, no further harmonics
     np.testing.assert_allclose(rows[:, 54], 0, atol=1e-6)  # half transparent
-    np.testing.assert_array_equal(rows[:, 58:], np.asarray(gaussians.quats)[np.arange(7) != 3])
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 58:], axis=1), 1, atol=1e-6)
+
+
+def test_a_viewer_that_follows_the_papers_conventions_draws_the_same_gaussians(gaussians, rng, tmp_path):
+    """Its steps, written out: exp of scales, sigmoid of opacity, w x y z quaternions as they stand, the SH constant."""
+    colours, share = rng.uniform(size=(7, 3)), rng.uniform(0.1, 0.9, 7)
+    write_gaussians(tmp_path / "a.ply", gaussians, colours, share)
+    rows, alive = PlyData.read(tmp_path / "a.ply")["vertex"], np.arange(7) != 3
+
+    def columns(*names):
+        return np.stack([np.asarray(rows[name], float) for name in names], -1)
+
+    np.testing.assert_allclose(1 / (1 + np.exp(-columns("opacity")[:, 0])), share[alive], atol=1e-6)
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * columns("f_dc_0", "f_dc_1", "f_dc_2"), colours[alive], atol=1e-6)
+    w, x, y, z = columns("rot_0", "rot_1", "rot_2", "rot_3").T
+    first = np.stack([w * w + x * x - y * y - z * z, 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)  # where x goes
+    second = np.stack([2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)], -1)
+    axes = np.stack([first, second, np.cross(first, second)], -1) * np.exp(columns("scale_0", "scale_1", "scale_2"))[:, None]
+    ours = covariance_factor(gaussians.log_scales, gaussians.quats)[alive]
+    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), ours @ ours.transpose(0, 2, 1), rtol=1e-4, atol=1e-5)
 
 
 def test_what_holds_no_gaussians(gaussians, tmp_path):

@@ -1,7 +1,7 @@
 """Gaussians as the PLY file of 3D Gaussian splatting (Kerbl et al. 2023), which splat viewers open, and back.
 
 A vertex a Gaussian, float32, binary little endian: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3. Opacity
-is kept before its sigmoid, scales as natural logarithms, the rotation as a quaternion w x y z; colours are the constant term of
+is kept before its sigmoid, scales as natural logarithms, the rotation as a unit quaternion w x y z; colours are the constant term of
 spherical harmonics. Radio has no colours: whoever writes says what they stand for.
 """
 
@@ -21,6 +21,8 @@ SH_CONSTANT = 0.28209479177387814
 """Y_0^0, of what a colour is 0.5 + SH_CONSTANT * f_dc."""
 RESTS = 45
 """Coefficients beyond the constant that viewers expect: three degrees, three colours."""
+SHORTEST = 1e-12
+"""Length of a quaternion that turns nothing."""
 MOST_CERTAIN = 1e-6
 """Distance of opacities from 0 and 1."""
 PLACE, COLOUR, SCALE, TURN = (
@@ -56,7 +58,8 @@ def write_gaussians(
         logits = np.log(share / (1 - share))
     rgb = np.full((len(alive), 3), 0.5) if colours is None else np.clip(colours, 0, 1)
     parts = {PLACE: gaussians.means, COLOUR: (rgb - 0.5) / SH_CONSTANT, ("opacity",): logits[:, None]}
-    parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats}
+    length = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # some viewers take the quaternion as it stands
+    parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats / np.maximum(length, SHORTEST)}
     rows = np.zeros(int(alive.sum()), [(name, "<f4") for name in NAMES])
     for names, values in parts.items():
         for name, column in zip(names, np.asarray(values, np.float32)[alive].T, strict=True):
