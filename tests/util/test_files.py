@@ -2,6 +2,7 @@
 
 import pytest
 
+from wbgs_jax._util import files
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json, write_json
@@ -68,3 +69,15 @@ def test_run_command_turns_a_user_error_into_one_line_and_exit_code_2(capsys):
         run_command(main)
     assert exit_info.value.code == 2
     assert capsys.readouterr().err == "error: no such scene; give another\n"
+
+
+def test_what_a_killed_writer_left_is_removed_and_what_another_one_writes_is_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "STALE_S", 0.0)
+    target = tmp_path / "a.json"
+    (tmp_path / ".a.json.deadbeef").write_text("{")
+    (tmp_path / ".b.json.deadbeef").write_text("{")
+    with files.atomic_write(target) as first:
+        first.write(b"1")
+        files.write_json(target, 2)
+        assert len(files.left_by_killed(target)) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json", ".b.json.deadbeef"} and target.read_text() == "1"

@@ -2,17 +2,26 @@
 
 import contextlib
 import csv
+import glob
 import io
 import json
 import os
 import re
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 from wbgs_jax._util.errors import UserError
 
+try:
+    import fcntl
+except ImportError:  # not on Windows, where nothing is removed
+    fcntl = None  # type: ignore[assignment]
+
+STALE_S = 5.0
+"""Age of temporary files that may be nobody's."""
 LONGEST_NAME = 100
 """Characters: file systems take 255, and names get endings."""
 
@@ -23,23 +32,42 @@ def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_left(path)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}; choose another folder or mend its permissions") from error
     try:
         with os.fdopen(handle, "wb") as stream:
+            with contextlib.suppress(OSError, AttributeError):  # of a file system without locks, or without `fcntl`
+                fcntl.flock(stream, fcntl.LOCK_SH)
             yield stream
         umask = os.umask(0)
         os.umask(umask)
         Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
         Path(temporary).replace(path)
     except BaseException as error:
-        Path(temporary).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # of a disk that has become read-only
+            Path(temporary).unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise UserError(
                 f"cannot write {path}: {error.strerror or error}; free some space or choose another folder"
             ) from error
         raise
+
+
+def left_by_killed(path: Path) -> list[Path]:
+    """Returns the temporary files beside a file, which a process that was killed while it wrote left there."""
+    return [*path.parent.glob(f".{glob.escape(path.name)}.????????")] if path.parent.is_dir() else []
+
+
+def _remove_left(path: Path) -> None:
+    """Removes what killed processes left of a file. Who still writes holds a lock; who has just begun may not hold it yet."""
+    for left in left_by_killed(path):
+        with contextlib.suppress(OSError):
+            if fcntl is not None and time.time() - left.stat().st_mtime >= STALE_S:
+                with left.open("rb+") as stream:
+                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    left.unlink()
 
 
 def read_text(path: Path) -> str:

@@ -5,9 +5,11 @@ to a temporary folder and renames it, so a checkpoint is whole or absent (one th
 """
 
 import contextlib
+import errno
 import hashlib
 import json
 import logging
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,6 +24,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.processes import is_first
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
+MARGIN = 2**16
+"""Bytes that a checkpoint takes beside its arrays."""
 STATE = "state"
 """Folder of the arrays in a checkpoint."""
 
@@ -74,6 +78,7 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
             full = {key: leaf for key, leaf in host.items() if leaf.size}
             metadata = metadata | {EMPTY: empty}
             metadata |= {DIGEST: digest(host, metadata)}
+            _demand_room(folder, full)
             ocp.save(target, full, custom_metadata=metadata, overwrite=True)
     except (OSError, ValueError) as error:  # ValueError: what TensorStore makes of a full disk
         for unfinished in folder.glob(f"{step}.*tmp*"):
@@ -86,7 +91,14 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
         ) from error
     if is_first():
         for old in checkpoint_steps(folder)[:-keep]:
-            shutil.rmtree(folder / str(old))
+            shutil.rmtree(folder / str(old), ignore_errors=True)  # the newest one is whole, and that is what counts
+
+
+def _demand_room(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raises an `OSError` for a disk that is too full, before Orbax begins: of its writes, which all run at once, one would
+    fail, and the others go on to complain on stderr, in threads of their own."""
+    if shutil.disk_usage(folder).free < sum(array.nbytes for array in arrays.values()) + MARGIN:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def read(folder: Path, step: int) -> Saved:

@@ -28,7 +28,7 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
     known: dict[str, Any] = {}
     if path.exists():
         before = read_json(path)
-        with contextlib.suppress(AttributeError, TypeError):  # what is no manifest has no scores
+        with contextlib.suppress(AttributeError, TypeError, ValueError):  # what is no manifest has no scores
             known = dict(before.get("scores", {})) if before.get("training", {}).get("steps") == trained.step else {}
     config, origin = trained.config, provenance(trained)
     scores = known | ({} if report is None else {report["part"]: _figures(report)})

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax._util.files import left_by_killed, read_json, write_json
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax._util.typed import misfit
 from wbgs_jax.config import Settings, check, from_dict, sections, to_dict
@@ -151,7 +151,7 @@ def _demand_types(path: Path, value: Any, prefix: str) -> None:
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
     """Makes the run folder, or makes sure that the one there belongs to the same run."""
     if not (folder / "config.json").exists():
-        if folder.is_dir() and any(folder.iterdir()):
+        if folder.is_dir() and set(folder.iterdir()) - {*left_by_killed(folder / "config.json")}:
             raise UserError(f"{folder} holds other files; choose another OUT")
         write_config(folder, config)
     elif found := difference(read_config(folder), config):
