@@ -2,8 +2,9 @@
 
 Without `--only` these are the tables and figures of the paper; the series (`--only choices`, `tuning`, `wave_choices`) are run
 by name. Jobs come in the order of importance: every experiment's first seed, then further ones, of those that see more spectra
-after the others. What is done is skipped, what was cut goes on where it stopped, however it was cut; runners side by side never
-do the same job. `make tables` shows the results.
+after the others. What is done is skipped, what was cut goes on where it stopped, however it was cut. `--cluster local` does
+several jobs at once, `--cluster tcp://...` on the workers of any Dask scheduler (docs/cluster.md). `make tables` shows the
+results.
 """
 
 import os
@@ -12,14 +13,12 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read with JAX; see wbgs_ja
 
 # isort: split
 
-import contextlib
 import dataclasses
-import fcntl
 import shutil
 import signal
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -32,12 +31,15 @@ from experiments.execute import execute
 from experiments.jobs import Job
 from experiments.paper import DENSE_SCENE
 from experiments.results import FOLDER, Results
+from wbgs_jax._util.cluster import connected, finished
 from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.training.lock import Taken, locked
 from wbgs_jax.training.loop import Interrupted
 
 RUNS = Path("runs/experiments")
+GO_ON = "the time is up: run the same command again to go on"
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,11 @@ class Command:
     """List the jobs and what is known of them."""
     results: Path = FOLDER
     runs: Path = RUNS
-    """Where unfinished runs are kept."""
+    """Where unfinished runs are kept. With --cluster every worker has to see both folders."""
+    cluster: str | None = None
+    """Do the jobs on a Dask cluster: "local", processes on this machine, or the address of a scheduler (tcp://host:8786)."""
+    workers: int = 2
+    """Processes of `--cluster local`."""
 
 
 class TimeIsUp(UserError):
@@ -123,19 +129,6 @@ def chosen_jobs(command: Command) -> list[Job]:
     return list(dict.fromkeys(dataclasses.replace(job, scene=command.data) for job in jobs))
 
 
-@contextlib.contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Whether this process, and no other, has the job. The kernel frees a lock when its process is gone, however it went."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-            return
-        yield True
-
-
 class Durations:
     """How long jobs take, learned from those that are done."""
 
@@ -173,24 +166,32 @@ def folder_of(job: Job, command: Command) -> Path:
     return command.runs / job.profile / job.name
 
 
-def run_job(job: Job, command: Command, results: Results, clock: Clock) -> str:
-    """Run one job unless it is done or another process has it; returns what became of it."""
-    folder = folder_of(job, command)
-    with claimed(folder.parent / "locks" / job.name) as mine:
-        if not mine:
-            return "another process has it"
-        if results.get(job):
-            return "done meanwhile"
-        begin = time.perf_counter()
-        try:
-            values, pictures = execute(job, folder, clock.may_go_on)
-        finally:
-            jax.clear_caches()  # otherwise every job's compiled programs stay in memory
-        seconds = time.perf_counter() - begin
-        results.write(job, values | {"wall_seconds": round(seconds, 1)}, pictures)
-        shutil.rmtree(folder, ignore_errors=True)
-        score = f"SSIM {values['average_of_medians']:.3f}, " if "average_of_medians" in values else ""
-        return f"{score}{seconds:.0f} s"
+def run_job(job: Job, command: Command, may_go_on: Callable[[], None] = lambda: None) -> str:
+    """Run one job, here or on a worker, unless it is done or another process has it; returns what became of it."""
+    use_compilation_cache()
+    folder, results = folder_of(job, command), Results(command.profile, command.results)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(folder):
+            if results.get(job):
+                return "done meanwhile"
+            return executed(job, folder, results, may_go_on)
+    except Taken:
+        return "another process has it"
+
+
+def executed(job: Job, folder: Path, results: Results, may_go_on: Callable[[], None]) -> str:
+    """Do a job, write its result, and remove what it left on the way; returns its score and its time for people."""
+    begin = time.perf_counter()
+    try:
+        values, pictures = execute(job, folder, may_go_on)
+    finally:
+        jax.clear_caches()  # otherwise every job's compiled programs stay in memory
+    seconds = time.perf_counter() - begin
+    results.write(job, values | {"wall_seconds": round(seconds, 1)}, pictures)
+    shutil.rmtree(folder, ignore_errors=True)
+    score = f"SSIM {values['average_of_medians']:.3f}, " if "average_of_medians" in values else ""
+    return f"{score}{seconds:.0f} s"
 
 
 def run(jobs: list[Job], command: Command) -> list[str]:
@@ -198,22 +199,43 @@ def run(jobs: list[Job], command: Command) -> list[str]:
     results = Results(command.profile, command.results)
     open_jobs = [job for job in jobs if results.get(job) is None]
     say(f"{len(jobs)} jobs: {Durations(results, jobs).left(open_jobs)}")
-    failures = []
+    return (run_on_cluster if command.cluster else run_here)(jobs, open_jobs, command)
+
+
+def run_here(jobs: list[Job], open_jobs: list[Job], command: Command) -> list[str]:
+    """Run jobs one after the other in this process."""
+    results, failures = Results(command.profile, command.results), list[str]()
     with Clock(command.minutes) as clock:
         for i, job in enumerate(open_jobs):
             try:
                 say(f"{job.name} ...")
-                outcome = run_job(job, command, results, clock)
+                outcome = run_job(job, command, clock.may_go_on)
                 say(f"{job.name}: {outcome}; {Durations(results, jobs).left(open_jobs[i + 1 :])}")
                 clock.may_go_on()
             except (Interrupted, TimeIsUp):
                 if not clock.expired:
                     raise
-                say("the time is up: run the same command again to go on")
+                say(GO_ON)
                 break
             except Exception as error:  # whatever it is, the other jobs are worth running
                 failures.append(f"{job.name}: {one_line(error)}")
                 say(f"{failures[-1]}")
+    return failures
+
+
+def run_on_cluster(jobs: list[Job], open_jobs: list[Job], command: Command) -> list[str]:
+    """Let the workers of a Dask cluster run jobs. What a killed worker has begun goes on where it stopped, on another one."""
+    results, failures, left = Results(command.profile, command.results), list[str](), list(open_jobs)
+    everywhere = dataclasses.replace(command, results=command.results.resolve(), runs=command.runs.resolve())
+    seconds = None if command.minutes is None else 60 * command.minutes
+    with connected(command.cluster or "", command.workers) as client:
+        try:
+            for job, outcome, error in finished(client, run_job, open_jobs, everywhere, seconds=seconds):
+                left.remove(job)
+                failures += [f"{job.name}: {one_line(error)}"] if error else []
+                say(f"{job.name}: {one_line(error) if error else outcome}; {Durations(results, jobs).left(left)}")
+        except TimeoutError:
+            say(GO_ON)
     return failures
 
 
@@ -244,7 +266,6 @@ def main() -> None:
     if command.dry_run:
         print(listing(jobs, command))
         return
-    use_compilation_cache()
     if failures := run(jobs, command):
         raise UserError(f"{len(failures)} of {len(jobs)} jobs failed: " + "; ".join(failures))
 

@@ -81,7 +81,7 @@ def test_two_at_once_do_not_do_the_same_job(command, monkeypatch):
 
     def run_one():
         together.wait()
-        said.append(runner.run_job(JOB, command, Results(command.profile, command.results), runner.Clock(None)))
+        said.append(runner.run_job(JOB, command))
 
     monkeypatch.setattr(runner, "execute", slow)
     said: list[str] = []
@@ -95,7 +95,7 @@ def test_two_at_once_do_not_do_the_same_job(command, monkeypatch):
 
 
 def test_the_lock_of_a_killed_process_is_free(command, calls):
-    lock = command.runs / command.profile / "locks" / JOB.name
+    lock = command.runs / command.profile / JOB.name / "training.lock"
     lock.parent.mkdir(parents=True)
     hold = "import fcntl, sys, time; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print('held'); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-u", "-c", hold, str(lock)], stdout=subprocess.PIPE, text=True) as holder:

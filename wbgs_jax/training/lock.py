@@ -15,12 +15,16 @@ except ImportError:  # not on Windows, where nobody is kept out
 FILE = "training.lock"
 
 
+class Taken(UserError):
+    """Another process has the folder."""
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keeps a run folder for this process while the block runs; the lock goes with the process, however that ends.
 
     Raises:
-        UserError: another process has it; the message says which.
+        Taken: another process has it; the message says which.
     """
     with (folder / FILE).open("a+") as stream:
         if fcntl is not None:
@@ -29,7 +33,7 @@ def locked(folder: Path) -> Iterator[None]:
             except OSError:
                 stream.seek(0)
                 holder = stream.read(200).strip() or "another process"
-                raise UserError(f"{folder} is being trained by {holder}; wait for it, or choose another OUT") from None
+                raise Taken(f"{folder} is being trained by {holder}; wait for it, or choose another OUT") from None
         stream.truncate(0)
         stream.write(f"process {os.getpid()}")
         stream.flush()
