@@ -79,6 +79,7 @@ def alone(tmp_path_factory):
     return run
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("names", [QUICK, pytest.param(REST, marks=pytest.mark.slow)], ids=" ".join)
 def test_four_devices_train_and_answer_as_one_does(names, alone, tmp_path):
     count, divided, difference = last_line(started(tmp_path, names, devices=4))
@@ -87,6 +88,7 @@ def test_four_devices_train_and_answer_as_one_does(names, alone, tmp_path):
         assert_same_curves(tmp_path / name, alone(name))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("names", [QUICK[1:], pytest.param(("nerf2", *REST), marks=pytest.mark.slow)], ids=" ".join)
 def test_two_processes_train_as_one_does(names, alone, tmp_path):
     in_two_processes(tmp_path, names)
