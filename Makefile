@@ -20,7 +20,7 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-slow lowest newest simulator data lint typecheck bench gpu-check experiments tables \
+.PHONY: help setup train eval view measured test test-slow test-faults lowest newest simulator data lint typecheck bench gpu-check experiments tables \
 	docs site notebooks package clean
 .DEFAULT_GOAL := help
 
@@ -60,6 +60,9 @@ test: setup  ## run the tests; QUICK=1 leaves out long searches and trainings
 
 test-slow: setup  ## run the slow tests too, in fully optimised code: larger cases of what `make test` checks
 	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
+
+test-faults: setup  ## run the tests of faults, count what was tried: make test-faults [ARGS="--only fuzz_readers --seed 1"]
+	$(PY) -m experiments.reliability $(ARGS)
 
 lowest:  ## run the tests with the lowest versions of the dependencies that pyproject.toml allows (needs uv)
 	$(call tested-with,lowest-direct)

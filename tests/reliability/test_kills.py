@@ -11,7 +11,7 @@ from ledger import count
 from synthetic import FIELDS
 
 KILLS = {
-    **{f"train {field}": 4 for field in FIELDS},
+    **{f"train {field}": 3 for field in FIELDS},
     "write checkpoints": 25,
     "generate data": 20,
     "predict": 6,

@@ -120,7 +120,7 @@ def data(folder: Path) -> None:
 def experiments(folder: Path) -> None:
     """Runs two jobs of the experiment runner."""
     execute.settings = lambda job: tiny_settings(job.field, loop=EVERY_STEP)
-    wanted = [Job(str(folder / "box.npz"), field, profile="smoke") for field in ("nerf2", "wideband")]
+    wanted = [Job(str(folder / "box.npz"), "nerf2", seed=seed, profile="smoke") for seed in (0, 1)]
     command = runner.Command(profile="smoke", results=folder / "results", runs=folder / "runs")
     if failures := runner.run(wanted, command):
         raise wbgs_jax.train.UserError("; ".join(failures))

@@ -1,8 +1,10 @@
 """What command lines share: errors as one line and an exit code, options that are looked at first."""
 
 import warnings
+from pathlib import Path
 
 import pytest
+from commands import assert_error_for_people, call
 
 from wbgs_jax._util.command import option_value, run_command, say
 from wbgs_jax._util.errors import UserError
@@ -56,3 +58,10 @@ def test_lines_for_people_leave_stdout_alone(capsys):
 )
 def test_the_value_of_an_option_that_is_looked_at_first(arguments, expected):
     assert option_value(arguments, "--field", "wideband") == expected
+
+
+def test_what_the_operating_system_says_of_a_file_is_one_line():
+    ended = call(lambda _: Path("9" * 5000).stat())
+    assert_error_for_people(ended, "File name too long", "check the path")
+    with pytest.raises(OSError, match="mistake"):
+        call(lambda _: (_ for _ in ()).throw(OSError("a mistake of ours")))

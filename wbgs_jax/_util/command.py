@@ -16,8 +16,9 @@ _as_python_has_it = warnings.formatwarning
 
 
 def run_command(main: Callable[[], None]) -> None:
-    """Runs a command line's `main`: a `UserError` becomes one line on stderr and exit code 2, Ctrl-C exit code 130, a reader
-    that has gone (`| head`) exit code 141, and a `UserWarning` a line that begins with "note:"."""
+    """Runs a command line's `main`: a `UserError`, or what the operating system says of a file, becomes one line on stderr and
+    exit code 2, Ctrl-C exit code 130, a reader that has gone (`| head`) exit code 141, and a `UserWarning` a line that begins
+    with "note:"."""
     warnings.formatwarning = _note
     try:
         main()
@@ -30,6 +31,12 @@ def run_command(main: Callable[[], None]) -> None:
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
+    except OSError as error:  # of a place that nobody has looked at: a name too long, a disk that went away
+        if error.filename is None:
+            raise
+        where = UserError(f"{error.strerror}: {error.filename}; check the path, its permissions and the space on its disk")
+        print(f"error: {where}", file=sys.stderr)
+        raise SystemExit(2) from None
 
 
 def _note(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
