@@ -1,7 +1,7 @@
 """Evaluate a trained field: `wbgs-jax eval --run RUN [--data ...] [--json]`.
 
 Scores the held-out spectra (scikit-image SSIM, data range 1, default window; PSNR; MAE) beside the baselines, draws pictures
-into the run folder and writes the report to `eval.json` there.
+into the run folder and writes the report to `eval.json` there; of other data (`--data`), to `eval-NAME.json`.
 """
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
@@ -18,7 +18,7 @@ from rich.console import Console
 
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
-from wbgs_jax._util.files import write_json
+from wbgs_jax._util.files import check_writable, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.evaluation import pictures
@@ -53,12 +53,14 @@ def main(arguments: list[str] | None = None) -> None:
     use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax eval")
     trained = load_trained(command.run)
+    check_writable(command.run / "eval.json")
     dataset = trained.dataset() if command.data is None else load_dataset(command.data, seed=trained.config.seed)
     console = Console(file=sys.stderr, markup=False, soft_wrap=True)
     index = held_out(dataset, command.part)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
     report, predicted = evaluate(trained, dataset, command.part)
-    write_json(command.run / f"{with_part('eval', command.part)}.json", report)
+    beside = "" if command.data is None else f"-{dataset.name}"  # scores on other data never replace the run's own
+    write_json(command.run / f"{with_part('eval', command.part)}{beside}.json", report)
     if command.data is None:
         write_manifest(command.run, trained, report)
     if command.results:
@@ -67,7 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(f"results: {path}")
     if command.pictures and dataset.kind != "power":
         entries = curves.read(command.run / "metrics.jsonl")
-        folder = command.run / with_part("pictures", command.part)
+        folder = command.run / f"{with_part('pictures', command.part)}{beside}"
         for path in pictures.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
         if (displaced := trained.field.displaced_surfaces()) is not None:

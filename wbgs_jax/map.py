@@ -18,7 +18,7 @@ import tyro
 from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress import CountProgress
 
 # What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
@@ -122,6 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax map")
     check(command)
+    check_writable(command.out, command.picture)
     use_compilation_cache()
     make_maps(command)
 

@@ -22,6 +22,7 @@ import tyro
 from wbgs_jax._util.command import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable
 from wbgs_jax._util.progress import CountProgress
 from wbgs_jax.inference import queries as asked
 from wbgs_jax.inference import writing
@@ -230,8 +231,9 @@ def answer(command: Command, queries: Queries) -> None:
     if not queries.paired:
         count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
     if command.out:
+        replaced = ", in the place of another file" if command.out.exists() else ""
         writing.write(command.out, command.what, answers, queries, opened.source)
-        say(f"{command.what}: {command.out} ({count})")
+        say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
         writing.write_picture(command.picture, command.what, answers, queries)
         say(f"picture: {command.picture}")
@@ -243,6 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax predict")
     check(command)
     queries = queries_of(command) if command.out or command.picture else None
+    check_writable(command.out, command.picture, command.export)
     use_compilation_cache()
     if command.export:
         _export(command)

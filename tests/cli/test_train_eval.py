@@ -123,6 +123,7 @@ def test_eval_of_other_data_for_people_with_results(run, layout, tmp_path):
     assert result.code == 0, result.err
     assert "held-out SSIM" in result.out and "inverse distance" in result.out and "ms a PAS" in result.out
     assert not (run / "pictures").exists()
+    assert len([*run.glob("eval-*.json")]) == 1, "scores on other data do not replace the run's own"
     (path,) = (tmp_path / "results").iterdir()
     assert path.name == "quality_box_wideband_smoke_cpu.json"
     provenance = json.loads(path.read_text())["provenance"]

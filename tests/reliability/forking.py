@@ -55,9 +55,9 @@ class Forks:
         return Ended(**json.loads(self.process.stdout.readline()))
 
     def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait(30)
+        """Ends the process; of work that somebody stopped too."""
+        self.process.kill()
+        self.process.wait()
 
 
 def _child(work: str, folder: Path, fault: Fault, counter: Counter) -> None:

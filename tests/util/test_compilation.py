@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 
+from wbgs_jax._util import compilation
 from wbgs_jax._util.compilation import VARIABLE, load_program, trace_program, use_compilation_cache
 
 PROGRAM = """
@@ -67,3 +68,11 @@ def test_a_program_is_traced_once(tmp_path):
     found = load_program(tmp_path, names[0])(np.arange(3, dtype=np.float32), np.ones(1, np.float32))
     np.testing.assert_array_equal(found["sum"], [1, 2, 3])
     np.testing.assert_array_equal(found["parts"][1], [1])
+
+
+def test_a_cache_has_a_limit(tmp_path):
+    for age, name in enumerate(("new", "old", "older")):
+        (tmp_path / name).write_bytes(b"x" * 100)
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    compilation.limit_size(tmp_path, 250)
+    assert {path.name for path in tmp_path.iterdir()} == {"new", "old"}

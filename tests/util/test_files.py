@@ -81,3 +81,12 @@ def test_what_a_killed_writer_left_is_removed_and_what_another_one_writes_is_not
         files.write_json(target, 2)
         assert len(files.left_by_killed(target)) == 1
     assert {path.name for path in tmp_path.iterdir()} == {"a.json", ".b.json.deadbeef"} and target.read_text() == "1"
+
+
+def test_what_cannot_be_written_is_told_before_the_work(tmp_path):
+    files.check_writable(None, tmp_path / "new" / "a.json")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    for path, words in ((tmp_path / "file" / "a.json", "Not a directory"), (tmp_path, "it is a folder")):
+        with pytest.raises(UserError, match=words):
+            files.check_writable(path)

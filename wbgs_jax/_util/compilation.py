@@ -3,6 +3,7 @@
 The library never switches this on by itself; other JAX pipelines have their own caches.
 """
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -15,6 +16,8 @@ VARIABLE = "WBGS_CACHE"
 """Environment variable: folder of the cache; empty switches it off."""
 MIN_SECONDS = 0.5
 """What compiles faster is not kept."""
+MOST_BYTES = 2e9
+"""Of the cache; beyond it the oldest files go."""
 SOURCES = Path(__file__).parents[1]
 PROGRAMS = "programs"
 """Folder of traced programs in the cache."""
@@ -46,7 +49,24 @@ def use_compilation_cache() -> Path | None:
     if (folder := cache_folder()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_SECONDS)
+        limit_size(folder)
     return folder
+
+
+def limit_size(folder: Path, most: float = MOST_BYTES) -> None:
+    """Removes the files of a cache that nobody has asked for longest, until the others are small enough."""
+    known = []
+    for path in folder.rglob("*"):
+        with contextlib.suppress(OSError):  # another process may be as tidy
+            if path.is_file():
+                there = path.stat()
+                known.append((max(there.st_atime, there.st_mtime), there.st_size, path))
+    total = 0
+    for _, size, path in sorted(known, reverse=True):
+        total += size
+        if total > most:
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[Any], structure: str) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import errno
 import glob
 import io
 import json
@@ -53,6 +54,18 @@ def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
                 f"cannot write {path}: {error.strerror or error}; free some space or choose another folder"
             ) from error
         raise
+
+
+def check_writable(*paths: Path | None) -> None:
+    """Raises a `UserError` for a file that cannot be written, before the work that it is for."""
+    for path in filter(None, paths):
+        try:
+            folder = next(parent for parent in path.absolute().parents if parent.exists())
+            tempfile.TemporaryFile(dir=folder).close()
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror}; choose another place or mend its permissions") from error
 
 
 def left_by_killed(path: Path) -> list[Path]:
