@@ -47,7 +47,7 @@ def generate(options: Options) -> Path:
     out = writable(options.out or options.default_out())
     backend, _ = find_backend()
     folder = options.work / f"{job.spec.name}-{job.digest(backend)}"
-    _compute(job, folder, *_processes(options, backend))
+    _compute(job, folder, *_processes(options, backend), options.cluster)
     save_scene(out, _assemble(job, folder, backend))
     return out
 
@@ -69,13 +69,13 @@ def _processes(options: Options, backend: str) -> tuple[int, int | None]:
     return workers, options.threads or (None if workers == 1 else -(-cores // workers))
 
 
-def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None) -> None:
+def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None, cluster: str | None = None) -> None:
     todo = [batch for batch in range(job.n_batches) if not jobs.batch_file(folder, batch).exists()]
     if not todo:
         return
     with CountProgress(f"{job.spec.name}, batches", job.n_batches, job.n_batches - len(todo)) as progress:
         heard, done = False, list[int]()
-        for batch in jobs.run(job, todo, folder, workers, threads):
+        for batch in jobs.run(job, todo, folder, workers, threads, cluster):
             done.append(batch)
             heard = heard or jobs.check_heard(job, folder, done)
             progress.advance()

@@ -6,14 +6,10 @@ settings left, and never anything else. Batches are independent: neither their o
 interruption changes a bit.
 """
 
-import concurrent.futures
 import hashlib
 import importlib.metadata
 import json
-import multiprocessing
-import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +21,7 @@ from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
 from wbgs_jax._util.archives import read_arrays
+from wbgs_jax._util.cluster import LOCAL, connected, finished
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 
@@ -84,27 +81,34 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
-def run(job: Job, todo: list[int], folder: Path, workers: int, threads: int | None) -> Iterator[int]:
-    """Computes batches in `workers` processes with `threads` threads each, and yields every one when its file is written."""
+def run(
+    job: Job, todo: list[int], folder: Path, workers: int, threads: int | None, cluster: str | None = None
+) -> Iterator[int]:
+    """Computes batches in `workers` processes with `threads` threads each, or on the workers of a Dask cluster, and yields
+    every one when its file is written. A batch whose worker is killed is computed by another one."""
     backend = find_backend()
-    if workers == 1:
+    if workers == 1 and cluster is None:
         _start(job, backend, threads)
         yield from (_work(batch, folder) for batch in todo)
         return
-    context = multiprocessing.get_context("spawn")  # Dr.Jit and JAX have threads: a fork could hang
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (job, backend, threads)) as pool:
-        waiting = [pool.submit(_work, batch, folder) for batch in todo]
-        try:
-            for future in concurrent.futures.as_completed(waiting):
-                yield future.result()
-        except BrokenProcessPool as error:
-            raise UserError("a worker was killed, out of memory perhaps; the same command goes on from there") from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    # On other machines the library may lie elsewhere.
+    there = backend if cluster in (None, LOCAL) else None
+    with connected(cluster or LOCAL, workers) as client:
+        for batch, _, error in finished(client, _work_there, todo, job, folder.resolve(), there, threads):
+            if isinstance(error, UserError):
+                raise error
+            if error is not None:
+                raise UserError(
+                    f"batch {batch} failed ({type(error).__name__}: {error}); with less memory in use, or fewer --workers, "
+                    "the same command goes on from there"
+                ) from error
+            yield batch
 
 
 _simulator: "Simulator"
 _job: Job
+_digest = ""
+"""Of the job that a worker is ready for."""
 
 
 def _start(job: Job, backend: tuple[str, str], threads: int | None) -> None:
@@ -119,9 +123,14 @@ def _start(job: Job, backend: tuple[str, str], threads: int | None) -> None:
     _simulator, _job = Simulator(job.spec, job.settings, job.array), job
 
 
-def _start_worker(job: Job, backend: tuple[str, str], threads: int | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets batches in progress finish
-    _start(job, backend, threads)
+def _work_there(batch: int, job: Job, folder: Path, backend: tuple[str, str] | None, threads: int | None) -> int:
+    """Computes a batch on a worker, which keeps its simulator for the next one."""
+    global _digest
+    backend = backend or find_backend()
+    if _digest != (digest := job.digest(backend[0])):
+        _start(job, backend, threads)
+        _digest = digest
+    return _work(batch, folder)
 
 
 def _work(batch: int, folder: Path) -> int:

@@ -110,6 +110,9 @@ class Options(SceneOptions):
     """Processes, of about 2.5 GB each; unless given, half as many as there are cores, four at most, and one with a GPU."""
     threads: int | None = None
     """Threads of each process; unless given, as many as keep all cores busy."""
+    cluster: str | None = None
+    """Compute on a Dask cluster: "local", --workers processes on this machine, as by default, or the address of a scheduler
+    (tcp://host:8786), whose workers have to see the folder for unfinished work."""
     work: Path = HERE / "work"
     """Folder for unfinished work."""
 

@@ -54,7 +54,7 @@ class Command:
     minutes: float = 9.0
     """The most that all of it takes."""
     only: tuple[Name, ...] = ()
-    """Sections; all by default."""
+    """Sections; all by default. The file keeps the others, of an earlier run on the same device."""
     out: Path = RESULTS
     """Folder of the result file."""
 
@@ -98,7 +98,7 @@ def find_device() -> dict[str, Any]:
 def run_section(name: str, seconds: float, path: Path, stand_in: bool) -> None:
     """Runs a section within so many seconds, and keeps how it ended."""
     record, begin = Record(path, name), time.monotonic()
-    record.set_state("running")
+    record.begin(read_json(path)["provenance"]["commit"])
     wanted = (name, str(seconds - GRACE_S), str(path), "yes" if stand_in else "no")
     process = start(*wanted, stderr=subprocess.PIPE, env=os.environ | (CHEAP if stand_in and name in SMALL else {}))
     try:
@@ -121,11 +121,12 @@ def last_line(complaints: str, code: int) -> str:
     return lines[-1] if lines else f"exit code {code}"
 
 
-def whole(device: dict[str, Any], command: Command) -> dict[str, Any]:
-    """Returns a result file without results."""
-    stand_in = device["platform"] == "cpu"
-    about = {"command": "python -m experiments.gpu_check", "minutes": command.minutes, "stand_in": stand_in}
-    return about | {"device": device, "provenance": device.pop("environment"), "sections": {}}
+def whole(device: dict[str, Any], command: Command, path: Path) -> dict[str, Any]:
+    """Returns a result file without the results of the sections that are about to run."""
+    known = read_json(path)["sections"] if command.only and path.exists() else {}
+    about = {"command": "python -m experiments.gpu_check", "minutes": command.minutes, "stand_in": device["platform"] == "cpu"}
+    kept = {name: section for name, section in known.items() if name not in command.only}
+    return about | {"device": device, "provenance": device.pop("environment"), "sections": kept}
 
 
 def check(command: Command) -> None:
@@ -138,7 +139,7 @@ def check(command: Command) -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the section is ended too
     device = find_device()
     stand_in, path = device["platform"] == "cpu", command.out / f"gpu_check_{device['name']}.json"
-    write_json(path, whole(device, command))
+    write_json(path, whole(device, command, path))
     if stand_in:
         there = ", although nvidia-smi is here: is the extra `cuda` installed?" if shutil.which("nvidia-smi") else ""
         say(f"JAX sees no GPU{there}: a stand-in on the CPU, with small sizes")
@@ -147,7 +148,7 @@ def check(command: Command) -> None:
             continue
         seconds = min(60 * command.minutes * SHARES[name], deadline - time.monotonic())
         if seconds < LEAST_S:
-            Record(path, name).set_state("left out", reason="the time was up")
+            Record(path, name).set_state("left out", reason="the time was up", figures={})
             continue
         say(f"{name}: at most {seconds:.0f} s")
         run_section(name, seconds, path, stand_in)

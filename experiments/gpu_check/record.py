@@ -26,6 +26,12 @@ class Record:
             own[name] = own.get(name, {}) | value if isinstance(value, dict) else value
         write_json(self.path, whole)
 
+    def begin(self, commit: str | None) -> None:
+        """Starts the section anew: nothing stays of an earlier run."""
+        whole = read_json(self.path)
+        whole["sections"][self.section] = {"state": "running", "commit": commit, "figures": {}, "left_out": {}}
+        write_json(self.path, whole)
+
     def add(self, name: str, figures: Any) -> None:
         """Keeps a figure, or a row of them by name."""
         self._update(figures={name: figures})

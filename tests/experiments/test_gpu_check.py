@@ -68,6 +68,15 @@ def test_what_failed_or_was_cut_is_listed_and_the_rest_is_kept(sections, monkeyp
     assert all(f"not done: {line}" in said for line in result["not_done"])
 
 
+def test_a_run_of_some_sections_keeps_the_others(sections, monkeypatch, tmp_path):
+    sections |= {"parity": parity(project=HOLDS), "renderer": "record.add('n1', 1)"}
+    run(monkeypatch, tmp_path, "--only", "parity", "renderer")
+    sections["renderer"] = "record.add('n2', 2)"
+    code, result = run(monkeypatch, tmp_path, "--only", "renderer")
+    assert code == 0 and result["parity_holds"] and result["sections"]["renderer"]["figures"] == {"n2": 2}
+    assert {section["commit"] for section in result["sections"].values()} == {"abc"}
+
+
 @pytest.mark.parametrize(
     ("code", "words"),
     [

@@ -10,6 +10,7 @@ from wbgs_jax._util.errors import UserError
 LOCAL = "local"
 """In the place of a scheduler's address: processes on this machine."""
 CONNECT_S = "30s"
+CLOSE_S = 30.0
 SETTINGS: dict[str, Any] = {
     # Dask would give its processes one thread for linear algebra each: then a serial run might differ in the last bit.
     "distributed.nanny.pre-spawn-environ": {},
@@ -33,17 +34,24 @@ def connected(where: str, workers: int) -> Iterator[Any]:
     except ImportError as error:
         raise UserError("--cluster needs Dask; install it with: pip install 'wbgs-jax[cluster]'") from error
     with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
-        cluster = where
+        cluster: Any = where
         if where == LOCAL:
             # No limit of memory: Dask would end processes that JAX has good use for. One that the kernel ends is started anew.
             wanted = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
-            cluster = stack.enter_context(distributed.LocalCluster(**wanted, silence_logs=logging.ERROR))
+            cluster = distributed.LocalCluster(**wanted, silence_logs=logging.ERROR)
+            stack.callback(_close, cluster)
         try:
             client = distributed.Client(cluster, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise UserError(f"no Dask scheduler answers at {where} ({reason}); start one with `dask scheduler`") from error
         yield stack.enter_context(client)
+
+
+def _close(cluster: Any) -> None:
+    """Ends local workers. One that does not end in time is no reason to lose what all have done: it ends with this process."""
+    with contextlib.suppress(TimeoutError, OSError):
+        cluster.close(timeout=CLOSE_S)
 
 
 def finished(
