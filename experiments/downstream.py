@@ -8,7 +8,7 @@ runs/downstream/SCENE_txNUMBER (used where it is there, gone on with where it wa
 * which beams to use for held-out transmitters, beside those that the nearest training transmitter's spectrum ranks highest.
 
 `--part validation` scores what settings are chosen by. Adds its rows to experiments/results/downstream.json, scene by scene and
-number by number; those that are there are not made again. docs/applications.md quotes them.
+number by number; those that are there, or a half of one, are not made again. docs/applications.md quotes them.
 """
 
 import os
@@ -54,6 +54,8 @@ SETTINGS = (
 )
 """A small coherent field: fewer paths, one round of the search for materials, few steps."""
 STEPS = 100
+PARTS = {"localisation", "beams"}
+"""Of a row; `account` makes those that are missing."""
 ALIKE = 4
 """Training transmitters whose places are averaged."""
 
@@ -93,11 +95,12 @@ def main() -> None:
         for scene in command.scenes:
             report: dict[str, Any] = read_json(path) if path.exists() else {}
             name, row = f"scene{scene}" if scene.isdecimal() else Path(scene).stem, f"tx{number or 'all'}"
-            if row in report.get(name, {}):
+            known = report.get(name, {}).get(row, {})
+            if PARTS <= set(known):
                 continue
             trained = trained_field(command, scene, command.runs / f"{name}_{row}", number)
             say(f"{name}, {row} ...")
-            found = account(trained, command)
+            found = known | account(trained, command, PARTS - set(known))
             report[name] = report.get(name, {}) | {row: found | {"provenance": provenance(trained)}}
             write_json(path, report)
             say(f"{name}, {row}: {found}")
@@ -112,12 +115,15 @@ def trained_field(command: Command, scene: str, folder: Path, number: int) -> Tr
     return load_trained(folder)
 
 
-def account(trained: TrainedField, command: Command) -> dict[str, Any]:
-    """Returns scores of localisation and of beams on held-out transmitters."""
+def account(trained: TrainedField, command: Command, parts: set[str]) -> dict[str, Any]:
+    """Returns scores of localisation and of beams on held-out transmitters, as far as they are wanted."""
     own = trained.dataset()
     asked = transmitters_of(own, own.test if command.part == "test" else own.validation)
     chosen = np.sort(np.random.default_rng(0).permutation(asked)[: command.transmitters])
-    return {"localisation": localisation(trained, own, chosen, command), "beams": beams(trained, own, command.part)}
+    return {
+        **({"localisation": localisation(trained, own, chosen, command)} if "localisation" in parts else {}),
+        **({"beams": beams(trained, own, command.part)} if "beams" in parts else {}),
+    }
 
 
 def transmitters_of(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " tx"]:
@@ -225,7 +231,9 @@ def localisation_table(report: dict[str, Any]) -> str:
     """Returns median, mean and 90th percentile of the errors as a table of a page."""
     kinds = ("field", "fingerprint", "fingerprints_weighted")
     lines = ["| scene | training transmitters | field | most alike | four most alike |", "| --- | ---: | ---: | ---: | ---: |"]
-    for scene, row, _ in rows(report):
+    for scene, row, found in rows(report):
+        if "localisation" not in found:
+            continue
         cells = [
             " / ".join(mark(scene, row, f"localisation.{kind}.{name}_m", report, 2) for name in ("median", "mean", "p90"))
             for kind in kinds
@@ -238,7 +246,9 @@ def beams_table(report: dict[str, Any]) -> str:
     """Returns what beams are worth as a table of a page."""
     lines = ["| scene | training transmitters | field | nearest transmitter |", "| --- | ---: | ---: | ---: |"]
     names = (("top1", 2), ("top3", 2), ("loss_db", 2), ("loss_top3_db", 2))
-    for scene, row, _ in rows(report):
+    for scene, row, found in rows(report):
+        if "beams" not in found:
+            continue
         cells = [
             " / ".join(mark(scene, row, f"beams.{kind}.{name}", report, decimals) for name, decimals in names)
             for kind in ("field", "nearest_tx")
