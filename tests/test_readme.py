@@ -101,6 +101,7 @@ def measured(names: dict) -> None:
 
 def formats(names: dict) -> None:
     assert names["pas"].shape == (10, 90, 360) and names["scene"].snapshots.shape == (877, 1, 10, 16)
+    assert len(wb.load_dataset("mine.npz")) == 80
 
 
 def interchange(names: dict) -> None:

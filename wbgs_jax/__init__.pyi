@@ -65,6 +65,7 @@ from .interchange.ray_paths import from_sionna as from_sionna
 from .interchange.ray_paths import load_paths as load_paths
 from .interchange.ray_paths import save_paths as save_paths
 from .interchange.scenes import scene_of_paths as scene_of_paths
+from .interchange.scenes import scene_of_snapshots as scene_of_snapshots
 from .measured.floor_plan import load_walls as load_walls
 from .measured.power_map import learn_map as learn_map
 from .measured.power_map import received_power as received_power

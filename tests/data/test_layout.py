@@ -241,7 +241,7 @@ def no_images(folder):
         (write("freq.txt", "1 2.4 1 2.4 1 GHz"), "freq.txt", "'GHz'"),
         (write("freq.txt", "1 2.4 1 2.4 1 0"), "freq.txt", "'0'"),
         (write("freq.txt", "1 2.4 1 2.4 1 -2"), "freq.txt", "'-2'"),
-        (remove("gateway_info.yml"), "gateway_info.yml", "No such file"),
+        (remove("gateway_info.yml"), "gateway_info.yml", "is missing, which says where the receiver stands"),
         (write("gateway_info.yml", ""), "gateway_info.yml", "names no gateway"),
         (write("gateway_info.yml", "[1, 2"), "gateway_info.yml", "not valid YAML"),
         (write("gateway_info.yml", "a: 2000-99-99"), "gateway_info.yml", "not valid YAML"),

@@ -11,7 +11,7 @@ from drawn_paths import draw_paths
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
 from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_arrivals, from_sionna, load_paths, save_paths
-from wbgs_jax.interchange.scenes import scene_of_paths
+from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
 from wbgs_jax.radio.channel import Arrivals
@@ -120,3 +120,6 @@ def test_scenes_that_cannot_be(rng):
         scene_of_paths([paths], planar_array(2, 2), "few")
     with pytest.raises(UserError, match="different ends"):
         scene_of_paths([draw_paths(rng), draw_paths(rng)], planar_array(2, 2), "two")
+    ends = rng.normal(size=(6, 3)), np.array([1e9]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])
+    with pytest.raises(UserError, match=r"shape \(6, 1, 4\); by transmitter"):
+        scene_of_snapshots(np.ones((6, 1, 4), complex), *ends, planar_array(2, 2), "flat")

@@ -191,11 +191,14 @@ def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: f
 
 def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
     """Returns the data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
+    wanted = "write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]"
+    if not path.exists():
+        raise UserError(f"{path} is missing, which says where the receiver stands; {wanted}")
     content = read_yaml(path)
     entries = content if isinstance(content, dict) else {}
     gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
     if not gateways:
-        raise UserError(f"{path} names no gateway; write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]")
+        raise UserError(f"{path} names no gateway; {wanted}")
     first, gateway = next(iter(gateways.items()))
     if len(gateways) > 1:
         warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)

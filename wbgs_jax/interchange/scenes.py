@@ -1,4 +1,4 @@
-"""Paths of other programs as a scene file that a field can be trained on."""
+"""Paths of other programs, and measured snapshots, as a scene file that a field can be trained on."""
 
 from collections.abc import Sequence
 
@@ -52,22 +52,67 @@ def scene_of_paths(
         )
     order = np.argsort([p.frequency_hz for p in paths])
     snapshots = np.stack([snapshots_of(paths[i], element_positions) for i in order], 2)
+    frequencies = np.array([paths[i].frequency_hz for i in order])
+    level = np.tile([1.0, 0, 0, 0], (len(first.targets), 1))
+    return scene_of_snapshots(
+        snapshots, first.sources, frequencies, first.targets, level, element_positions, name, vertices, faces, seed
+    )
+
+
+def scene_of_snapshots(
+    snapshots: Complex[np.ndarray, "tx rx freq elements"],
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+    rx_position: Float[np.ndarray, "rx 3"],
+    rx_orientation: Float[np.ndarray, "rx 4"],
+    element_positions: Float[np.ndarray, "elements 3"],
+    name: str,
+    vertices: Float[np.ndarray, "vertices 3"] | None = None,
+    faces: np.ndarray | None = None,
+    seed: int = 0,
+) -> SceneFile:
+    """Returns a scene of measured array snapshots, to be written with `save_scene`. A fifth of the transmitters is for the
+    test.
+
+    Args:
+        snapshots: complex voltages of the elements; phases count between the elements of one snapshot.
+        tx_positions: world frame, metres.
+        frequencies_hz: hertz, ascending.
+        rx_position: world frame, metres.
+        rx_orientation: quaternions (wxyz) from the arrays' frame to the world's; 1 0 0 0 looks along +x.
+        element_positions: of the receivers' arrays, wavelengths, in their own frame (`planar_array`).
+        name: of the scene.
+        vertices: of the scene's surfaces, metres; none by default.
+        faces: triangles.
+        seed: of the split.
+
+    Raises:
+        UserError: there are too few transmitters, or the shapes do not agree.
+    """
+    count, receivers = len(tx_positions), len(rx_position)
+    wanted = count, receivers, len(frequencies_hz), len(element_positions)
+    if np.shape(snapshots) != wanted:
+        raise UserError(
+            f"the snapshots of {name} have shape {np.shape(snapshots)}; by transmitter, receiver, frequency and element it "
+            f"must be {wanted}"
+        )
+    if count < FEWEST:
+        raise UserError(f"{name} has {count} transmitters, and a training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
     split[np.random.default_rng(seed).permutation(count)[: max(round(TEST_SHARE * count), 1)]] = TEST
-    receivers = len(first.targets)
     known = faces is not None and vertices is not None
     return SceneFile(
         name=name,
-        tx_positions=first.sources,
-        frequencies_hz=np.array([paths[i].frequency_hz for i in order]),
-        rx_position=first.targets,
-        rx_orientation=np.tile([1.0, 0, 0, 0], (receivers, 1)),
+        tx_positions=tx_positions,
+        frequencies_hz=frequencies_hz,
+        rx_position=rx_position,
+        rx_orientation=rx_orientation,
         element_positions=np.tile(element_positions, (receivers, 1, 1)),
         vertices=np.asarray(vertices if known else np.zeros((0, 3)), np.float32),
         faces=np.asarray(faces if known else np.zeros((0, 3)), np.int32),
         face_part=np.zeros(0 if faces is None or not known else len(faces), np.int32),
         split=split,
-        snapshots=snapshots.astype(np.complex64),
+        snapshots=np.asarray(snapshots, np.complex64),
         meta={"parts": [{"name": "surface", "material": "unknown", "thickness": 0}]} if known else {},
     )
 
