@@ -156,7 +156,7 @@ class WaveField(Field):
         away = jnp.linalg.norm(self.receivers - receiver.position, axis=-1)
         own = jnp.argmin(away)
 
-        def found(of_all: Array) -> Array:
+        def found(of_all: Any) -> Array:
             return jnp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
 
         position = receiver.position + found(self.motion.receiver)

@@ -1,8 +1,8 @@
 """Gaussians as the PLY file of 3D Gaussian splatting (Kerbl et al. 2023), which splat viewers open, and back.
 
 A vertex a Gaussian, float32, binary little endian: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3. Opacity
-is kept before its sigmoid, scales as natural logarithms, the rotation as a unit quaternion w x y z; colours are the constant term of
-spherical harmonics. Radio has no colours: whoever writes says what they stand for.
+is kept before its sigmoid, scales as natural logarithms, the rotation as a unit quaternion w x y z; colours are the constant
+term of spherical harmonics. Radio has no colours: whoever writes says what they stand for.
 """
 
 from pathlib import Path
@@ -10,11 +10,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
-from wbgs_jax.data.ply import read_elements
+from wbgs_jax.data.ply_elements import read_elements, write_elements
 from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814
@@ -64,8 +62,7 @@ def write_gaussians(
     for names, values in parts.items():
         for name, column in zip(names, np.asarray(values, np.float32)[alive].T, strict=True):
             rows[name] = column
-    with atomic_write(path) as stream:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(stream)
+    write_elements(path, {"vertex": rows})
     return len(rows)
 
 
@@ -75,10 +72,9 @@ def read_gaussians(path: Path | str) -> tuple[Gaussians, Float[np.ndarray, "n 3"
     Raises:
         UserError: the file is missing, damaged, or holds no Gaussians.
     """
-    rows = read_elements(path).get("vertex")
-    found = () if rows is None else rows.dtype.names or ()
-    missing = [name for name in NEEDED if name not in found]
-    if rows is None or missing:
+    rows = read_elements(path).get("vertex", {})
+    missing = [name for name in NEEDED if not isinstance(rows.get(name), np.ndarray)]
+    if missing:
         raise UserError(f"{path} has no {missing[0]}: it holds points or a mesh, not Gaussians; export it as splats")
     columns = {
         names: np.stack([np.asarray(rows[name], np.float32) for name in names], -1) for names in (PLACE, COLOUR, SCALE, TURN)

@@ -156,8 +156,8 @@ def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
         now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
         pool = heard.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
-            count, known = config.geometry_snapshots, (motion, covariance, widths)
-            motion, covariance = adjust(now.field, now.params, now.cache, *known, data, pool, count, heard.rng)
+            count, before = config.geometry_snapshots, (motion, covariance, widths)
+            motion, covariance = adjust(now.field, now.params, now.cache, *before, data, pool, count, heard.rng)
         else:
             count = config.geometry_steps
             params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
