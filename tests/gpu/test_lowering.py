@@ -36,7 +36,7 @@ def products_without_precision(jaxpr):
 
 
 @pytest.mark.parametrize("costly", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("room", [pytest.param(name, marks=[pytest.mark.slow] * (name == "hybrid")) for name in ROOMS])
 def test_every_public_function_lowers_for_cuda(room, costly):
     for case in [case for case in ROOMS[room]() if case.costly == costly]:
         traced = jax.jit(case.program()).trace(*case.arguments)
