@@ -27,6 +27,8 @@ from wbgs_jax.training import curves
 
 KINDS = ("one", "reversed", "four", "two")
 """One device; one that takes the links of every batch in reverse, so that sums are rounded otherwise; four; two processes."""
+DONE = "done"
+"""File in the folder of a finished kind."""
 FIGURES = ("loss", "batch_ssim", "held_out_ssim")
 
 
@@ -36,6 +38,8 @@ class Command:
 
     fields: tuple[str, ...] = ("wideband", "nerf2", "wave")
     out: Path = FOLDER
+    work: Path | None = None
+    """Folder of the trainings, which is kept: those that are finished there are not repeated."""
 
 
 def start(kind: str, folder: Path, fields: tuple[str, ...], **told: str) -> subprocess.Popen:
@@ -69,24 +73,46 @@ def curve(folder: Path) -> dict[str, list[float]]:
 
 
 def furthest(curve: dict[str, list[float]], other: dict[str, list[float]]) -> dict[str, float]:
-    """Returns the largest relative difference of two runs by figure."""
-    return {name: float(np.max(np.abs(np.array(curve[name]) / np.array(other[name]) - 1))) for name in curve if name != "step"}
+    """Returns the largest relative difference of two runs by figure, percent."""
+    names = [name for name in curve if name != "step"]
+    return {name: 100 * float(np.max(np.abs(np.array(curve[name]) / np.array(other[name]) - 1))) for name in names}
+
+
+def in_units(parts: dict[str, Any]) -> dict[str, Any]:
+    """Returns the measured parts of a field's step in the units of the page too: milliseconds and kilobytes."""
+    times = {
+        f"{name.removesuffix('_s')}_ms": 1e3 * value
+        for name, value in parts.items()
+        if name.endswith("_s") and name != "step_s"
+    }
+    return parts | times | {f"{name}_kb": parts[f"{name}_bytes"] / 1e3 for name in ("gradient", "state", "data")}
+
+
+def report_of(runs: dict[str, Any], exchanged: dict[str, Any], parts: dict[str, Any]) -> dict[str, Any]:
+    """Returns everything that is written, from the curves by field and kind of run, and what two of the kinds looked at."""
+    last = {
+        field: {kind: {name: values[-1] for name, values in one.items()} for kind, one in of.items()}
+        for field, of in runs.items()
+    }
+    differ = {field: {kind: furthest(of[kind], of["one"]) for kind in KINDS[1:]} for field, of in runs.items()}
+    report = {"curves": runs, "last": last, "furthest_percent": differ, "exchanged": exchanged}
+    report |= {"parts": {field: in_units(own) for field, own in parts.items()}, "paper": on_paper(parts)}
+    return report | {"provenance": environment() | {"command": "python -m experiments.devices"}}
 
 
 def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.devices")
     with tempfile.TemporaryDirectory() as name:
-        work = Path(name)
+        work = command.work or Path(name)
         for kind in KINDS:
-            say(f"training: {kind}")
-            run(kind, work / kind, command.fields)
+            if not (work / kind / DONE).exists():
+                say(f"training: {kind}")
+                run(kind, work / kind, command.fields)
+                (work / kind / DONE).touch()
         runs = {field: {kind: curve(work / kind / field) for kind in KINDS} for field in command.fields}
-        differ = {field: {kind: furthest(of[kind], of["one"]) for kind in KINDS[1:]} for field, of in runs.items()}
-        exchanged, parts = read_json(work / "four" / "exchanged.json"), read_json(work / "one" / "parts.json")
-    report: dict[str, Any] = {"curves": runs, "furthest": differ, "exchanged": exchanged, "parts": parts}
-    report |= {"paper": on_paper(parts), "provenance": environment() | {"command": "python -m experiments.devices"}}
-    write_json(command.out / "devices.json", report)
+        looked = read_json(work / "four" / "exchanged.json"), read_json(work / "one" / "parts.json")
+    write_json(command.out / "devices.json", report_of(runs, *looked))
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """What the measured parts of a step say of more devices than there are here: times on paper.
 
-    T(D, B) = shared + spectrum B / D + exchange(D)        exchange(D) = 2 (D - 1) / D  bytes / bandwidth + 2 (D - 1) latency
+    T(D, B) = shared + spectrum B / D + exchange(D)        exchange(D) = 2 (D - 1) / D  bytes / bandwidth + 2 log2(D) latency
 
 A step of B links on D devices: what every device does for itself (projection, sorting, the layers of the networks that see the
-Gaussians alone), its part of the links, and a ring all-reduce of the gradients. Bandwidth and latency are assumed, all else is
+Gaussians alone), its part of the links, and an all-reduce of the gradients along trees. Bandwidth and latency are assumed, all else is
 measured.
 """
 
+import math
 from typing import Any
 
 DEVICES = (1, 2, 4, 8, 16, 32, 64)
@@ -24,8 +25,8 @@ def step_s(parts: dict[str, Any], devices: int, batch: int, link: str, faster: f
     """Returns the time of a step on paper."""
     bandwidth, latency = LINKS[link]
     computed = (parts["shared_s"] + parts["spectrum_s"] * batch / devices) / faster
-    ring = 2 * (devices - 1) / devices * parts["gradient_bytes"] / bandwidth + 2 * (devices - 1) * latency
-    return float(computed + (ring if devices > 1 else 0.0))
+    exchange = 2 * (devices - 1) / devices * parts["gradient_bytes"] / bandwidth + 2 * math.log2(devices) * latency
+    return float(computed + exchange)
 
 
 def scaling(parts: dict[str, Any], link: str, faster: float) -> dict[str, Any]:
