@@ -13,15 +13,14 @@ MODELS = (
     ("wideband", ""),
     ("wideband", "pooled"),
     ("wrfgs", ""),
-    ("nerf2", ""),
     ("wave", ""),
 )
-CONTROLS, SCENE_OF_CURVE = (("wideband", "pooled"), ("nerf2", "")), "4"
+CONTROLS, SCENE_OF_CURVE = (("wideband", "pooled"),), "4"
 """Models that have several seeds in this scene alone, that of the curve (`series.curve`)."""
 
 
 def jobs() -> list[Job]:
-    """Ours and WRF-GS by frequency and pooled, the volume, the coherent field and what learns nothing."""
+    """Ours and WRF-GS by frequency and pooled, the coherent field and what learns nothing."""
     trained = [job for scene in SCENES for model in MODELS for job in jobs_of(scene, *model)]
     return trained + [Job(scene, BASELINES) for scene in SCENES]
 
