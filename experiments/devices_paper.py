@@ -3,8 +3,8 @@
     T(D, B) = shared + spectrum B / D + exchange(D)        exchange(D) = 2 (D - 1) / D  bytes / bandwidth + 2 log2(D) latency
 
 A step of B links on D devices: what every device does for itself (projection, sorting, the layers of the networks that see the
-Gaussians alone), its part of the links, and an all-reduce of the gradients along trees. Bandwidth and latency are assumed, all else is
-measured.
+Gaussians alone), its part of the links, and an all-reduce of the gradients along trees. Bandwidth and latency are assumed, all
+else is measured.
 """
 
 import math
