@@ -23,6 +23,8 @@ from wbgs_jax.training.loop import Run, train
 SCRIPT = Path(device_runs.__file__)
 QUICK = ("nerf2", "wideband")
 REST = ("wrfgs", "wave", "hybrid")
+ASKED_AGREE = 1e-3
+"""Of spectra, 0 to 1: phases at 94 GHz are the last digits of path lengths, and other programs round them otherwise."""
 AGREE = 1e-3
 """Relative: what eight steps of Adam make of the last bit of a sum, at these large learning rates."""
 
@@ -83,7 +85,7 @@ def alone(tmp_path_factory):
 @pytest.mark.parametrize("names", [QUICK, pytest.param(REST, marks=pytest.mark.slow)], ids=" ".join)
 def test_four_devices_train_and_answer_as_one_does(names, alone, tmp_path):
     count, divided, difference = last_line(started(tmp_path, names, devices=4))
-    assert count == divided == "4" and float(difference) < 1e-5
+    assert count == divided == "4" and float(difference) < ASKED_AGREE
     for name in names:
         assert_same_curves(tmp_path / name, alone(name))
 
