@@ -96,7 +96,7 @@ def main() -> None:
             report: dict[str, Any] = read_json(path) if path.exists() else {}
             name, row = f"scene{scene}" if scene.isdecimal() else Path(scene).stem, f"tx{number or 'all'}"
             known = report.get(name, {}).get(row, {})
-            if PARTS <= set(known):
+            if not PARTS - set(known):
                 continue
             trained = trained_field(command, scene, command.runs / f"{name}_{row}", number)
             say(f"{name}, {row} ...")

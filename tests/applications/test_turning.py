@@ -59,7 +59,7 @@ def test_slopes_are_differences(rng):
     assert float(slope) == pytest.approx(float(ahead - behind) / 0.02, rel=0.01, abs=0.01)
 
 
-@pytest.mark.parametrize("pattern", ["tr38901", "dipole", "iso"])
+@pytest.mark.parametrize("pattern", ["tr38901", "dipole"])
 def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     """Before a wall of metal, with the powers of both waves added."""
     field, params, _ = field_of([rectangle((-5, 2, -5), (15, 0, 0), (0, 0, 15))], RX, conductivity=METAL, **SMALL)
@@ -68,7 +68,7 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     orientation = boresight_quaternion(jnp.asarray(angles, jnp.float32))
     plan = field.plan(params, make_receiver(RX, orientation, np.zeros((1, 3)), pattern=pattern))
     query = Query(jnp.asarray(tx, jnp.float32), jnp.full(2, HZ, jnp.float32))
-    said = field.render(field.blurred(params, 0.5), plan, query).power_db
+    said = jax.jit(field.render)(field.blurred(params, 0.5), plan, query).power_db
     np.testing.assert_allclose(turned[0], said, atol=0.05)
 
 

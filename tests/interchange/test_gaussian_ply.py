@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from plyfile import PlyData
 
 from wbgs_jax._util.errors import UserError

@@ -159,7 +159,7 @@ def straight_powers(field: Field, params: Any, ends: Any, frequencies_hz: Any) -
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
     if "paths" not in field.known():
-        raise UserError(f"the {field.name} field knows no paths, and so not what stands in the way; train --field wave or hybrid")
+        raise UserError(f"the {field.name} field knows no paths, nor what stands in the way; train --field wave or hybrid")
     field, params = field.anywhere(params)
     one = np.zeros((1, 3))  # an antenna, no array
     plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]
@@ -187,7 +187,7 @@ def place_reflector(
     step: float = 0.5,
     starts: int = 4,
 ) -> Descended:
-    """Returns where a plate serves its users best: `place` (starts, 5), poses, the best one first, and `loss`, minus the aim (dB).
+    """Returns where a plate serves its users best: poses, `place` (starts, 5), the best one first, and minus the aim, `loss`.
 
     At every place of a grid the plate is aimed at one user after the other; the best poses that stand apart are followed by
     gradient steps of all five numbers, under edges that are ever less washed out.

@@ -180,7 +180,7 @@ class Field(ABC):
         raise NotImplementedError("a field without `electrical` has no materials")
 
     def with_thickness(self, plan: Any, material: int, metres: float) -> tuple["Field", Any]:
-        """Returns the field and a plan in which all walls of one material are this thick, whatever data or training say (host)."""
+        """Returns the field and a plan in which all walls of one material are this thick, whatever data say (host)."""
         raise NotImplementedError("a field without `electrical` has no materials")
 
     def blurred(self, params: Any, metres: Float[Array, ""] | float) -> Any:
