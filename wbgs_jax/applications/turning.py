@@ -52,7 +52,7 @@ def arrivals_anywhere(field: Field, params: Any, receiver: Any, transmitters: An
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
     if "paths" not in field.known():
-        raise UserError(f"the {field.name} field knows no paths, and so not whence waves come; train --field wave or hybrid")
+        raise UserError(f"the {field.name} field knows no paths, and so not whence waves come; train the default one on data with a mesh")
     field, params = field.anywhere(params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
