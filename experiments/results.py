@@ -115,7 +115,7 @@ def _read(path: Path, modified_ns: int) -> Result:
 
 
 def _is_result(values: Any) -> bool:
-    if not isinstance(values, dict) or not (BASELINES in values or {"ssim", "tx"} <= set(values)):
+    if not isinstance(values, dict) or not (BASELINES in values or "median_ssim" in values or {"ssim", "tx"} <= set(values)):
         return False
     kinds = {"settings": dict, "presets": int, "tx": list, "ssim": dict, "training_seconds": float | int}
     if any(name in values and not isinstance(values[name], kind) for name, kind in kinds.items()):

@@ -19,6 +19,7 @@ from wbgs_jax.fields import get_field
 
 JOB = Job("1", "wideband")
 VALUES = {"environment": {"commit": "abc", "device": "cpu", "jax": "0.10", "version": "0.1.0"}, "evaluation_seconds": 1.0}
+VALUES |= {"tx": [1], "ssim": {"1": [0.5]}}
 
 
 @pytest.fixture(scope="module")
@@ -108,13 +109,13 @@ def test_the_table_is_that_of_the_results(table, tmp_path):
 
 
 def test_a_row_is_a_job_and_a_frequency(table):
-    rows = [row for row in table if (row["profile"], row["job"]) == ("quick", "scene1_wrfgs_long_seed2")]
-    values = json.loads((FOLDER / "quick" / "scene1_wrfgs_long_seed2.json").read_text())
+    rows = [row for row in table if (row["profile"], row["job"]) == ("quick", "scene4_wrfgs_long_seed2")]
+    values = json.loads((FOLDER / "quick" / "scene4_wrfgs_long_seed2.json").read_text())
     assert [float(row["ghz"]) for row in rows] == [float(f) for f in values["ssim"]]
     for row, (ghz, ssim) in zip(rows, values["ssim"].items(), strict=True):
         assert (float(row["median_ssim"]), float(row["mean_ssim"])) == pytest.approx((np.median(ssim), np.mean(ssim)), abs=6e-5)
         assert int(row["n"]) == len(ssim) and float(row["psnr_db"]) == values["psnr_db"][ghz]
-        expected = {"scene": "1", "field": "wrfgs", "variant": "long", "combination": "", "all_tx": "False", "seed": "2"}
+        expected = {"scene": "4", "field": "wrfgs", "variant": "long", "combination": "", "all_tx": "False", "seed": "2"}
         expected |= {name: str(values[name]) for name in ("steps", "samples", "gaussians", "training_seconds", "models")}
         expected |= {name: values["environment"][name] for name in ("version", "commit", "device", "jax")}
         assert expected.items() <= row.items() and row["current"] == "True"

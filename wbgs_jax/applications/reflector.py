@@ -159,7 +159,7 @@ def straight_powers(field: Field, params: Any, ends: Any, frequencies_hz: Any) -
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
     if "paths" not in field.known():
-        raise UserError(f"the {field.name} field knows no paths, nor what stands in the way; train the default one on data with a mesh")
+        raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
     field, params = field.anywhere(params)
     one = np.zeros((1, 3))  # an antenna, no array
     plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]

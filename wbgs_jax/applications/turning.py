@@ -52,7 +52,7 @@ def arrivals_anywhere(field: Field, params: Any, receiver: Any, transmitters: An
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
     if "paths" not in field.known():
-        raise UserError(f"the {field.name} field knows no paths, and so not whence waves come; train the default one on data with a mesh")
+        raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
     field, params = field.anywhere(params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
@@ -72,12 +72,12 @@ def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
     assert arrived.polarised is not None, "arrivals of traced paths have it"
     direction, amplitude = arrived.direction, arrived.polarised
     along_theta = zenith_vector(direction)
-    wave = amplitude[..., :1] * along_theta + amplitude[..., 1:] * jnp.cross(direction, along_theta)
+    vector = amplitude[..., :1] * along_theta + amplitude[..., 1:] * jnp.cross(direction, along_theta)
     exponents = jnp.array(pattern_exponents(pattern), jnp.float32)
 
     def one(angles: Float[Array, "2"]) -> Float[Array, " tx"]:
         heard = antenna_field(Antenna(boresight_quaternion(angles), exponents), direction)
-        return decibels(jnp.sum(squared_magnitude(jnp.sum(wave * heard, -1)), -1))
+        return decibels(jnp.sum(squared_magnitude(jnp.sum(vector * heard, -1)), -1))
 
     return jax.vmap(one)
 
