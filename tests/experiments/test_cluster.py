@@ -22,7 +22,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import save_scene
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import tests
-TIMES = ("wall_seconds", "training_seconds", "evaluation_seconds")
+TIMES = ("wall_seconds", "training_seconds", "evaluation_seconds", "environment")
+"""What may differ: times, and the commit, where somebody works in the tree meanwhile."""
 
 
 @pytest.fixture
