@@ -54,7 +54,7 @@ def account(before: Any, found: dict[str, dict[str, int]], run: dict[str, Any]) 
     """Returns the account with new counts in the place of those of the same names."""
     known = before.get("tried", {}) if isinstance(before, dict) else {}
     tried = {part: known.get(part, {}) | found.get(part, {}) for part in sorted({*known, *found})}
-    totals = {part: sum(counts.values()) for part, counts in tried.items()}
+    totals = {part.replace(" ", "_"): sum(counts.values()) for part, counts in tried.items()}  # as marks of pages name them
     runs = [*(before.get("runs", []) if isinstance(before, dict) else []), run]
     return {"totals": totals, "tried": tried, "runs": runs[-8:]}
 

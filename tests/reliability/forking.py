@@ -6,6 +6,7 @@ line of JSON for every piece of work, and answers with one.
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,7 +17,8 @@ from pathlib import Path
 
 from faults import Counter, Fault, install
 
-LONGEST_S = 400.0
+MOST_CPU_S, LONGEST_S = 300, 3600.0
+"""Of a piece of work: processor time, and time on a busy machine."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ def _child(work: str, folder: Path, fault: Fault, counter: Counter) -> None:
     from wbgs_jax._util.command import run_command
 
     os.setsid()
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))
     for number in (1, 2):
         os.dup2(os.open(f"{folder}.{('out', 'err')[number - 1]}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
     os.chdir(folder)
