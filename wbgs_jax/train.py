@@ -44,7 +44,7 @@ class Command:
     scene: str | None = None
     """Released scene (1, 2, ...) or a scene file (.npz); several of one room, seen by different receivers, as A,B."""
     data: str | None = None
-    """Folder of the published layout (spectrum/*.png, tx_pos.csv, ...), instead of --scene."""
+    """Folder of the published layout, instead of --scene."""
     out: Path | None = None
     """Run folder; the default names scene, field, preset and seed under runs/."""
     field: str = dataclasses.field(default_factory=default_field)
@@ -56,23 +56,23 @@ class Command:
     resume: bool = False
     """Go on where the run folder's newest checkpoint ends; starts anew where there is none."""
     frequency_ghz: float | None = None
-    """Frequency of a single-frequency folder that does not say."""
+    """Frequency of a folder that says none."""
     train_ghz: tuple[float, ...] = ()
-    """Train at these frequencies alone; the evaluation asks for the others (held-out transmitters, unseen frequencies)."""
+    """Train at these frequencies alone; the evaluation asks for the others."""
     train_tx: int = 0
     """Train with this number of transmitters; 0: all that are not held out."""
     validation: float = VALIDATION
-    """Share of the training transmitters that the curves watch and choices are made by, where the data name none; 0: none."""
+    """Share of the training transmitters by which choices are made; 0: none."""
     test_box: tuple[float, ...] = ()
-    """Test at all transmitters in a box, x y z of its lowest and of its highest corner (metres), and train at the others."""
+    """Test at all transmitters in a box (lowest and highest corner, metres), train at the others."""
     receiver: int | None = None
-    """Look at this receiver alone, of data that have several."""
+    """Look at this receiver alone."""
     neighbours: bool = True
-    """Ask known spectra nearby beside the field, where that gains on validation (docs/inference.md)."""
+    """Ask known spectra nearby, where that gains on validation."""
     devices: int = 0
-    """Devices of this machine that share every batch, at most; 0: all that can share it evenly (docs/scaling.md)."""
+    """Devices that share every batch; 0: all (docs/scaling.md)."""
     distributed: bool = False
-    """One of several processes that train together, started by srun or mpirun (docs/scaling.md)."""
+    """One of several processes (docs/scaling.md)."""
 
 
 def default_preset() -> str:

@@ -41,6 +41,8 @@ def test_what_another_library_has_written(tmp_path, rng, order, alike, rows):
     for name in numbers.dtype.names:
         np.testing.assert_allclose(found["point"][name], numbers[name], rtol=1e-6)
         assert found["point"][name].dtype == numbers[name].dtype
+    if order == ">":  # of elements with lists that library swaps no bytes, and cannot read them itself
+        return
     for name in ("before", "between"):
         np.testing.assert_allclose(found["face"][name], lists[name], rtol=1e-6)
     for name in ("corners", "weights"):

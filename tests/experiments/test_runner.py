@@ -117,10 +117,11 @@ def test_the_time_limit_holds_outside_a_training(command, monkeypatch, capsys):
 
 
 def test_a_signal_from_outside_stops_everything(command, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(runner, "execute", lambda *_: signal.raise_signal(signal.SIGTERM))
     with pytest.raises(runner.TimeIsUp):
         runner.run([JOB], command)
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_list_of_numbers_is_one_line(command):

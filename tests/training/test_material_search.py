@@ -30,7 +30,7 @@ SETTINGS = tiny_settings(
         "slope": 0.0,
     },
     optim={"steps": 20, "min_steps": 20},
-    search={"spectra": 48, "rounds": 3, "antenna_rounds": 0},
+    search={"spectra": 48, "rounds": 3, "antenna_rounds": 0, "tuning_spectra": 0},
 )
 
 

@@ -53,7 +53,7 @@ def use_compilation_cache() -> Path | None:
     return folder
 
 
-def limit_size(folder: Path, most: float = MOST_BYTES) -> None:
+def limit_size(folder: Path, most: float | int = MOST_BYTES) -> None:
     """Removes the files of a cache that nobody has asked for longest, until the others are small enough."""
     known = []
     for path in folder.rglob("*"):
