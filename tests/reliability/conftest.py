@@ -15,7 +15,7 @@ from wbgs_jax.training import checkpoint
 
 WITHOUT_A_RUN = ("train", "write", "run", "generate", "lay out", "measure")
 """Pieces of work that do not ask a trained field."""
-NAMES = {"seconds", "wall_seconds", "training_seconds", "evaluation_seconds", "environment"}
+NAMES = {"seconds", "ms_per_pas", "ms_per_pas_single", "wall_seconds", "training_seconds", "evaluation_seconds", "environment"}
 """What differs between two runs."""
 
 
