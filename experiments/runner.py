@@ -59,6 +59,8 @@ class Command:
     """Seeds; all by default."""
     fields: tuple[str, ...] = ()
     """Fields (wideband, wrfgs, wave, baselines, ...); all by default."""
+    variants: tuple[str, ...] = ()
+    """What is changed (snr_10, tx_20, missing_30, ...; experiments/variants.py); all by default."""
     minutes: float | None = None
     """Stop after this time; what is cut goes on the next time."""
     dry_run: bool = False
@@ -120,7 +122,8 @@ def all_jobs(names: tuple[str, ...] = (), profile: str = "quick") -> list[Job]:
 def chosen_jobs(command: Command) -> list[Job]:
     """Returns what a command line asks for."""
     jobs = all_jobs(command.only, command.profile)
-    for name, wanted in (("scene", command.scenes), ("seed", command.seeds), ("field", command.fields)):
+    choices = {"scene": command.scenes, "seed": command.seeds, "field": command.fields, "variant": command.variants}
+    for name, wanted in choices.items():
         jobs = [job for job in jobs if not wanted or getattr(job, name) in wanted]
     if not jobs:
         raise UserError("no job fits this choice; see `python -m experiments.runner --dry-run`")

@@ -183,6 +183,13 @@ def test_series_are_run_when_they_are_asked_for_in_their_own_size():
     assert {job.profile for job in runner.all_jobs(("wave_choices", "table1"), "smoke")} == {"smoke"}
 
 
+def test_faults_are_chosen_by_name(command):
+    chosen = runner.chosen_jobs(
+        dataclasses.replace(command, only=("robustness",), scenes=("4",), fields=("hybrid",), variants=("snr_10", "tx_20"))
+    )
+    assert {job.variant for job in chosen} == {"snr_10", "tx_20"} and {job.scene for job in chosen} == {"4"}
+
+
 def test_jobs_run_on_other_data(command):
     chosen = runner.chosen_jobs(dataclasses.replace(command, only=("choices",), scenes=("1", "2"), data="a/kitchen.npz"))
     assert {job.scene for job in chosen} == {"a/kitchen.npz"} and len({job.name for job in chosen}) == len(chosen)
