@@ -51,11 +51,14 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
 
 
 def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
-    """Returns the report of predicted powers of some links, those without any power left out; None where the data know none."""
+    """Returns the report of predicted powers of some links, those without any power left out; None where the data know none, or
+    are snapshots in which nothing was heard."""
     truth = dataset.received_db(index)
     if truth is None:
         return None
     heard = truth > NOT_HEARD_DB
+    if dataset.kind != "power" and not heard.any():
+        return None
     return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
 
 
@@ -83,11 +86,13 @@ def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarr
 
 
 def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver."""
+    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver; of the nearest
+    one where a receiver heard none."""
     everything = dataset.received_db(np.arange(len(dataset)))
     assert everything is not None
     heard = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
-    return everything[nearest_links(dataset, index, heard)]
+    all_hear = np.isin(dataset.receiver_index[index], dataset.receiver_index[heard]).all()
+    return everything[nearest_links(dataset, index, heard if all_hear else dataset.train)]
 
 
 def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
