@@ -20,7 +20,7 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-slow test-faults lowest newest simulator data lint typecheck bench gpu-check experiments tables \
+.PHONY: help setup train eval view measured test test-slow test-faults lowest newest locks coverage simulator data lint typecheck bench gpu-check experiments tables \
 	docs site notebooks package clean
 .DEFAULT_GOAL := help
 
@@ -79,6 +79,14 @@ define tested-with
 	VIRTUAL_ENV="$$work/venv" uv pip list 2>/dev/null | grep -iE "^(jax|jaxlib|flax|numpy|optax|orbax-checkpoint|scipy) " && \
 	"$$work/venv/bin/python" -m pytest -n 2 --dist worksteal -m "not slow"
 endef
+
+locks:  ## write the locks anew, with the hashes of every file, after a change of dependencies (needs uv)
+	uv lock --quiet
+	uv export --quiet --locked --no-emit-project --extra dev -o requirements.lock
+	uv export --quiet --locked --no-emit-project --extra dev --extra data -o requirements-data.lock
+
+coverage: setup  ## run the tests and report which lines of the library they reach (htmlcov/)
+	$(PY) -m pytest -n 2 --dist worksteal -m "not slow" --cov=wbgs_jax --cov-branch --cov-report=html --cov-report=json:coverage.json
 
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \

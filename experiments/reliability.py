@@ -34,7 +34,8 @@ class Command:
     """Run the tests of faults and write what they tried."""
 
     only: str = ""
-    """Those of a part alone, as `pytest -k` has it: kills, full_disks, fuzz_readers, fuzz_commands; other counts stay."""
+    """Those of a part alone, as `pytest -k` has it: kills, full_disks, fuzz_readers, fuzz_commands, guided; other
+    counts stay."""
     seed: int | None = None
     """Of everything that is drawn; a new one by default."""
     out: Path = FOLDER
