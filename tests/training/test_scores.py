@@ -9,7 +9,7 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
 
-from wbgs_jax.training.scores import make_scores
+from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
 SETTINGS = tiny_settings(
@@ -47,3 +47,9 @@ def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
     first = score(candidates, 3)
     np.testing.assert_allclose(first, found[:, :3], atol=1e-4)
     np.testing.assert_array_equal(score([params, params])[0], score([params])[0])
+
+
+def test_one_transmitter_is_never_sure(rng):
+    gains = rng.uniform(1, 2, 6)
+    assert not surely_better(gains, np.zeros(6, int), 3.0)
+    assert surely_better(np.tile(gains, 4), np.repeat(np.arange(12), 2), 3.0)
