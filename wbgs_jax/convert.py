@@ -22,6 +22,7 @@ from jaxtyping import Float
 from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable
 from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # What takes JAX is imported where it is wanted, as in predict.py.
@@ -160,6 +161,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax convert")
     check(command)
+    check_writable(command.out if command.out.suffix else command.out / "scenario")
     use_compilation_cache()
     say(take_in(command) if command.run is None else hand_on(command))
 

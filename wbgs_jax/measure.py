@@ -28,7 +28,7 @@ from trimesh.exchange.ply import export_ply
 from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, write_csv, write_json
+from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.measured.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
 from wbgs_jax.measured.held_out import COMPARED, NINETY, Score, scores
@@ -145,6 +145,7 @@ def main(arguments: list[str] | None = None) -> None:
     use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax measure")
     check(command)
+    check_writable(command.out, command.picture, command.answers, command.mesh)
     places, walls = parse_positions(command.tx), walls_of(command)
     check_positions("--tx", places)
     if command.mesh and not len(walls.ends):

@@ -61,6 +61,7 @@ def test_paths_out_and_in_again(runs, tmp_path):
         (["--paths", "gone", "--ghz", "28", "--out", "a.npz"], ["cannot read gone"]),
         (["--paths", "gone", "--out", "a.npz"], ["gone does not say its frequency"]),
         (["--paths", "gone", "--out", "a.ply"], ["does not end in .npz"]),
+        (["--paths", "gone", "--ghz", "28", "--out", "/dev/null/a.npz"], ["cannot write /dev/null/a.npz"]),
     ],
 )
 def test_what_cannot_be_converted(runs, tmp_path, monkeypatch, arguments, words):

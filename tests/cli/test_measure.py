@@ -56,6 +56,7 @@ def test_cells_grow_until_a_map_can_hold_them(tmp_path, rng):
         (["--data", "DATA", "--floor-plan", "nowhere.csv"], "there is no floor plan nowhere.csv"),
         (["--floor-plan", "walls.csv", "--mesh", "w.ply", "--tx", "1,1,1"], "powers follow from readings"),
         (["--data", "DATA", "--tx", "1e30,0,0"], "--tx 1e30,0,0 is no position"),
+        (["--data", "DATA", "--out", "/dev/null/s.json"], "cannot write /dev/null/s.json"),
     ],
 )
 def test_errors_are_for_people(tmp_path, rng, options, says):
