@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rooms import box, field_of, mesh_of, rectangle, room
-from synthetic import tiny_scene
+from synthetic import FIELDS, tiny_dataset, tiny_scene
 
-from wbgs_jax import predict, train
+from wbgs_jax import fields, predict, train
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import scene_dataset
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.data.surface import DatasetScene, make_mesh
 from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.fields import wave
+from wbgs_jax.fields import get_field, wave
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.inference.predictor import at_receiver, observe_links, predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
@@ -342,3 +342,19 @@ def test_the_pattern_is_the_receivers():
         plan = field.plan(params, make_receiver(RX, pattern=pattern))
         power.append(float(jax.jit(WaveField.render)(field, params, plan, query).power_db[0]))
     assert power[1] - power[0] == pytest.approx(8.0, abs=1e-3)
+
+
+def test_a_field_of_data_is_asked_within_jit():
+    """Its receivers are known, and where they were found to stand is decided on the host."""
+    dataset = tiny_dataset()
+    field = get_field("wave").make(FIELDS["wave"], DatasetScene(dataset), 0)
+    assert len(field.receivers)
+    moved = field.motion.receiver.at[0, 0].add(0.01)
+    field = dataclasses.replace(field, motion=dataclasses.replace(field.motion, receiver=moved))
+    params, receiver, query = field.init(jax.random.key(0)), dataset.receiver(), dataset.query(dataset.train[:2])
+    expected = field.render(params, field.plan(params, receiver), query).pas
+    found = jax.jit(lambda params, query: fields.pas(field, params, receiver, query))(params, query)
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    elsewhere = dataclasses.replace(receiver, position=receiver.position + jnp.array([0.01, 0, 0]))
+    unmoved = dataclasses.replace(field, receivers=jnp.zeros((0, 3)))
+    np.testing.assert_allclose(unmoved.render(params, unmoved.plan(params, elsewhere), query).pas, expected, atol=1e-3)

@@ -86,8 +86,8 @@ def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarr
 
 
 def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver; of the nearest
-    one where a receiver heard none."""
+    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver; where a
+    receiver heard none, of the nearest one."""
     everything = dataset.received_db(np.arange(len(dataset)))
     assert everything is not None
     heard = dataset.train[everything[dataset.train] > NOT_HEARD_DB]

@@ -141,7 +141,7 @@ class WaveField(Field):
 
     def _search(self, receiver: Receiver) -> Search:
         config = self.config
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self.facets, self.edges, receiver.position))):
+        if _traced(self.facets, self.edges, receiver.position):
             raise TypeError(
                 "the wave field finds a receiver's mirror images on the host: neither the field nor receiver.position can be "
                 "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
@@ -153,13 +153,17 @@ class WaveField(Field):
         """Returns a receiver of the data where it has been found to stand, and its tuning; any other one as it is, in tune."""
         if not len(self.receivers):
             return receiver, None
-        away = jnp.linalg.norm(self.receivers - receiver.position, axis=-1)
-        own = jnp.argmin(away)
+        known = self.receivers, receiver.position, self.motion.receiver
+        xp = jnp if _traced(*known) else np  # the mirror images of a position are found on the host, within `jit` too
+        places, position, shifts = map(xp.asarray, known)
+        away = xp.linalg.norm(places - position, axis=-1)
+        own = xp.argmin(away)
 
-        def found(of_all: Any) -> Array:
-            return jnp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
+        def found(of_all: Any, xp: Any = jnp) -> Any:
+            return xp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
 
-        position = receiver.position + found(self.motion.receiver)
+        with jax.ensure_compile_time_eval():
+            position = jnp.asarray(position + found(shifts, xp))
         orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
         tuning = None if self.tuning is None else found(self.tuning)
         return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
@@ -294,9 +298,13 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
 def _beams(receiver: Receiver) -> Beams | None:
     """Returns the beams of an array that is the same at all frequencies and known on the host."""
     positions = receiver.element_positions
-    if receiver.unit != "wavelengths" or isinstance(positions, jax.core.Tracer):
+    if receiver.unit != "wavelengths" or _traced(positions):
         return None
     return beams_of(np.asarray(positions))
+
+
+def _traced(*trees: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def _to_device(tree: Any) -> Any:
