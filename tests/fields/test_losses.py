@@ -171,3 +171,25 @@ def test_gradients_of_a_prediction_of_nothing_are_finite(snapshots):
 
     for scale in (0.0, 1e-20, 1.0):
         assert np.isfinite(jax.jit(jax.grad(total))(scale))
+
+
+def test_silent_snapshots_cost_nothing_and_break_nothing(rng):
+    """As of a transmitter that no wave leaves: its truth is zero."""
+    predicted, truth = (rng.normal(size=(2, 6, 2)).astype(np.float32).view(np.complex64)[..., 0] for _ in range(2))
+    silent = np.concatenate([truth, 0 * truth])
+    both = jnp.asarray(np.concatenate([predicted, predicted]))
+
+    def total(predicted, truth):
+        covariance = jnp.eye(6) / 6 + 0 * predicted[:, None, :]
+        losses = *snapshot_losses(predicted, truth), log_decorrelation(predicted, truth), surprise(covariance, truth)
+        return sum(map(jnp.sum, losses[:2])) * len(truth), losses
+
+    (_, (correlation, power, decorrelation, told)), gradient = jax.value_and_grad(total, has_aux=True)(
+        both, jnp.asarray(silent)
+    )
+    (_, alone), expected = jax.value_and_grad(total, has_aux=True)(both[:2], jnp.asarray(truth))
+    np.testing.assert_allclose([2 * correlation, 2 * power], alone[:2], rtol=1e-5)
+    np.testing.assert_allclose(decorrelation[:2], alone[2], rtol=1e-5)
+    np.testing.assert_allclose(told, np.append(alone[3], [0, 0]), rtol=1e-5)
+    np.testing.assert_allclose(gradient[:2], expected, rtol=1e-4, atol=1e-6)
+    assert not np.asarray(gradient[2:]).any() and np.isfinite(decorrelation).all()

@@ -13,8 +13,8 @@ from experiments.gpu_check import cases as cases_module
 from experiments.gpu_check import compiled, parity
 from experiments.gpu_check.cases import AIMS, ON_THE_HOST, ROOMS
 
-FREE = {"wbgs_jax/fields/networks.py", "wbgs_jax/applications/reflector.py"}
-"""Files whose matrix products may leave their precision to the device: the networks, and a plate's, still to be stated."""
+FREE = {"wbgs_jax/fields/networks.py"}
+"""Files whose matrix products may leave their precision to the device."""
 OF_A_CPU = ("lapack", "blas", "cpu", "ducc", "callback")
 """Parts of the names of code that only a CPU calls."""
 RUN = ("splatting", "statistics", "powers")

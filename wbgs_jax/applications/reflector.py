@@ -20,7 +20,7 @@ from wbgs_jax.applications.coverage import NARROWEST_M, Powers, soft_minimum
 from wbgs_jax.applications.descent import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.propagation.paths import TRANSMITTED
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, squared_magnitude
+from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import decibels, free_space_db
 from wbgs_jax.radio.patterns import zenith_vector
 from wbgs_jax.types import Query, make_receiver
@@ -96,7 +96,7 @@ class Reflector:
         """Returns the power of one user from one plate at all frequencies, dB."""
         normal, level, up = plate_axes(pose[3:])
         here, there = (end - pose[:3] for end in (self.transmitter, user))
-        before, behind = here @ normal, there @ normal
+        before, behind = _along(here, normal), _along(there, normal)
         image = here - 2 * before * normal
         # Where the straight way from the mirror image to the user meets the plane; weights alone, so that nothing divides by 0.
         share = jnp.abs(before) / jnp.maximum(jnp.abs(before) + jnp.abs(behind), NEAREST_M)
@@ -104,13 +104,13 @@ class Reflector:
         first, second, whole = _length(point - here), _length(there - point), _length(there - image)
         arriving = (point - here) / first
         caught = [
-            _caught(point @ axis, half, arriving @ axis, first * second / whole, self.frequencies_hz, blur)
+            _caught(_along(point, axis), half, _along(arriving, axis), first * second / whole, self.frequencies_hz, blur)
             for axis, half in ((level, self.size[0] / 2), (up, self.size[1] / 2))
         ]
         leaving = (there - point) / second
         field = zenith_vector(arriving)
-        mirrored = 2 * (field @ normal) * normal - field  # of the electric field off a metal
-        turned = mirrored @ zenith_vector(-leaving)
+        mirrored = 2 * _along(field, normal) * normal - field  # of the electric field off a metal
+        turned = _along(mirrored, zenith_vector(-leaving))
         amplitude = jnp.where(before * behind > 0, caught[0] * caught[1] * turned, 0)
         return decibels(amplitude**2) + _friis(whole, self.frequencies_hz) + in_the_way
 
@@ -256,6 +256,10 @@ def _caught(
 
 def _friis(metres: Float[Array, "*n"], frequencies_hz: Float[Array, " f"]) -> Float[Array, "*n f"]:
     return free_space_db(*jnp.broadcast_arrays(metres[..., None], frequencies_hz))
+
+
+def _along(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, ""]:
+    return jnp.matmul(vector, axis, precision=EXACT)
 
 
 def _length(vectors: Float[Array, "*n 3"]) -> Float[Array, "*n"]:

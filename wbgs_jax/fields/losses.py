@@ -81,25 +81,34 @@ def surprise(covariance: Complex[Array, "*n k k"], truth: Complex[Array, "*n k"]
 
     Covariances have a trace of 1, and `UNEXPLAINED` of it is added as noise. Where one sum of paths is all that there is, this
     is `log_decorrelation`, but for a constant and the noise; where paths are partially coherent it knows which part of a
-    snapshot says nothing.
+    snapshot says nothing. Of a silent snapshot it is zero.
     """
     count = truth.shape[-1]
     noise = UNEXPLAINED / count * jnp.eye(count)
     lower = jnp.linalg.cholesky((covariance + noise) / (1 + UNEXPLAINED))
-    unit = truth / jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
+    unit, norm = unit_snapshots(truth)
     whitened = solve_triangular(lower, unit[..., None], lower=True)[..., 0]
     volume = 2 * jnp.sum(jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1).real), -1)
-    return volume / count + jnp.log(jnp.sum(squared_magnitude(whitened), -1))
+    heard = norm[..., 0] > 0
+    return jnp.where(heard, volume / count + jnp.log(jnp.where(heard, jnp.sum(squared_magnitude(whitened), -1), 1)), 0)
 
 
 def _correlation_and_power(
     predicted: Complex[Array, "*n elements"], truth: Complex[Array, "*n elements"]
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns |y^H y'|^2 / (|y|^2 |y'|^2) and |y'|^2 / |y|^2."""
-    scale = jnp.sqrt(jnp.sum(squared_magnitude(truth), -1, keepdims=True))
-    unit_truth, relative = truth / scale, predicted / scale
+    """Returns |y^H y'|^2 / (|y|^2 |y'|^2) and |y'|^2 / |y|^2; of a silent truth, which says nothing of either, 1 and 1."""
+    unit_truth, scale = unit_snapshots(truth)
+    heard = scale[..., 0] > 0
+    relative = predicted / jnp.where(scale > 0, scale, 1)
     power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
-    return squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power, power
+    squared_correlation = squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power
+    return jnp.where(heard, squared_correlation, 1), jnp.where(heard, power, 1)
+
+
+def unit_snapshots(snapshots: Complex[Array, "*n k"]) -> tuple[Complex[Array, "*n k"], Float[Array, "*n 1"]]:
+    """Returns snapshots of norm 1, zeros where there were zeros, and their norms."""
+    norm = jnp.sqrt(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
+    return snapshots / jnp.where(norm > 0, norm, 1), norm
 
 
 def image_loss(

@@ -185,10 +185,10 @@ class WaveField(Field):
         self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
-        facet corrections."""
+        facet corrections. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum of 1."""
         config, plan = self.config, self.plan(params, batch.receiver, cache=cache)
         seen = self.render_links(params, plan, cache, batch.links)
-        loss, aux = compare(seen, batch, config.ssim_weight)
+        loss, aux = compare(seen, _heard_alone(batch, seen), config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
@@ -301,6 +301,14 @@ def _beams(receiver: Receiver) -> Beams | None:
     if receiver.unit != "wavelengths" or _traced(positions):
         return None
     return beams_of(np.asarray(positions))
+
+
+def _heard_alone(batch: Batch, seen: Observation) -> Batch:
+    """Returns a batch whose black spectra are what was predicted."""
+    if batch.pas is None:
+        return batch
+    black = jnp.max(batch.pas, (1, 2), keepdims=True) == 0
+    return dataclasses.replace(batch, pas=jnp.where(black, jax.lax.stop_gradient(seen.pas), batch.pas))
 
 
 def _traced(*trees: Any) -> bool:

@@ -129,7 +129,7 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
     three errors.
     """
     by_tx = _by_transmitter(gains, tx_index)
-    if len(by_tx) == 1:  # signs of one are flipped with even odds
+    if len(by_tx) < 2:  # signs of one are flipped with even odds
         return False
     chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue
     return bool(chance <= norm.sf(errors))

@@ -110,10 +110,11 @@ class Search:
         return params, bool(found.taken)
 
     def _tuning(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
-        """Returns the field with arrays that are out of tune as spectra say."""
-        if told.data.snapshots is None or not self.config.tuning_spectra:
+        """Returns the field with arrays that are out of tune as spectra say, which takes two transmitters."""
+        count = self.config.tuning_spectra
+        if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
             return told.field
-        field, found = search_tuning(params, told, self.config.tuning_spectra)
+        field, found = search_tuning(params, told, count)
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
 
