@@ -1,5 +1,5 @@
 # One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
-# `make experiments`; PYTHON for set-up; QUICK of `make test`.
+# `make experiments`; PYTHON for set-up; QUICK of `make test`, `lowest` and `newest`.
 SCENE  ?= 1
 FIELD  ?= hybrid
 PRESET ?= $(if $(CUDA),gpu,cpu)
@@ -77,7 +77,8 @@ define tested-with
 	uv venv --quiet --python "$(PYTHON)" "$$work/venv" && \
 	VIRTUAL_ENV="$$work/venv" uv pip install --quiet --resolution $(1) -e ".[dev]" && \
 	VIRTUAL_ENV="$$work/venv" uv pip list 2>/dev/null | grep -iE "^(jax|jaxlib|flax|numpy|optax|orbax-checkpoint|scipy) " && \
-	"$$work/venv/bin/python" -m pytest -n 2 --dist worksteal -m "not slow"
+	"$$work/venv/bin/python" -m pytest -n 2 --dist worksteal -m "not slow$(if $(QUICK), and not heavy)" && \
+	"$$work/venv/bin/python" -m pytest tests/guard/test_versions.py
 endef
 
 locks:  ## write the locks anew, with the hashes of every file, after a change of dependencies (needs uv)
