@@ -18,6 +18,7 @@ import tyro
 from wbgs_jax._util.command import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable
 from wbgs_jax.inference.answers import check_frequencies, frequencies, receiver_at
 from wbgs_jax.inference.predictor import at_receiver
 from wbgs_jax.training.run_folder import load_trained
@@ -88,6 +89,9 @@ def main(arguments: list[str] | None = None) -> None:
     use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax view")
     check(command)
+    check_writable(command.html)
+    if command.html:
+        say(f"drawing what {command.run} sees ...")
     viewer = start(command)
     if command.html:
         viewer.wait()
