@@ -17,6 +17,13 @@ def fresnel(cosine, permittivity):
     return (cosine - inner) / (cosine + inner), (permittivity * cosine - inner) / (permittivity * cosine + inner)
 
 
+def test_conductivity_is_the_imaginary_part_of_itu(rng):
+    """ITU-R P.2040-3, equation 29: 17.98 sigma / f, with the frequency in GHz."""
+    ghz, real, conductivity = rng.uniform(1, 100, 20), rng.uniform(1, 8, 20), rng.uniform(1e-3, 5, 20)
+    found = complex_permittivity(jnp.asarray(real), jnp.asarray(conductivity), jnp.asarray(1e9 * ghz))
+    np.testing.assert_allclose(found, real - 17.98j * conductivity / ghz, rtol=1e-3)
+
+
 def test_a_thick_lossy_slab_is_a_half_space(rng):
     cosine, permittivity = rng.uniform(0.05, 1, 20), rng.uniform(2, 8, 20) - 1j * rng.uniform(0.5, 5, 20)
     found = slab_coefficients(jnp.asarray(cosine), jnp.asarray(permittivity), jnp.full(20, 3.0), jnp.full(20, FREQUENCY))
