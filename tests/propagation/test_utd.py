@@ -66,3 +66,12 @@ def test_gradients_are_finite_at_a_border():
 
     for phi_out in (0.5 + np.pi, np.pi - 0.5, 1.0, 4.0):
         assert np.isfinite(jax.grad(total)(jnp.asarray(phi_out, jnp.float32)))
+
+
+def test_on_a_border_half_of_the_wave_is_diffracted():
+    """Half of the incident wave on the border of the shadow, and half of the reflected one on the border of the reflection."""
+    wavenumber, rho = 2 * np.pi, 30.0
+    for border, part in ((np.pi + 0.5, 0), (np.pi - 0.5, 2)):
+        arguments = (0.5, border, 2.0, 1.0, wavenumber * rho, wavenumber)
+        found = wedge_coefficients(*(jnp.asarray(a, jnp.float32) for a in arguments))[part]
+        np.testing.assert_allclose(abs(found) / np.sqrt(rho), 0.5, atol=0.03)  # the first sums the terms of two borders
