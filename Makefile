@@ -86,8 +86,9 @@ locks:  ## write the locks anew, with the hashes of every file, after a change o
 	uv export --quiet --locked --no-emit-project --extra dev -o requirements.lock
 	uv export --quiet --locked --no-emit-project --extra dev --extra data -o requirements-data.lock
 
-coverage: setup  ## run the tests and report which lines of the library they reach (htmlcov/)
+coverage: setup  ## run the tests and report which lines of the library they reach (htmlcov/, experiments/results)
 	$(PY) -m pytest -n 2 --dist worksteal -m "not slow" --cov=wbgs_jax --cov-branch --cov-report=html --cov-report=json:coverage.json
+	$(PY) -m experiments.coverage_account
 
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \

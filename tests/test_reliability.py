@@ -101,7 +101,8 @@ def test_a_checksum_is_of_every_number_and_of_no_name(rng):
     assert checksum(dataset) == checksum(tiny_dataset())
     for name in ("tx_positions", "snapshots", "vertices", "frequencies_hz"):
         values = np.asarray(getattr(dataset, name)).copy()
-        values.reshape(-1)[rng.integers(values.size)] *= 1 + 1e-6
+        flat, at = values.reshape(-1), rng.integers(values.size)
+        flat[at] = flat[at] * (1 + 1e-6) + 1e-6
         changed = type(dataset)(**{**vars(dataset), name: values})
         assert checksum(changed) != checksum(dataset), name
     assert checksum(type(dataset)(**{**vars(dataset), "name": "other"})) == checksum(dataset)
