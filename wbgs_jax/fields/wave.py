@@ -162,8 +162,10 @@ class WaveField(Field):
         def found(of_all: Any, xp: Any = jnp) -> Any:
             return xp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
 
-        with jax.ensure_compile_time_eval():
-            position = jnp.asarray(position + found(shifts, xp))
+        position = position + found(shifts, xp)
+        if xp is np:
+            with jax.ensure_compile_time_eval():
+                position = jnp.asarray(position)
         orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
         tuning = None if self.tuning is None else found(self.tuning)
         return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
