@@ -60,6 +60,7 @@ def train(field: str, folder: Path) -> None:
 
 def checkpoints(folder: Path) -> None:
     """Writes ten checkpoints, from wherever it was, of which two are kept."""
+    checkpoint.tidy(folder / "kept", 2)  # as a training that goes on
     done = checkpoint.checkpoint_steps(folder / "kept")
     for step in range(done[-1] + 1 if done else 1, 11):
         state = {"a": np.random.default_rng(step).random(50_000), "b": np.full((3, 4), step, np.float32)}

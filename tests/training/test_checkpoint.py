@@ -160,3 +160,20 @@ def test_a_place_that_cannot_be_written(tmp_path, state):
     with pytest.raises(UserError, match="cannot write checkpoint"):
         save(tmp_path / "file" / "checkpoints", state)
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_what_a_killed_process_had_begun_to_remove_is_removed_and_a_number_is_a_whole_checkpoint(tmp_path, state, monkeypatch):
+    for step in (1, 2, 3):
+        checkpoint.save(tmp_path, step, state, {}, METADATA, 3)
+
+    def killed(path, **options):
+        if any(path.iterdir() if path.is_dir() else ()):
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(shutil, "rmtree", killed)
+        checkpoint.tidy(tmp_path, 2)
+    assert checkpoint.checkpoint_steps(tmp_path) == [2, 3] and (tmp_path / "1.removed").exists()
+    checkpoint.tidy(tmp_path, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["3"]
+    checkpoint.tidy(tmp_path / "none", 2)

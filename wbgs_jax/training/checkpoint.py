@@ -27,6 +27,8 @@ FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16
 """Bytes that a checkpoint takes beside its arrays."""
 STATE = "state"
+REMOVED = ".removed"
+"""Ending of a checkpoint that is being removed."""
 """Folder of the arrays in a checkpoint."""
 
 
@@ -90,8 +92,21 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
             f"cannot write checkpoint {target}: {reason}; {left}. Free some space and go on with --resume"
         ) from error
     if is_first():
-        for old in checkpoint_steps(folder)[:-keep]:
-            shutil.rmtree(folder / str(old), ignore_errors=True)  # the newest one is whole, and that is what counts
+        tidy(folder, keep)
+
+
+def tidy(folder: Path, keep: int) -> None:
+    """Removes the oldest checkpoints beyond `keep`, and what a process that was killed meanwhile left of one.
+
+    A checkpoint is renamed before it is removed: what a number names is whole. Errors are nobody's: the newest one is there, and
+    that is what counts.
+    """
+    for old in checkpoint_steps(folder)[:-keep]:
+        shutil.rmtree(folder / f"{old}{REMOVED}", ignore_errors=True)
+        with contextlib.suppress(OSError):
+            (folder / str(old)).rename(folder / f"{old}{REMOVED}")
+    for left in folder.glob(f"*{REMOVED}"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 def _demand_room(folder: Path, arrays: dict[str, np.ndarray]) -> None:

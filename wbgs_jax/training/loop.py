@@ -231,6 +231,7 @@ class Run:
 
     def restore(self) -> bool:
         """Loads the newest checkpoint, if there is one, and returns whether there was."""
+        by_first(lambda: checkpoint.tidy(self.checkpoints, self.settings.loop.keep_checkpoints))
         steps = checkpoint.checkpoint_steps(self.checkpoints)
         by_first(lambda: curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1))
         if not steps:
