@@ -98,8 +98,8 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
 def tidy(folder: Path, keep: int) -> None:
     """Removes the oldest checkpoints beyond `keep`, and what a process that was killed meanwhile left of one.
 
-    A checkpoint is renamed before it is removed: what a number names is whole. Errors are nobody's: the newest one is there, and
-    that is what counts.
+    A checkpoint is renamed before it is removed: what a number names is whole. Errors are nobody's: the newest one is there,
+    and that is what counts.
     """
     for old in checkpoint_steps(folder)[:-keep]:
         shutil.rmtree(folder / f"{old}{REMOVED}", ignore_errors=True)
