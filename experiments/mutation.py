@@ -73,18 +73,8 @@ def environment_of_tests(folder: Path, seed: int) -> dict[str, str]:
 
 def passes(tree: Path, tests: tuple[str, ...], seed: int, limit: float | None = None) -> bool:
     """Returns whether a module's tests pass in a tree."""
-    words = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-m",
-        "not slow",
-        "-p",
-        "no:cacheprovider",
-        *(f"tests/{name}" for name in tests),
-    ]
+    options = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    words = [sys.executable, "-m", "pytest", *options, *(f"tests/{name}" for name in tests)]
     try:
         done = subprocess.run(
             words, cwd=tree, env=environment_of_tests(tree.parent, seed), capture_output=True, timeout=limit, check=False

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equation_six import pixel
 
 from experiments.bench.scene import random_gaussians
-from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat import geometry_plan, measure_limits, project, render_dense, render_splats
-from wbgs_jax.splat.project import SUPPORT
 from wbgs_jax.types import Gaussians, make_receiver
 
 MANY = 200_000
@@ -49,20 +48,9 @@ def test_two_hundred_thousand_gaussians(rng):
     assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 0.6
     splats = jax.tree.map(np.asarray, project(gaussians, RECEIVER))
     rows, columns = rng.integers(0, 90, 60), rng.integers(0, 360, 60)
-    expected = [pixel(splats, attenuation, signal, *place) for place in zip(rows, columns, strict=True)]
+    of_each = np.asarray(attenuation)[:, 0], np.asarray(signal)[:, 0]
+    expected = [pixel(splats, *of_each, *place) for place in zip(rows, columns, strict=True)]
     np.testing.assert_allclose(image[0, rows, columns], expected, atol=1e-3)
-
-
-def pixel(splats, attenuation, signal, row, column):
-    dx = (column - splats.means2d[:, 0] + AZIMUTH_PERIOD / 2) % AZIMUTH_PERIOD - AZIMUTH_PERIOD / 2
-    dy = row - splats.means2d[:, 1]
-    a, b, c = splats.conics.T.astype(float)
-    edge = np.exp(-(SUPPORT**2) / 2)
-    footprint = np.maximum(np.exp(-(a * dx**2 + 2 * b * dx * dy + c * dy**2) / 2) - edge, 0) / (1 - edge)
-    order = np.argsort(splats.depths, kind="stable")
-    alpha = np.where(np.isfinite(splats.depths), np.asarray(attenuation)[:, 0] * footprint, 0)[order]
-    surviving = np.concatenate([[1], np.cumprod(1 - alpha)[:-1]])
-    return np.sum(surviving * alpha * np.asarray(signal)[order, 0])
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from equation_six import pixel
 
 from wbgs_jax.radio.geometry import (
     AZIMUTH_PERIOD,
@@ -29,7 +30,6 @@ from wbgs_jax.splat import (
     render_splats,
     slots_for,
 )
-from wbgs_jax.splat.project import SUPPORT
 from wbgs_jax.splat.tiles import CHUNK, build_tile_jobs
 from wbgs_jax.types import Gaussians, Receiver, make_receiver
 
@@ -184,22 +184,11 @@ def test_plans_can_be_mapped_over(rng, x64):
 def test_dense_reference_agrees_with_equation_6_written_pixel_by_pixel(rng, x64):
     gaussians, receiver, attenuation, signal = random_case(rng)
     splats = project(gaussians, receiver)
-    means, conics, depths = (np.asarray(a) for a in (splats.means2d, splats.conics, splats.depths))
-    attenuation_, signal_ = np.asarray(attenuation), np.asarray(signal)
-    edge = np.exp(-(SUPPORT**2) / 2)
     image = np.asarray(jax.jit(render_dense)(splats, attenuation, signal))
-    order = [i for i in np.argsort(depths) if np.isfinite(depths[i])]
+    splats, attenuation, signal = jax.tree.map(np.asarray, (splats, attenuation, signal))
     for query, row, column in zip(rng.integers(0, B, 60), rng.integers(0, 90, 60), rng.integers(0, 360, 60), strict=True):
-        total, surviving = 0.0, 1.0
-        for i in order:
-            dx = (column - means[i, 0] + AZIMUTH_PERIOD / 2) % AZIMUTH_PERIOD - AZIMUTH_PERIOD / 2
-            d = np.array([dx, row - means[i, 1]])
-            q = d @ np.array([[conics[i, 0], conics[i, 1]], [conics[i, 1], conics[i, 2]]]) @ d
-            g = max(np.exp(-q / 2) - edge, 0) / (1 - edge)
-            alpha = attenuation_[i, query] * g
-            total += surviving * alpha * signal_[i, query]
-            surviving *= 1 - alpha
-        assert image[query, row, column] == pytest.approx(total, abs=1e-12)
+        expected = pixel(splats, attenuation[:, query], signal[:, query], row, column)
+        assert image[query, row, column] == pytest.approx(expected, abs=1e-12)
 
 
 def test_gradients_agree_with_finite_differences(rng, x64):

@@ -9,6 +9,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Complex, Float
 
 from wbgs_jax.radio.array import EXACT, squared_magnitude
+from wbgs_jax.radio.channel import unit_snapshots
 
 _WINDOW, _SIGMA = 11, 1.5
 FAINTEST = 1e-12
@@ -103,12 +104,6 @@ def _correlation_and_power(
     power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
     squared_correlation = squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power
     return jnp.where(heard, squared_correlation, 1), jnp.where(heard, power, 1)
-
-
-def unit_snapshots(snapshots: Complex[Array, "*n k"]) -> tuple[Complex[Array, "*n k"], Float[Array, "*n 1"]]:
-    """Returns snapshots of norm 1, zeros where there were zeros, and their norms."""
-    norm = jnp.sqrt(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
-    return snapshots / jnp.where(norm > 0, norm, 1), norm
 
 
 def image_loss(

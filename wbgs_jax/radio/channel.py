@@ -121,11 +121,18 @@ def doppler_hz(
     return frequency_hz / SPEED_OF_LIGHT * (along_departure - jnp.sum(arrivals.arrival * rx_velocity, -1))
 
 
+def unit_snapshots(
+    snapshots: Complex[Array, "*b elements"],
+) -> tuple[Complex[Array, "*b elements"], Float[Array, "*b 1"]]:
+    """Returns snapshots of norm 1, zeros where there were zeros, and their norms."""
+    norm = jnp.sqrt(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
+    return snapshots / jnp.where(norm > 0, norm, 1), norm
+
+
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
     """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for one of nothing."""
     # Of unit vectors: the square of a product of faint ones would vanish in single precision.
-    norms = [jnp.sqrt(jnp.sum(squared_magnitude(v), -1, keepdims=True)) for v in (a, b)]
-    unit_a, unit_b = (v / jnp.where(norm > 0, norm, 1) for v, norm in zip((a, b), norms, strict=True))
+    (unit_a, _), (unit_b, _) = unit_snapshots(a), unit_snapshots(b)
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 
