@@ -70,7 +70,7 @@ def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningRepor
 def _parts(tuned: Any) -> tuple[np.ndarray, np.ndarray]:
     """Returns phases (radians) and amplitudes (dB) of all elements."""
     tuning = np.asarray(tuned.tuning, np.float64)
-    return tuning[..., 1], 20 * np.log10(np.e) * tuning[..., 0]
+    return tuning[..., 1], 20 / np.log(10) * tuning[..., 0]
 
 
 def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> Complex[np.ndarray, "r elements"]:
