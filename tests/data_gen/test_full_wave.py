@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ElementTree
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from trimesh.sample import sample_surface
 
 from data_gen.full_wave import cabin, openems
 from data_gen.full_wave.assemble import assemble
@@ -67,7 +68,7 @@ def test_everything_lies_on_nodes_of_all_cell_sizes(model):
 def test_bodies_of_the_mesh_are_filled_with_what_they_are_made_of(model, spec, rng):
     """Just inside of every face of a body there is its material, just outside there is none of it."""
     for part in spec.solids:
-        points, face = part.mesh.sample(400, return_index=True, seed=int(rng.integers(2**31)))
+        points, face = sample_surface(part.mesh, 400, seed=int(rng.integers(2**31)))
         normal = part.mesh.face_normals[face]
         inside = fills(model.blocks, points - 0.004 * normal)
         assert set(inside) == {part.material}
@@ -83,7 +84,7 @@ def test_walls_begin_at_the_mesh_and_are_as_thick_as_it_says(model, spec, rng):
     for part in spec.parts:
         if part.kind != "shell":
             continue
-        points, face = part.mesh.sample(100, return_index=True, seed=int(rng.integers(2**31)))
+        points, face = sample_surface(part.mesh, 100, seed=int(rng.integers(2**31)))
         normal = part.mesh.face_normals[face]
         outward = normal * np.sign(((points - middle) * normal).sum(1))[:, None]
         inner = np.clip(points, spec.bounds()[0] + 0.01, spec.bounds()[1] - 0.01)  # off the corners

@@ -153,7 +153,7 @@ def test_a_batch_equals_a_vmap_of_single_queries(rng, points, query):
     params = trained(rng, field)
     plan = plan_of(field, params)
     batch = render(params, plan, query)
-    assert batch.shape == (B, 90, 360) and float(batch.max()) > 0.05
+    assert batch.shape == (B, 90, 360) and float(batch.max()) > 0.01
     assert batch.std(axis=0).max() > 1e-3  # the queries do differ
     one_by_one = jax.vmap(lambda tx, f: wideband.render(params, plan, Query(tx[None], f[None]))[0])
     np.testing.assert_allclose(jax.jit(one_by_one)(query.tx_position, query.frequency_hz), batch, atol=1e-5)

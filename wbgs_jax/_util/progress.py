@@ -24,11 +24,13 @@ class CountProgress:
         self.task = self.bar.add_task(label, total=total, completed=done)
 
     def __enter__(self) -> "CountProgress":
-        self.bar.start()
+        if not self.bar.disable:
+            self.bar.start()
         return self
 
     def __exit__(self, *exception) -> None:
-        self.bar.stop()
+        if not self.bar.disable:  # rich of before 14.3.1 ends one that it never showed by an empty line
+            self.bar.stop()
 
     def advance(self) -> None:
         """Says that one more piece is done."""

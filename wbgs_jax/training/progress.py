@@ -44,11 +44,13 @@ class TrainingProgress:
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
 
     def __enter__(self) -> "TrainingProgress":
-        self.bar.start()
+        if not self.bar.disable:
+            self.bar.start()
         return self
 
     def __exit__(self, *exception) -> None:
-        self.bar.stop()
+        if not self.bar.disable:
+            self.bar.stop()
 
     def update(self, entry: dict[str, Any]) -> None:
         """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
