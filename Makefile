@@ -1,5 +1,5 @@
 # One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
-# `make experiments`; PYTHON for set-up; QUICK of `make test`, `lowest` and `newest`.
+# `make experiments`; PYTHON for set-up; QUICK of `make lowest` and `newest`.
 SCENE  ?= 1
 FIELD  ?= hybrid
 PRESET ?= $(if $(CUDA),gpu,cpu)
@@ -20,7 +20,7 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-slow test-faults lowest newest locks coverage simulator data lint typecheck bench gpu-check experiments tables \
+.PHONY: help setup train eval view measured test test-heavy test-slow test-faults lowest newest locks coverage simulator data lint typecheck bench gpu-check experiments tables \
 	docs site notebooks package clean
 .DEFAULT_GOAL := help
 
@@ -55,10 +55,13 @@ measured: setup  ## learn and score a map of measured powers: make measured DATA
 	@test -n "$(DATA)" || { echo "error: give the folder with the readings: make measured DATA=folder" >&2; exit 2; }
 	$(VENV)/bin/wbgs-jax measure --data $(DATA) --out $(MEASURED)/scores.json --picture $(MEASURED)/maps.png
 
-test: setup  ## run the tests; QUICK=1 leaves out long searches and trainings
-	$(PY) -m pytest -n 2 --dist worksteal -m "not slow$(if $(QUICK), and not heavy)"
+test: setup  ## run the tests: about five minutes on two cores
+	$(PY) -m pytest -n 2 --dist worksteal -m "not slow and not heavy"
 
-test-slow: setup  ## run the slow tests too, in fully optimised code: larger cases of what `make test` checks
+test-heavy: setup  ## run the tests that compile, search or train for long; CI runs them too: about ten minutes
+	$(PY) -m pytest -n 2 --dist worksteal -m "heavy and not slow"
+
+test-slow: setup  ## run all tests in fully optimised code, among them larger cases of what the others check: hours
 	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
 
 test-faults: setup  ## run the tests of faults, count what was tried: make test-faults [ARGS="--only fuzz_readers --seed 1"]

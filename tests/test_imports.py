@@ -76,6 +76,7 @@ def report():
     return json.loads(done.stdout)
 
 
+@pytest.mark.heavy
 def test_importing_the_package_loads_and_changes_nothing(report):
     assert report["import wbgs_jax"] == report["before JAX is loaded"] == {}
     assert report["loaded"] == []

@@ -56,6 +56,7 @@ for field in (splatted, volume, coherent):
 """
 
 
+@pytest.mark.heavy
 def test_the_pure_part_renders_where_the_hosts_modules_are_missing():
     """All fields, from their geometry to their spectra."""
     source = BLOCKER.format(blocked=HOST_ONLY) + RENDER_EVERYTHING

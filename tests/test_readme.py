@@ -127,6 +127,7 @@ HOLDS: dict[str, Callable[[dict], None]] = {
 """What must hold of the names that a page's blocks leave, by page."""
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("page", [p for p in PAGES if python_blocks(p) and p.name not in ELSEWHERE], ids=lambda p: p.name)
 def test_the_examples_of_a_page_run(page, folder, monkeypatch):
     monkeypatch.setattr(base, "_FIELDS", dict(base._FIELDS))

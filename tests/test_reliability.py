@@ -75,6 +75,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(saved, error, monkeypatch):
     assert {entry.name for entry in saved.iterdir()} == {"4", "8"}
 
 
+@pytest.mark.heavy
 def test_other_data_under_the_same_name_are_told(tmp_path):
     """To whoever goes on with a training, asks it or scores it."""
     run = make_coherent_run(tmp_path / "box")
@@ -116,6 +117,7 @@ def _hold(folder, ready):
         time.sleep(60)
 
 
+@pytest.mark.heavy
 def test_two_trainings_never_share_a_folder(tmp_path):
     context = multiprocessing.get_context("spawn")
     ready = context.Event()
@@ -218,6 +220,7 @@ def test_answers_far_away_are_refused(tmp_path):
     assert not (tmp_path / "x.npz").exists()
 
 
+@pytest.mark.heavy
 def test_without_git_results_have_no_commit(tmp_path, monkeypatch):
     run = make_coherent_run(tmp_path / "box")
     monkeypatch.setenv("PATH", str(tmp_path))

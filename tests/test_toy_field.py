@@ -302,6 +302,7 @@ def test_what_it_does_not_know_is_an_error_for_people(tmp_path):
         del base._FIELDS["blind"]
 
 
+@pytest.mark.heavy
 def test_neighbours_are_asked_unless_their_file_is_gone(tmp_path):
     """By the command line: the toy knows little of the room, the transmitters next door more."""
     save_scene(tmp_path / "box.npz", tiny_scene(24))

@@ -42,6 +42,7 @@ def mirrored(users, reflection):
     return powers
 
 
+@pytest.mark.heavy
 def test_in_free_space_powers_and_their_slopes_are_those_of_friis(air, rng):
     powers = power_at_users(*air, [0.0, 0.0, 1.0], HZ)
     place = rng.uniform(*BOX, 3).astype(np.float32)
@@ -52,6 +53,7 @@ def test_in_free_space_powers_and_their_slopes_are_those_of_friis(air, rng):
     np.testing.assert_allclose(slope, -20 / np.log(10) * away / distance**2, atol=0.02)
 
 
+@pytest.mark.heavy
 def test_ends_may_be_exchanged_before_a_wall(mirror, rng):
     """What a user gets from the antenna is what the antenna gets from the user."""
     field, params = mirror

@@ -15,6 +15,7 @@ from experiments import downstream
 GUIDE = (Path(__file__).parents[2] / "docs" / "applications.md").read_text()
 
 
+@pytest.mark.heavy
 def test_the_guide_runs(monkeypatch):
     monkeypatch.setattr(wbgs_jax, "load_trained", lambda folder: trained())
     names: dict = {}
@@ -39,6 +40,7 @@ def account(tmp_path, monkeypatch):
     return tmp_path / "downstream.json"
 
 
+@pytest.mark.heavy
 def test_the_account_of_a_scene(account, capsys, monkeypatch):
     report = json.loads(account.read_text())["box"]["txall"]
     nearest = report["localisation"]["nearest_training_transmitter"]["median_m"]

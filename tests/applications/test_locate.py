@@ -68,6 +68,7 @@ def test_an_unknown_transmitted_power_does_not_matter(rng):
     np.testing.assert_allclose(losses, 0, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_front_and_back_of_a_planar_array_sound_alike(rng):
     asked = locator(
         trained(images=1), HZ, box=[RX - np.array([2, 1.5, 0.5]), RX + np.array([2, 1.5, 1.3])], step=1.0, starts=24
@@ -92,6 +93,7 @@ def test_slopes_of_the_loss_are_differences(rng, what, quantity):
     assert float(slope) == pytest.approx(float(ahead - behind) / 0.02, rel=0.03, abs=2e-3)
 
 
+@pytest.mark.heavy
 def test_a_wall_of_metal_gives_the_coherent_field_slopes_too(rng):
     """One wave off a wall: the loss of a blurred and of a sharp answer has the slope that differences have."""
     sizes = {"specular_tried": 4, "specular_kept": 4, "diffracted_tried": 4, "diffracted_kept": 4, "mirror_areas": (0.0,)}

@@ -87,6 +87,7 @@ def test_the_best_plate_halves_the_angle(rng):
     assert (jnp.diff(found.loss) >= 0).all()
 
 
+@pytest.mark.heavy
 def test_a_plate_is_what_a_field_with_the_same_plate_in_its_mesh_says():
     """Around a screen of metal, by a plate that looks back at both ends; straight through the screen next to nothing goes."""
     screen, plate = rectangle((2, -1, 0), (0, 2, 0), (0, 0, 3)), rectangle((1.2, 2, 0.7), (1.6, 0, 0), (0, 0, 1.6))

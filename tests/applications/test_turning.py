@@ -59,6 +59,7 @@ def test_slopes_are_differences(rng):
     assert float(slope) == pytest.approx(float(ahead - behind) / 0.02, rel=0.01, abs=0.01)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("pattern", ["tr38901", "dipole"])
 def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     """Before a wall of metal, with the powers of both waves added."""

@@ -29,6 +29,7 @@ def ask(runs, field, *arguments):
     return call(map_command.main, "--run", runs[field], *arguments)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("ghz", [(28,), (2.4, 28, 60)])
 @pytest.mark.parametrize("what", ["power", "k-factor", "delay-spread", "angular-spread"])
 def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
@@ -65,6 +66,7 @@ def test_best_beams_are_those_of_the_spectra(runs, tmp_path):
     assert azimuth.shape == zenith.shape == (len(codebook()),) and np.abs(azimuth).max() <= 180 and zenith.max() < 90
 
 
+@pytest.mark.heavy
 def test_the_picture_shows_maps_and_walls(runs, tmp_path):
     picture = tmp_path / "new" / "map.png"
     result = ask(runs, "wave", "--ghz", 2.4, 28, "--step", 0.4, "--picture", picture)

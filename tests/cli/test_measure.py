@@ -11,6 +11,7 @@ from flats import LAW, folder, powers
 from wbgs_jax.measure import main
 
 
+@pytest.mark.heavy
 def test_scores_pictures_and_answers(tmp_path, rng):
     data = folder(tmp_path, rng)
     files = {
@@ -38,6 +39,7 @@ def test_walls_become_a_mesh(tmp_path, rng):
     np.testing.assert_allclose(mesh.bounds[1][2], 2.5)
 
 
+@pytest.mark.heavy
 def test_cells_grow_until_a_map_can_hold_them(tmp_path, rng):
     data = folder(tmp_path, rng, n=1700, rooms=False)
     done = call(main, "--data", data, "--cell", 0.01, "--tx", "1,1,1.3")
@@ -76,6 +78,7 @@ def test_a_real_flat_with_a_room_held_out(tmp_path, shared_data):
     assert "CC BY 4.0" in done.err
 
 
+@pytest.mark.heavy
 def test_odd_rooms_and_receivers(tmp_path, rng):
     """A receiver heard in one room alone, one never heard, a square where nothing is, and names of rooms that are markup."""
     data = folder(tmp_path, rng, n=200)

@@ -232,6 +232,7 @@ def test_a_file_of_queries(hearing, tmp_path):
         assert answer["pas"].shape == (3, 90, 360) and answer["tx_positions"].shape == (3, 3)
 
 
+@pytest.mark.heavy
 def test_paths_of_a_file_of_queries(coherent, tmp_path):
     queries, out = tmp_path / "q.csv", tmp_path / "a.csv"
     queries.write_text("x,y,z,ghz\n1,0.5,1.5,28\n1,0.5,1.5,2.4\n-1,1,1.2,28\n")
@@ -316,6 +317,7 @@ def coherent(tmp_path_factory):
     return make_coherent_run(tmp_path_factory.mktemp("runs") / "coherent")
 
 
+@pytest.mark.heavy
 def test_below_the_band_only_paths_answer(coherent, tmp_path):
     out = tmp_path / "low.npz"
     result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.4, "--what", "power", "--out", out)
@@ -327,6 +329,7 @@ def test_below_the_band_only_paths_answer(coherent, tmp_path):
     assert result.code == 2 and "0.3 to 100 GHz" in result.err
 
 
+@pytest.mark.heavy
 def test_the_whole_channel(coherent, tmp_path):
     ask = ["--run", coherent, "--tx", *INSIDE, "--ghz", 2.4, 28]
     for what, options, shapes in (

@@ -269,6 +269,7 @@ def test_data_that_are_gone(run, scene, tmp_path):
     assert_error_for_people(call(eval_command.main, "--run", run), "gone.npz")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("what", ["manifest.ocdbt", "d/*"])
 def test_a_damaged_checkpoint_in_a_process_of_its_own(run, what):
     damaged = list((run / "checkpoints" / "4" / "state").glob(what))
@@ -279,6 +280,7 @@ def test_a_damaged_checkpoint_in_a_process_of_its_own(run, what):
     assert_error_for_people(result, run / "checkpoints" / "4", "delete")
 
 
+@pytest.mark.heavy
 def test_an_unknown_scene_in_a_process_of_its_own(tmp_path):
     assert_error_for_people(in_a_process("wbgs_jax.train", "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene")
     assert list(tmp_path.iterdir()) == []

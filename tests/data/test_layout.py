@@ -361,6 +361,7 @@ def test_a_split_without_test_has_no_form_in_the_layout(tmp_path, scene):
         export_layout(scene, tmp_path / "out")
 
 
+@pytest.mark.heavy
 def test_command_line(tmp_path, scene):
     save_scene(tmp_path / "s.npz", scene)
     command = [sys.executable, "-m", "wbgs_jax.data.layout", str(tmp_path / "s.npz"), str(tmp_path / "out")]

@@ -208,6 +208,7 @@ def test_a_run_goes_on_where_it_stopped(model, tmp_path):
     assert len({digest(model, "1"), digest(model, "2"), digest(other, "1")}) == 3
 
 
+@pytest.mark.heavy
 def test_scene_file(model, tmp_path):
     model = dataclasses.replace(model, points=model.points[::20])
     results, scale = results_of(FreeSpace(), model, tmp_path)

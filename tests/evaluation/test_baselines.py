@@ -147,6 +147,7 @@ def test_images_serve_as_well_as_snapshots(dataset):
         np.testing.assert_allclose(baselines(images)[name](dataset.test), predict(dataset.test), atol=0.5 / 255 + 1e-5)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("unit", ["wavelengths", "metres"])
 def test_every_receiver_is_predicted_from_its_own(unit):
     """As if it were the only one; but the mean is that of all."""

@@ -60,6 +60,7 @@ def test_a_run_without_neighbours_scores_the_same_twice(tmp_path, monkeypatch):
     assert 0 < scores["nearest_tx"]["median_ssim"] < 1
 
 
+@pytest.mark.heavy
 def test_receivers_that_were_never_heard(tmp_path, monkeypatch):
     """The same receiver under another name scores as it does at home; what was trained is left out there."""
     run = make_coherent_run(tmp_path / "box")
@@ -87,6 +88,7 @@ def test_receivers_that_were_never_heard(tmp_path, monkeypatch):
         assert both[name]["trained_on"] == "box+box_rx3"
 
 
+@pytest.mark.heavy
 def test_the_main_job_is_timed_against_another(tmp_path):
     settings = tiny_settings()
     versions = {"today": settings, "longer": changed(settings, {"optim": {"steps": 3 * settings.optim.steps}})}

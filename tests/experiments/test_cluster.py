@@ -55,6 +55,7 @@ def killed_once(number, folder):
     return number**2
 
 
+@pytest.mark.heavy
 def test_a_killed_worker_loses_nothing_and_an_error_stops_no_other(tmp_path):
     with cluster.connected("local", 2) as client:
         found = {task: (said, str(error)) for task, said, error in cluster.finished(client, killed_once, range(4), tmp_path)}

@@ -44,6 +44,7 @@ def result_of(command, job=JOB):
     return Results(command.profile, command.results).get(job)
 
 
+@pytest.mark.heavy
 def test_every_job_is_done_once(command, calls):
     wanted = [dataclasses.replace(JOB, seed=seed) for seed in range(3)]
     assert runner.run(wanted[:2], command) == []

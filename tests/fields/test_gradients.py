@@ -50,7 +50,8 @@ OUTSIDE = {"wave": {".position"}}
 """Leaves that the promise leaves out."""
 SLOW = ("wrfgs", "wave with edges")
 """The wideband field with less, and what compiles for long."""
-NAMES = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in (*UNUSED, "wave with edges")]
+MARKS = {"wave": pytest.mark.heavy, **dict.fromkeys(SLOW, pytest.mark.slow)}
+NAMES = [pytest.param(name, marks=MARKS.get(name, ())) for name in (*UNUSED, "wave with edges")]
 
 
 SMALL_VOLUME = dict.fromkeys(("skip", "point_octaves", "direction_octaves", "tx_octaves", "frequency_octaves"), 1)

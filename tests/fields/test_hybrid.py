@@ -62,6 +62,7 @@ def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
     np.testing.assert_allclose(again.pas, seen.pas, atol=2e-3)  # traced by another program, in single precision, at 94 GHz
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("share", [0.0, 0.35, 1.0])
 def test_the_share_is_what_explains_other_links_best(run, share):
     params, index = run.state.params, run.dataset.validation
@@ -77,6 +78,7 @@ def test_the_share_is_what_explains_other_links_best(run, share):
     assert report["coherent_share"]["spectra"] == {"mean": pytest.approx(share, abs=0.05), "by_query": False}
 
 
+@pytest.mark.heavy
 def test_its_loss_is_the_sum_and_no_field_knows_of_the_other(run):
     field, params = run.field, run.state.params
     batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)
@@ -96,6 +98,7 @@ def test_elsewhere_it_is_the_coherent_field(run):
     assert field.name == "wave" and params is run.state.params.wave
 
 
+@pytest.mark.heavy
 def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     nothing = np.zeros((0, 3), np.int32)
     dataset = dataclasses.replace(tiny_dataset(12), faces=nothing, materials=None, face_part=None)

@@ -173,6 +173,7 @@ def test_gradients_of_a_prediction_of_nothing_are_finite(snapshots):
         assert np.isfinite(jax.jit(jax.grad(total))(scale))
 
 
+@pytest.mark.heavy
 def test_silent_snapshots_cost_nothing_and_break_nothing(rng):
     """As of a transmitter that no wave leaves: its truth is zero."""
     predicted, truth = (rng.normal(size=(2, 6, 2)).astype(np.float32).view(np.complex64)[..., 0] for _ in range(2))

@@ -94,6 +94,7 @@ def trained(folder):
     return load_trained(folder / "run")
 
 
+@pytest.mark.heavy
 def test_training_finds_the_materials_and_moves_nothing_else(trained):
     """Held-out spectra, and the permittivity itself: all it has seen are snapshots. The field's geometry stays what it was."""
     dataset, params = trained.dataset(), trained.params
@@ -113,6 +114,7 @@ def test_training_finds_the_materials_and_moves_nothing_else(trained):
         assert (np.asarray(getattr(start, name)) != getattr(params, name)).any()
 
 
+@pytest.mark.heavy
 def test_the_commands_answer(folder, trained, tmp_path):
     """Spectra, and quantities of the channel: traced anew, those of links whose paths are prepared."""
     assert trained.field.sizes(trained.params)["facets"] == 12
@@ -137,6 +139,7 @@ def test_the_commands_answer(folder, trained, tmp_path):
         np.testing.assert_allclose(seen.power_db[index], 10 * np.log10(np.mean(np.abs(found) ** 2, -1)), atol=0.01)
 
 
+@pytest.mark.heavy
 def test_another_receiver_is_asked_as_if_it_were_the_only_one(folder, trained, tmp_path):
     """By the command: another place and another turn of the array, traced anew; what training found out about where the trained
     receiver stands goes with that one. At its own place the field is what it was."""
@@ -165,6 +168,7 @@ def test_another_receiver_is_asked_as_if_it_were_the_only_one(folder, trained, t
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
+@pytest.mark.heavy
 def test_prepared_links_are_rendered_as_others_are(rng):
     """Paths that are traced beforehand, and looked up by the number of their transmitter, give the same observation."""
     field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), **SMALL)
@@ -187,6 +191,7 @@ def test_without_surfaces_the_message_says_so(scene):
         make_mesh(points)
 
 
+@pytest.mark.heavy
 def test_links_of_several_receivers_are_rendered_as_those_of_each_alone():
     """From one table of paths, in which every receiver has those of its own transmitters."""
     dataset = scene_dataset(tiny_scene(n_rx=3))
@@ -229,6 +234,7 @@ def test_all_parameters_have_finite_gradients(rng, parts):
         assert float(jnp.abs(found.excess_loss).max()) > 0 and float(jnp.abs(found.facet_correction).max()) > 0
 
 
+@pytest.mark.heavy
 def test_without_phases_the_spectrum_is_that_of_added_powers(rng):
     """Against the mean over many draws of random path phases, squared."""
     _, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0, 0.0), **SMALL)
@@ -245,6 +251,7 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(rng):
     np.testing.assert_allclose(found, np.sqrt(power / power.max()), atol=0.07)
 
 
+@pytest.mark.heavy
 def test_spectra_are_those_of_snapshots_where_places_are_known_and_of_added_powers_where_they_are_not(rng):
     _, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0, 0.0), **SMALL)
     query = make_query(rng.uniform([3.5, 0.5, 0.5], [5.5, 3.5, 2.5], (3, 3)), [5e9, 28e9, 94e9])
@@ -261,6 +268,7 @@ def test_spectra_are_those_of_snapshots_where_places_are_known_and_of_added_powe
     np.testing.assert_array_equal(unknown.snapshots, known.snapshots)
 
 
+@pytest.mark.heavy
 def test_an_array_in_metres_is_that_of_its_wavelengths_at_one_frequency(rng):
     field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), **SMALL)
     params = dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(2e-3)))
@@ -278,6 +286,7 @@ def test_more_facets_than_can_be_numbered_are_refused():
         WaveField.check(WaveConfig(max_facets=100_001))
 
 
+@pytest.mark.heavy
 def test_phase_blind_spectra_of_next_to_nothing_have_gradients():
     """Behind metal everywhere: powers far below single precision."""
     settings = {"conductivity": 1e3, "mirror_areas": (0.0,), "coherent": False}
@@ -294,6 +303,7 @@ def test_phase_blind_spectra_of_next_to_nothing_have_gradients():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.materials))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("coherent", [True, False])
 def test_a_link_without_any_path_has_gradients(coherent):
     """Data may hold a spectrum where the mesh lets nothing through; a training goes on."""
@@ -319,6 +329,7 @@ def test_a_link_without_any_path_has_gradients(coherent):
         assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB
 
 
+@pytest.mark.heavy
 def test_a_transmitter_in_the_receivers_place_has_no_line_of_sight():
     """What is left is finite, and so are its gradients."""
     field, params, plan = field_of(room(), RX, mirror_areas=(0.0,), **SMALL)
@@ -333,6 +344,7 @@ def test_a_transmitter_in_the_receivers_place_has_no_line_of_sight():
     assert value < power(params, here + jnp.array([0.05, 0.0, 0.0])) - 10  # five centimetres away it is heard directly
 
 
+@pytest.mark.heavy
 def test_the_pattern_is_the_receivers():
     """What TR 38.901's element gains in the direction of sight, 8 dB, is in the received power."""
     field = wave.make_field(mesh_of(room()[0]), WaveConfig(mirror_areas=(), **SMALL))
@@ -344,6 +356,7 @@ def test_the_pattern_is_the_receivers():
     assert power[1] - power[0] == pytest.approx(8.0, abs=1e-3)
 
 
+@pytest.mark.heavy
 def test_a_field_of_data_is_asked_within_jit():
     """Its receivers are known, and where they were found to stand is decided on the host."""
     dataset = tiny_dataset()

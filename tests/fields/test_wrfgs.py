@@ -39,6 +39,7 @@ def test_it_is_a_field_with_its_own_settings():
         assert WrfgsField.presets[preset].field == without_frequency(WidebandField.presets[preset].field)
 
 
+@pytest.mark.heavy
 def test_rendering_is_bit_identical_across_frequency(trained):
     """Of every transmitter at all three frequencies."""
     dataset = tiny_dataset(12)

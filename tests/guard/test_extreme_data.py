@@ -86,7 +86,7 @@ SCENES = {
 REFUSED: dict[str, str] = {"one transmitter": NO_TEST}
 """Words of the sentence that a case stops with; all others end."""
 QUICK = {("black images", "wideband"), ("a transmitter at the receiver", "wideband")}
-"""In `make test` too."""
+"""In `make test-heavy` too."""
 ALL = [
     pytest.param(case, field, marks=[] if (case, field) in QUICK else [pytest.mark.slow]) for case in SCENES for field in FIELDS
 ]
@@ -101,6 +101,7 @@ def numbers(tree) -> list[float]:
     return [tree] if isinstance(tree, float) else []
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("case", "field"), ALL)
 def test_data_at_the_edges(case, field, tmp_path):
     save_scene(tmp_path / "room.npz", SCENES[case]())

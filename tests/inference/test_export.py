@@ -66,6 +66,7 @@ def exported(path):
     return load_exported(path)
 
 
+@pytest.mark.heavy
 def test_the_answers_are_those_of_the_predictor(exported, predict):
     """For more than one number of queries, and for any leading axes."""
     expected = np.asarray(predict(TX, HZ))
@@ -115,6 +116,7 @@ def blocks(text):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
+@pytest.mark.heavy
 def test_the_guide_runs(tmp_path, monkeypatch):
     """Block after block, and the one that loads a field elsewhere in a process that can import nothing of the library."""
     run = make_run(tmp_path / "runs" / "scene1-hybrid-cpu-seed0")

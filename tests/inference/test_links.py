@@ -73,6 +73,7 @@ def snapshot(asked, tx=TX, hz=GHZ):
     return np.asarray(observe_queries(asked.trained, asked.receiver, query, "snapshots"))
 
 
+@pytest.mark.heavy
 def test_the_line_of_sight_is_that_of_free_space(asked):
     table = paths(asked)
     (sight,) = np.flatnonzero(table["interactions"] == SIGHT)
@@ -105,6 +106,7 @@ def test_walls_mirror_the_transmitter(asked):
     assert {word.removeprefix("off ") for word in table["interactions"][words]} <= set(asked.dataset.materials.names)
 
 
+@pytest.mark.heavy
 def test_paths_add_up_to_the_snapshot(asked):
     table = paths(asked)
     total = amplitudes(table) @ steering(asked, table)
@@ -149,6 +151,7 @@ def test_a_response_is_that_of_the_paths(asked):
     np.testing.assert_allclose(answer["impulse_response"][0, 0], kernel @ response, atol=1e-4 * np.abs(response).max())
 
 
+@pytest.mark.heavy
 def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
     elements = planar_array(2, 2)
     matrix = ask_mimo(asked.trained, asked.receiver, TX, GHZ, elements)["mimo"][0, 0]

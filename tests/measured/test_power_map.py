@@ -26,6 +26,7 @@ def readings(tx, heard):
     return Readings(tx, heard, np.isfinite(heard).astype(float), rooms, RECEIVERS)
 
 
+@pytest.mark.heavy
 def test_a_law_without_noise_is_found_and_holds_everywhere(rng):
     tx = places(rng, 250)
     learned = learn_map(readings(tx, powers(tx)), WALLS)
@@ -92,6 +93,7 @@ def test_intervals_hold_nine_in_ten(rng):
     assert 0.82 < held / total < 0.97, held / total
 
 
+@pytest.mark.heavy
 def test_gradients_point_to_more_power(rng):
     tx = places(rng, 60)
     learned = learn_map(readings(tx, powers(tx, 2.0, rng)), WALLS)

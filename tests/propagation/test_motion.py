@@ -54,6 +54,7 @@ def drawn(rng, shift=1e-3, turn=0.0) -> Motion:
     return jax.tree.map(lambda leaf: (rng.normal(size=leaf.shape) * leaf).astype(np.float32), size)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["specular", "diffracted"])
 def test_lengths_follow_surfaces_and_ends(kind, rng):
     facets = facets_of(*PARTS)
@@ -126,6 +127,7 @@ def test_coherence_is_the_mean_of_phases_over_places(rng):
     np.testing.assert_allclose(np.diag(found), 1, atol=1e-4)
 
 
+@pytest.mark.heavy
 def test_what_paths_share_says_what_their_gradients_say(rng):
     """Values, and gradients with respect to how far everything may stand from its place."""
     search, wavenumber = search_of(PARTS, RX), jnp.float32(300.0)

@@ -124,6 +124,7 @@ def test_the_field_is_continuous_where_the_shadow_of_metal_begins():
     assert jumps[0] < 0.03 * scale and jumps[1] > 0.8 * scale
 
 
+@pytest.mark.heavy
 def test_channels_are_reciprocal(rng):
     """One isotropic element each: both ends exchanged, the same voltage; reflections and walls included."""
     parts = [*room(), rectangle((3, 0, 0), (0, 2.5, 0), (0, 0, 3)), box((1, 1, 0.5), (2, 2, 1.2))]
@@ -136,6 +137,7 @@ def test_channels_are_reciprocal(rng):
     np.testing.assert_allclose(voltages[0], voltages[1], rtol=1e-2)
 
 
+@pytest.mark.heavy
 def test_an_array_in_metres_is_one_in_wavelengths(rng):
     """At every frequency, and not the same array at two of them."""
     search = search_of(room(), (1, 1, 1.2), mirror_areas=(0.0,))
@@ -155,6 +157,7 @@ def test_a_transmitter_may_have_no_paths():
     assert np.array_equal(snapshot_of(search, (8, 0.1, 0.2), 1e9), np.zeros(16))
 
 
+@pytest.mark.heavy
 def test_single_precision_is_enough_at_94_ghz(x64):
     """Paths of tens of metres are tens of thousands of radians."""
     search, receiver = search_of(room((12.0, 9.0, 3.0)), (1, 1, 1.2)), make_receiver((1, 1, 1.2))
@@ -200,6 +203,7 @@ def gradients_of_a_spectrum(materials, search, traced, receiver, frequency):
     return jnp.sum(snapshot_to_pas(y, receiver.element_positions) ** 2)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("frequency", [1e9, 24e9, 100e9])
 @pytest.mark.parametrize("height", [0.002, 0.5, 1.5])
 def test_gradients_are_finite(frequency, height):

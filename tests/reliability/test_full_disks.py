@@ -56,6 +56,7 @@ def refuse(work: str, kind: str, at: int, forks, fresh, undisturbed) -> None:
     count("disks that refuse a write", f"{work}, {kind}", 1)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["full", "read-only"])
 @pytest.mark.parametrize("work", ["generate data"])
 def test_a_disk_that_refuses_a_write(work, kind, forks, fresh, undisturbed, rng):

@@ -146,6 +146,7 @@ def fuzz(name: str, place: Path, cases: int) -> None:
     count("command lines", name, len(tried))
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("name", SEEDS)
 def test_a_few_careless_command_lines(name, place):

@@ -70,6 +70,7 @@ def certain(run):
     return jnp.zeros((pairs, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
 
 
+@pytest.mark.heavy
 def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
     motion = drawn(rng, run, 0.2)
     index, tree, links = parts_of(run, 8)
@@ -84,6 +85,7 @@ def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
     np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())
 
 
+@pytest.mark.heavy
 def test_the_matrix_is_that_of_the_jacobian(run, rng):
     motion = drawn(rng, run, 0.2)
     index, tree, links = parts_of(run, 8)
@@ -118,6 +120,7 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
         np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)
 
 
+@pytest.mark.heavy
 def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
     """Snapshots of a room whose things stand elsewhere, without noise: lengths come back, and numbers that no path depends on
     keep the variance of their prior."""

@@ -48,6 +48,7 @@ def test_it_names_the_antennas_of_both_ends(untrained, rng):
     np.testing.assert_array_equal(params.transmitter.orientation, candidates[transmitter].orientation)
 
 
+@pytest.mark.heavy
 def test_what_is_right_stays(untrained):
     params, report = searched(untrained)
     assert report.taken == {}
@@ -57,6 +58,7 @@ def test_what_is_right_stays(untrained):
     )
 
 
+@pytest.mark.heavy
 def test_known_elements_are_left_alone(untrained):
     _, report = searched(untrained, known_elements=True, element=antenna_candidates()["dipole along +x"])
     assert "element" not in report.taken

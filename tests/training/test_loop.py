@@ -98,6 +98,7 @@ def test_a_run_leaves_checkpoints_and_curves(dataset, tmp_path):
     assert all(np.isfinite(list(entry.values())).all() for entry in entries)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("case", [PLAIN, CROWDED], ids=["plain", "crowded"])
 def test_checkpoints_follow_their_interval(uninterrupted, case):
     assert checkpoint.checkpoint_steps(uninterrupted(case) / "checkpoints") == [4, 8]
@@ -121,7 +122,9 @@ def test_equal_seeds_make_equal_fields_and_others_do_not(dataset):
     assert any((x != y).any() for x, y in zip(*(jax.tree.leaves(params[i].networks) for i in (0, 2)), strict=True))
 
 
-@pytest.mark.parametrize("case", [PLAIN, CROWDED], ids=["plain", "across more slots"])
+@pytest.mark.parametrize(
+    "case", [pytest.param(PLAIN, id="plain"), pytest.param(CROWDED, id="across more slots", marks=pytest.mark.heavy)]
+)
 def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninterrupted, case):
     """The density control of step 4 lies before the checkpoint of step 4."""
     shutil.copytree(uninterrupted(case), tmp_path / "run")

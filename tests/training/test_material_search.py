@@ -82,6 +82,7 @@ def test_it_names_the_materials(run_on, tmp_path, rng):
             assert permittivity == pytest.approx(ITU_MATERIALS[name][0], rel=1e-5)
 
 
+@pytest.mark.heavy
 def test_what_fits_better_than_the_list_is_kept(run_on):
     run = run_on([(9.3, 0.05, 0.0)] * len(PARTS), permittivity=9.3, conductivity=0.05)
     before = np.asarray(run.state.params.materials.log_susceptibility)
@@ -114,6 +115,7 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
     assert looked_at == [*range(count), 0, 1]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("natural", [(), ("thick",), ("curved", "thick")])
 def test_it_finds_out_what_ray_tracers_leave_out(natural, run_on, tmp_path, rng):
     names = rng.choice(["concrete", "wood", "plasterboard", "glass"], len(PARTS))
@@ -140,6 +142,7 @@ _thickness = jax.jit(
 )
 
 
+@pytest.mark.heavy
 def test_known_thickness_is_not_trained(run_on):
     """It belongs to the field, not to the parameters; what is learned where it is not known does not reach the slabs."""
     run = run_on([ITU_MATERIALS["wood"]] * len(PARTS))

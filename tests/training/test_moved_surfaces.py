@@ -77,6 +77,7 @@ def test_walls_come_back(truth, tmp_path):
     assert np.median(z) < 3 and np.median(known) < 0.25e3 * SETTINGS.search.geometry_width
 
 
+@pytest.mark.heavy
 def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_path, rng):
     """To first order: surfaces, both ends and the receiver's turn, at a frequency at which that is enough."""
     heard, params = truth
@@ -133,6 +134,7 @@ def shifted(parts, metres, rng):
     return [part.copy().apply_translation(rng.normal(0, metres, 3)) for part in parts]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("metres", "lowest", "highest"), [(0.0, SPREADS_M[0], 1e-3), (0.02, 3e-3, SPREADS_M[-1])])
 def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, highest, tmp_path, rng):
     """Every part is off by as much along every axis, so that no draw leaves the surfaces that count where they were."""

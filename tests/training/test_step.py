@@ -165,6 +165,7 @@ def test_the_statistics_are_sums_of_the_positional_gradients(tmp_path, dataset):
     np.testing.assert_array_equal(seen.visible, (expected > 0).astype(float))
 
 
+@pytest.mark.heavy
 def test_an_overflow_commits_nothing_and_the_host_grows_the_tile_lists(tmp_path, dataset):
     """And ends where a roomy run ends."""
     roomy, short = (new_run(dataset, tmp_path, "wideband", GROWING, limits) for limits in (None, TINY))
@@ -301,6 +302,7 @@ def test_batches_depend_on_seed_and_epoch_alone(tmp_path, dataset):
     assert new_run(few, tmp_path).batches(0, LENGTH).shape == (LENGTH, 1)
 
 
+@pytest.mark.heavy
 def test_a_batch_is_of_one_receiver_and_every_receiver_has_its_share(tmp_path):
     dataset = tiny_dataset(n_rx=3)
     links = dataset.train

@@ -82,6 +82,7 @@ def test_what_fits_stays(room, rng):
     assert heard.scores()([found]).mean() < -4
 
 
+@pytest.mark.heavy
 def test_a_known_thickness_is_not_searched(room, rng):
     start = room.field.init(jax.random.key(0))
     metres = rng.uniform(0.01, 0.3, len(PARTS))

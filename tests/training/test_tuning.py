@@ -58,6 +58,7 @@ def searched(run, heard, folder, rng):
     return own.field, *search_tuning(run.state.params, told, 200)
 
 
+@pytest.mark.heavy
 def test_an_array_out_of_tune_is_tuned(run, tmp_path, rng):
     gains = draw_gains(rng)
     heard = heard_by(run, run.field.tuned(gains[None]), run.state.params)
@@ -69,6 +70,7 @@ def test_an_array_out_of_tune_is_tuned(run, tmp_path, rng):
     assert report.phase_deg == pytest.approx(np.rad2deg(np.std(np.angle(gains))), abs=0.3)
 
 
+@pytest.mark.heavy
 def test_an_array_in_tune_is_left_alone(run, tmp_path, rng):
     noise = 0.1 * np.exp(2j * np.pi * rng.random((N_TX, 1, len(FREQUENCIES), 16)))
     heard = heard_by(run, run.field, run.state.params) * (1 + noise)
@@ -76,6 +78,7 @@ def test_an_array_in_tune_is_left_alone(run, tmp_path, rng):
     assert not report.kept and tuned is field
 
 
+@pytest.mark.heavy
 def test_spectra_and_snapshots_are_of_the_same_tuning(run, rng):
     field, params = run.field.tuned(draw_gains(rng)[None]), run.state.params
     params = dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(1e-7)))

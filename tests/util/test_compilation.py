@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+import pytest
 
 from wbgs_jax._util import compilation
 from wbgs_jax._util.compilation import VARIABLE, load_program, trace_program, use_compilation_cache
@@ -32,6 +33,7 @@ def run(folder, **more):
     return where, int(hits)
 
 
+@pytest.mark.heavy
 def test_a_second_process_loads_what_the_first_compiled(tmp_path):
     where, hits = run(tmp_path)
     assert where.startswith(str(tmp_path)) and hits == 0

@@ -34,6 +34,7 @@ def splatting(tmp_path_factory):
     return Asker(trained, dataset, dataset.receiver())
 
 
+@pytest.mark.heavy
 def test_an_answer_is_the_fields(coherent):
     answer = coherent.ask(PLACE, HZ)
     np.testing.assert_allclose(answer.pas, predictor(coherent.trained)(PLACE, HZ), atol=1e-5)
@@ -87,6 +88,7 @@ def test_another_thickness_is_seen_at_once_where_the_data_know_one_and_taken_bac
     assert coherent.ask(PLACE, HZ).power_db == before and coherent.plan is plan
 
 
+@pytest.mark.heavy
 def test_gaussians_have_what_blending_uses(splatting, coherent):
     found = splatting.splatted(PLACE, HZ)
     assert found.attenuation.shape == found.signal.shape == (len(found.gaussians.means), 1)

@@ -140,7 +140,7 @@ class Dataset:
 
     def _arrays(self, index: Int[np.ndarray, " b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, " b"]]:
         """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""
-        own = jax.tree.map(lambda leaf: leaf[self.receiver_index[index]], self.receivers)
+        own = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[self.receiver_index[index]]), self.receivers)
         positions = own.element_wavelengths(jnp.asarray(self.frequencies_hz[index], jnp.float32))
         _, first, which = np.unique(np.asarray(positions), axis=0, return_index=True, return_inverse=True)
         return positions[first], which.reshape(-1)

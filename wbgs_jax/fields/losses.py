@@ -3,6 +3,7 @@
 import functools
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
@@ -42,6 +43,7 @@ def _blur(images: Float[Array, "*n h w"], stride: int) -> Float[Array, "*n h_val
     return jnp.matmul(jnp.matmul(rows, images, precision=EXACT), columns.T, precision=EXACT)
 
 
+@functools.partial(jax.jit, static_argnames="stride")
 def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"], stride: int = 1) -> Float[Array, "*n"]:
     """Returns the differentiable mean SSIM of images, data range 1: 11x11 Gaussian window, sigma 1.5 (Wang et al. 2004).
 

@@ -64,6 +64,7 @@ def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedP
     return PreparedPaths(surfaces, _shared_beams(plans), paths, *jnp.asarray(pairs.T, jnp.int32))
 
 
+@jax.jit
 def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     """Returns the paths of B transmitters; independent of frequency and materials."""
     config, search = plan.config, plan.surfaces
@@ -73,30 +74,27 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
 
 
-_trace = jax.jit(trace)
-
-
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:
     n, parts = len(positions), []
     size = min(n, TRACED_AT_ONCE)
     for start in range(0, n, size):
         index = np.minimum(np.arange(start, start + size), n - 1)  # blocks of one shape: one compilation
-        parts.append(jax.tree.map(np.asarray, _trace(plan, jnp.asarray(positions[index]))))
+        parts.append(jax.tree.map(np.asarray, trace(plan, jnp.asarray(positions[index]))))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:n], *parts)
 
 
 def _stacked(some: list[Paths]) -> Paths:
     """Returns paths one after the other, all with as much room as those that have most: receivers have different numbers."""
     room = max(paths.alive.shape[1] for paths in some)
-    filled = [_filled(paths, room - paths.alive.shape[1]) for paths in some]
-    together: Paths = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *filled)
-    return together
 
+    def filled(leaf: np.ndarray, mode: Any) -> np.ndarray:
+        return np.pad(leaf, [(0, 0), (0, room - leaf.shape[1])] + [(0, 0)] * (leaf.ndim - 2), mode)
 
-def _filled(paths: Paths, missing: int) -> Paths:
-    grown = jax.tree.map(lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:, -1:], missing, 1)], 1), paths)
-    alive = jnp.arange(grown.alive.shape[1]) < paths.alive.shape[1]
-    return dataclasses.replace(grown, alive=grown.alive & alive)
+    together: Paths = jax.tree.map(
+        lambda *leaves: jnp.asarray(np.concatenate([filled(leaf, "edge") for leaf in leaves])), *some
+    )
+    alive = np.concatenate([filled(np.asarray(paths.alive), "constant") for paths in some])
+    return dataclasses.replace(together, alive=jnp.asarray(alive))
 
 
 def _shared_beams(plans: list[WavePlan]) -> Beams | None:

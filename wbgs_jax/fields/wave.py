@@ -321,7 +321,7 @@ def _to_device(tree: Any) -> Any:
     """Returns positions as float32 and indices as int32."""
 
     def leaf(a: Any) -> Array:
-        return jnp.asarray(a, jnp.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else jnp.int32)
+        return jnp.asarray(np.asarray(a, np.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else np.int32))
 
     return jax.tree.map(leaf, tree)
 

@@ -98,6 +98,7 @@ class WavePlan:
     config: WaveConfig = static()
 
 
+@jax.jit
 def path_snapshots(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Complex[Array, "b elements"]:
@@ -105,6 +106,7 @@ def path_snapshots(
     return _snapshots(params, plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
 
 
+@jax.jit
 def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Arrivals:
     """Returns every path of B transmitters whose paths are known, leading axis B."""
     found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, frequency_hz)
@@ -123,6 +125,7 @@ def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elemen
     return jnp.exp(tuning[:, 0] + 1j * tuning[:, 1])
 
 
+@jax.jit
 def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
     """Returns spectra, snapshots and received power of B transmitters whose paths are known."""
     if not plan.config.coherent:
@@ -137,6 +140,7 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz
     return Observation(pas, y, decibels(power), covariance)
 
 
+@jax.jit
 def path_covariances(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, " b"]
 ) -> tuple[Complex[Array, "b elements elements"], Float[Array, " b"]]:
@@ -160,6 +164,7 @@ def path_covariances(
     return found
 
 
+@jax.jit
 def phase_blind_pas(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Float[Array, "b 90 360"]:

@@ -123,7 +123,7 @@ def _on_host(leaf: AnyArray) -> np.ndarray:
 
 def _on_device(leaf: AnyArray) -> Array:
     """Returns an array with float32 positions or int32 indices."""
-    return jnp.asarray(leaf, jnp.float32 if np.issubdtype(leaf.dtype, np.floating) else jnp.int32)
+    return jnp.asarray(np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32))
 
 
 def receiver_chains(

@@ -17,6 +17,7 @@ product of two amplitudes loses exp(-k^2 Var(dL_i - dL_j) / 2): the spectrum is 
 import dataclasses
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -53,6 +54,7 @@ def still(movers: int, receivers: int = 1) -> Motion:
     return Motion(nothing, nothing, none, none)
 
 
+@jax.jit
 def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Array, " k"]:
     """Returns by how much the K paths of one transmitter to one receiver grow (metres) if things and that receiver
     (`Motion.of_receiver`) move by so much; turning the receiver changes no length."""
@@ -98,6 +100,7 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
     return jnp.exp(-0.5 * jnp.maximum(variance[:, None] + variance - 2 * both, 0))
 
 
+@jax.jit
 def path_coherence(
     paths: TracedPaths, surfaces: Surfaces, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
 ) -> Float[Array, "k k"]:

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
@@ -43,6 +44,7 @@ def complex_permittivity(
     return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * VACUUM_PERMITTIVITY)
 
 
+@jax.jit
 def slab_coefficients(
     cosine: Float[Array, "*#n"],
     permittivity: Complex[Array, "*#n"],

@@ -5,6 +5,7 @@ plane of incidence. Antennas are those of radio/patterns.py. The time factor is 
 """
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -54,6 +55,7 @@ class _SlabInteractions(NamedTuple):
     tm: Complex[Array, "k 5"]
 
 
+@partial(jax.jit, static_argnames="diffracted")
 def arrivals(
     paths: Paths,
     surfaces: Surfaces,
@@ -112,6 +114,7 @@ def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
     return jnp.where(kind == NONE, -1, surfaces.facets.material[facet])
 
 
+@jax.jit
 def element_voltages(
     arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
 ) -> Complex[Array, "k elements"]:
@@ -163,6 +166,7 @@ def mimo_matrix(
     return jnp.matmul(voltages.T, steering_vector(tx_elements, arrived.departure), precision=EXACT)
 
 
+@jax.jit
 def covariance_from_paths(
     arrived: Arrivals,
     receiver: Receiver,

@@ -57,6 +57,7 @@ def pas_directions() -> Float[np.ndarray, "90 360 3"]:
     return _pas_directions()
 
 
+@jax.jit
 def steering_vector(
     element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]
 ) -> Complex[Array, "*n elements"]:
@@ -89,6 +90,7 @@ def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m el
     return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]], precision=EXACT))
 
 
+@jax.jit
 def snapshot_to_pas(
     snapshot: Complex[Array, "*n elements"], element_positions: Float[Array, "elements 3"] | Float[Array, "n elements 3"]
 ) -> Float[Array, "*n 90 360"]:
@@ -133,6 +135,7 @@ def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
     return Beams(jnp.asarray(basis, jnp.float32), jnp.asarray(number), jnp.asarray(once))
 
 
+@jax.jit
 def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams: Beams) -> Float[Array, "*n 90 360"]:
     """Returns the power angular spectra, each scaled to a maximum of 1, of mean products y y^H of random snapshots: the root of
     the mean of |a^H y|^2. Covariances have a trace of about 1.
@@ -146,6 +149,7 @@ def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams:
     return normalise(_root(power).reshape(*covariance.shape[:-2], *PAS_SHAPE))
 
 
+@jax.jit
 def wide_covariance_to_pas(
     covariance: Complex[Array, "n elements elements"], element_positions: Float[Array, "n elements 3"]
 ) -> Float[Array, "n 90 360"]:

@@ -5,6 +5,7 @@ exponent: the element of 3GPP TR 38.901, which looks along +x, and the short dip
 apart, and those between them can be learned.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -44,6 +45,7 @@ def pattern_exponents(pattern: str) -> tuple[float, float]:
     return PATTERN_EXPONENTS.get(pattern, (0.0, 0.0))
 
 
+@jax.jit
 def antenna_field(antenna: Antenna, direction: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Returns the polarised amplitude gain of an antenna in unit directions: theta-hat of its own frame times its gain."""
     own = to_local(direction, antenna.orientation)
