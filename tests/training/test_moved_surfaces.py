@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 from synthetic import tiny_settings
-from wave_runs import PARTS, places, run_in
+from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
@@ -45,9 +45,9 @@ def truth(tmp_path_factory):
     return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16), params
 
 
-def learned(truth, parts, folder):
+def learned(truth, parts, folder, receiver=RX):
     snapshots, params = truth
-    run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots)
+    run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots, (receiver,))
     place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
 
@@ -75,6 +75,18 @@ def test_walls_come_back(truth, tmp_path):
     z = 1e3 * left[walls] / known  # the posterior is no narrower than what is left
     print(np.round(known, 3), np.round(z, 1))
     assert np.median(z) < 3 and np.median(known) < 0.25e3 * SETTINGS.search.geometry_width
+
+
+@pytest.mark.heavy
+def test_a_receiver_comes_back(truth, tmp_path, rng):
+    """It is said to stand 2 cm from where it stands; walls, which stand where they are said to, do not go with it."""
+    step = rng.normal(size=3)
+    step *= 0.02 / np.linalg.norm(step)
+    (place, report), _ = learned(truth, PARTS, tmp_path, tuple(np.add(RX, step)))
+    left = np.linalg.norm(np.asarray(place.field.motion.receiver[0]) + step)
+    print(step, place.field.motion.receiver, report.typical_mm)
+    assert report.kept and left < 6e-3
+    assert report.typical_mm < 8
 
 
 @pytest.mark.heavy

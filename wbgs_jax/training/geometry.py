@@ -37,10 +37,11 @@ SPREAD = 0.05
 prior says."""
 TRACED_AGAIN = 5.0
 """Ratio of frequencies after which surfaces are moved and paths traced again."""
-TURN, RECEIVER, RECEIVER_TURN = 1e-3, 1e-3, 2e-3
-"""Standard deviations (radians, metres, radians) of how far surfaces are turned, and the receiver stands elsewhere and is
-turned. What seems to be the receiver's is mostly what all walls have in common: where it is free to go, it goes away with
-them."""
+TURN = 1e-3
+"""Standard deviation (radians) of how far surfaces are turned."""
+RECEIVER, HELD_RECEIVER = (1e-2, 1e-2), (1e-3, 2e-3)
+"""Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: by least squares; and by
+descent, which takes what all walls have in common for the receiver's where that is free to go."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
@@ -146,7 +147,7 @@ def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
     """
     data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
-    motion, widths = none, _widths(none, config.geometry_width)
+    motion, widths = none, _widths(none, config.geometry_width, HELD_RECEIVER if data.snapshots is None else RECEIVER)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
     for highest in np.unique(frequency):
         if highest > TRACED_AGAIN * traced_at:
@@ -166,9 +167,9 @@ def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
     return Place(now.field.moved(motion), now.params, now.cache, known)
 
 
-def _widths(motion: Motion, shift: float) -> Motion:
+def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Motion:
     """Returns the standard deviations of all numbers of a motion before anything was heard."""
-    far = {"shift": shift, "turn": TURN, "receiver": RECEIVER, "receiver_turn": RECEIVER_TURN}
+    far = {"shift": shift, "turn": TURN, "receiver": receiver[0], "receiver_turn": receiver[1]}
     return Motion(**{name: jnp.full_like(getattr(motion, name), width) for name, width in far.items()})
 
 
