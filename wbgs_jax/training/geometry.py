@@ -39,9 +39,9 @@ TRACED_AGAIN = 5.0
 """Ratio of frequencies after which surfaces are moved and paths traced again."""
 TURN = 1e-3
 """Standard deviation (radians) of how far surfaces are turned."""
-RECEIVER, HELD_RECEIVER = (1e-2, 1e-2), (1e-3, 2e-3)
-"""Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: by least squares; and by
-descent, which takes what all walls have in common for the receiver's where that is free to go."""
+HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
+"""Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
+in common is easily taken for the receiver's; and free, where spectra are surely better for it."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
@@ -125,17 +125,28 @@ def learn_geometry(
     heard, all_heard = _Heard(data, own, config, rng), _Heard(data, train, config, rng)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
     start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds, sized=True)
-    now = _followed(start, heard, links, named=True)
+    now, receiver = _followed(start, heard, links, HELD_RECEIVER, named=True), HELD_RECEIVER
+    if data.snapshots is not None:
+        free = _followed(start, heard, links, FREE_RECEIVER, named=True)
+        now, receiver = (free, FREE_RECEIVER) if _surely_better(free, now, heard, links) else (now, receiver)
     now = _retraced(now, _fresh(now.params, place.params), data.links, data)
     now = all_heard.named(all_heard.guessed(now), 1)
     moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
     if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
-        now = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, named=False)
+        now = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, receiver, named=False)
         moved.append(all_heard.named(_retraced(now, now.params, data.links, data), 1, "snapshots"))
     return _judged(place, moved, all_heard)
 
 
-def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
+def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
+    """Returns whether spectra are surely better where one place was found than where another was."""
+    spectra = heard.rng.choice(heard.spectra, min(heard.config.spectra, len(heard.spectra)), replace=False)
+    both = (heard.guessed(_retraced(one, one.params, links, heard.data), "spectra") for one in (place, other))
+    ours, others = (Told(one.field, one.cache, heard.data, spectra).scores(compared="spectra")([one.params])[0] for one in both)
+    return surely_better(others - ours, np.asarray(heard.data.links.tx_index)[spectra], SURE)
+
+
+def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, float], named: bool) -> Place:
     """Returns the field with things moved as spectra say, from low frequencies to high ones; its paths are those of before.
     Paths are traced again on the way, and materials named, if they are.
 
@@ -143,11 +154,12 @@ def _followed(now: Place, heard: _Heard, links: Links, named: bool) -> Place:
         now: with the paths of the transmitters of `links`.
         heard: what their spectra say.
         links: of which paths are traced.
+        receiver: standard deviations of how far it stands elsewhere and is turned.
         named: whether materials are named.
     """
     data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
-    motion, widths = none, _widths(none, config.geometry_width, HELD_RECEIVER if data.snapshots is None else RECEIVER)
+    motion, widths = none, _widths(none, config.geometry_width, receiver)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
     for highest in np.unique(frequency):
         if highest > TRACED_AGAIN * traced_at:
