@@ -20,8 +20,8 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-heavy test-slow test-faults lowest newest locks coverage simulator data lint typecheck bench gpu-check experiments tables \
-	docs site notebooks package clean
+.PHONY: help setup train eval view measured test test-heavy test-slow test-faults lowest newest locks coverage simulator data lint \
+	typecheck bench gpu-check experiments tables docs site notebooks package clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets

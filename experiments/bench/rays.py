@@ -52,9 +52,6 @@ def answer(params: Any, plan: Any, paths: Any, place: Any, frequency_hz: Float[j
     return wave.observe(params, plan, jax.tree.map(lambda leaf: leaf[place], paths), frequency_hz)
 
 
-trace = jax.jit(wave.trace)
-
-
 def measure_scene(report: Report, effort: Effort, number: str) -> None:
     """A released scene by its own numbers: everything that does not depend on the query is planned."""
     say(f"rays: scene {number}")
@@ -65,13 +62,13 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
     some, tens = dataset.query(first_links(dataset, BLOCK_TX)).tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
 
     def block() -> Any:
-        paths = trace(plan, some)
+        paths = wave.trace(plan, some)
         return [answer(params, plan, paths, jnp.full(len(tens), one), tens) for one in range(len(some))]
 
     def single() -> Any:
-        return answer(params, plan, trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
+        return answer(params, plan, wave.trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
 
-    ready, traced = (lambda: field.plan(params, receiver)), (lambda: trace(plan, some))
+    ready, traced = (lambda: field.plan(params, receiver)), (lambda: wave.trace(plan, some))
     seconds = interleaved({"receiver": ready, "trace": traced, "block": block, "single": single}, effort)
     report.add_time(f"rays_scene{number}_receiver_ready", seconds["receiver"])
     report.add_time(f"rays_scene{number}_transmitter", seconds["trace"] / len(some))
@@ -89,7 +86,7 @@ def _measure_hall(report: Report, effort: Effort, facets: int) -> None:
     ready = timed(lambda: plans.append(field.plan(params, receiver)))
     plan, tx = plans[0], rng.uniform(HALL * [0.1, 0.1, 0.8], HALL * 0.95, (CROWD, 3))
     query = make_query(tx, 28e9)
-    compiled = trace.lower(plan, query.tx_position).compile()
+    compiled = wave.trace.lower(plan, query.tx_position).compile()
     every = jnp.arange(CROWD)
     calls = {"query": lambda: answer(params, plan, compiled(plan, query.tx_position), every, query.frequency_hz)}
     seconds = interleaved(calls, dataclasses.replace(effort, repeats=3))["query"] / CROWD

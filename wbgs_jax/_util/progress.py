@@ -10,6 +10,15 @@ LOG_INTERVAL = 20.0
 """Seconds between two lines when the output is no terminal."""
 
 
+class Bar(Progress):
+    """A live bar of which nothing is seen where it is disabled: older versions of rich end it by an empty line all the same."""
+
+    def stop(self) -> None:
+        """Ends it."""
+        if not self.disable:
+            super().stop()
+
+
 class CountProgress:
     """Shows how many of equal pieces of work are done and the time left, on stderr."""
 
@@ -18,19 +27,17 @@ class CountProgress:
         self.started = self.last_line = time.monotonic()
         self.console = Console(file=sys.stderr)
         columns = (TextColumn(label), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
-        self.bar = Progress(
+        self.bar = Bar(
             *columns, TextColumn("left"), TimeRemainingColumn(), console=self.console, disable=not self.console.is_terminal
         )
         self.task = self.bar.add_task(label, total=total, completed=done)
 
     def __enter__(self) -> "CountProgress":
-        if not self.bar.disable:
-            self.bar.start()
+        self.bar.start()
         return self
 
     def __exit__(self, *exception) -> None:
-        if not self.bar.disable:  # rich of before 14.3.1 ends one that it never showed by an empty line
-            self.bar.stop()
+        self.bar.stop()
 
     def advance(self) -> None:
         """Says that one more piece is done."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 T = TypeVar("T")
 
@@ -76,3 +78,15 @@ def replaced(tree: T, **values: Any) -> T:
     for f in dataclasses.fields(tree):  # type: ignore[arg-type]
         object.__setattr__(new, f.name, values.get(f.name, getattr(tree, f.name)))
     return new
+
+
+def to_device(tree: Any) -> Any:
+    """Returns a tree of host arrays on the device: floating-point numbers as float32, integers and booleans as int32.
+
+    They are converted on the host, where that compiles nothing.
+    """
+
+    def leaf(a: Any) -> jax.Array:
+        return jnp.asarray(np.asarray(a, np.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else np.int32))
+
+    return jax.tree.map(leaf, tree)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Key
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.pytree import pytree, static, with_leaves
+from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, register
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.fields.prepared_paths import PreparedPaths, prepare_paths, trace
@@ -205,7 +205,7 @@ class WaveField(Field):
         facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
         total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
         places = {"facets": facets, "edges": edges_of_facets(facets), "motion": total}
-        return dataclasses.replace(self, **{name: _to_device(place) for name, place in places.items()})
+        return dataclasses.replace(self, **{name: to_device(place) for name, place in places.items()})
 
     def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
@@ -293,8 +293,8 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     movers = int(facets.mover.max()) + 1
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
-    motion = _to_device(still(movers, len(known)))
-    return WaveField(_to_device(facets), _to_device(edges), thickness, placement, known, motion, None, config)
+    motion = to_device(still(movers, len(known)))
+    return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, config)
 
 
 def _beams(receiver: Receiver) -> Beams | None:
@@ -315,15 +315,6 @@ def _heard_alone(batch: Batch, seen: Observation) -> Batch:
 
 def _traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
-
-
-def _to_device(tree: Any) -> Any:
-    """Returns positions as float32 and indices as int32."""
-
-    def leaf(a: Any) -> Array:
-        return jnp.asarray(np.asarray(a, np.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else np.int32))
-
-    return jax.tree.map(leaf, tree)
 
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:

@@ -9,11 +9,10 @@ another from the image: occlusion is the business of `paths.py`.
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import pytree, to_device
 from wbgs_jax.propagation.crossings import planes_of
 from wbgs_jax.propagation.edges import Edges
 from wbgs_jax.propagation.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
@@ -112,18 +111,14 @@ def make_search(
         receiver_chains(facets, rx, mirror_areas),
         diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge),
     )
-    return jax.tree.map(_on_device, search)
+    on_device: Search = to_device(search)
+    return on_device
 
 
 def _on_host(leaf: AnyArray) -> np.ndarray:
     """Returns an array with float64 positions or int32 indices."""
     array = np.asarray(leaf)
     return array.astype(np.float64 if np.issubdtype(array.dtype, np.floating) else np.int32)
-
-
-def _on_device(leaf: AnyArray) -> Array:
-    """Returns an array with float32 positions or int32 indices."""
-    return jnp.asarray(np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32))
 
 
 def receiver_chains(

@@ -58,7 +58,7 @@ def training_data(dataset: Dataset) -> TrainingData:
     """Returns a dataset on the device."""
     receivers, steering = dataset.receivers, None
     if dataset.snapshots is not None and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
-        steering = jax.jit(steering_vector)(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
+        steering = steering_vector(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
     return TrainingData(
         receivers=receivers,
         links=dataset.links(np.arange(len(dataset))),

@@ -112,6 +112,13 @@ class _Heard:
         params, _ = search_placement(now.params, self.told(now).scores(self.config.placement_spectra, compared))
         return dataclasses.replace(now, params=params)
 
+    def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
+        """Returns places, each with as much doubt as suits it, the scores of some spectra at each, and their transmitters."""
+        spectra = self.rng.choice(self.spectra, min(self.config.spectra, len(self.spectra)), replace=False)
+        doubted = [self.guessed(one, "spectra") for one in places]
+        scores = [Told(p.field, p.cache, self.data, spectra).scores(compared="spectra")([p.params])[0] for p in doubted]
+        return doubted, scores, np.asarray(self.data.links.tx_index)[spectra]
+
 
 def learn_geometry(
     place: Place, data: TrainingData, train: Int[np.ndarray, " n"], config: SearchConfig, rng: np.random.Generator
@@ -140,10 +147,8 @@ def learn_geometry(
 
 def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
     """Returns whether spectra are surely better where one place was found than where another was."""
-    spectra = heard.rng.choice(heard.spectra, min(heard.config.spectra, len(heard.spectra)), replace=False)
-    both = (heard.guessed(_retraced(one, one.params, links, heard.data), "spectra") for one in (place, other))
-    ours, others = (Told(one.field, one.cache, heard.data, spectra).scores(compared="spectra")([one.params])[0] for one in both)
-    return surely_better(others - ours, np.asarray(heard.data.links.tx_index)[spectra], SURE)
+    _, (ours, others), tx = heard.compared([_retraced(one, one.params, links, heard.data) for one in (place, other)])
+    return surely_better(others - ours, tx, SURE)
 
 
 def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, float], named: bool) -> Place:
@@ -188,14 +193,9 @@ def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Moti
 def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, GeometryReport]:
     """Returns the best place, with its uncertainty. A moved one has to be surely better at what counts in the end, spectra: the
     likelihood of snapshots forgives a wrong mesh that is doubted enough."""
-    spectra = heard.rng.choice(heard.spectra, min(heard.config.spectra, len(heard.spectra)), replace=False)
-    as_it_was, *others = (heard.guessed(one, "spectra") for one in (place, *moved))
-    before, *after = (
-        Told(one.field, one.cache, heard.data, spectra).scores(compared="spectra")([one.params])[0]
-        for one in (as_it_was, *others)
-    )
+    (as_it_was, *others), (before, *after), tx = heard.compared([place, *moved])
     best = int(np.argmin([own.mean() for own in after]))
-    kept = surely_better(before - after[best], np.asarray(heard.data.links.tx_index)[spectra], SURE)
+    kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
     sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.covariance)
     report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes, bodies=bodies)

@@ -7,14 +7,13 @@ from typing import Any
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    Progress,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 
-from wbgs_jax._util.progress import LOG_INTERVAL
+from wbgs_jax._util.progress import LOG_INTERVAL, Bar
 
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
 """Figures that are measured now and then, and shown until they are measured again."""
@@ -30,7 +29,7 @@ class TrainingProgress:
         self.held_out: dict[str, float] = {}
         self.started = self.last_line = time.monotonic()
         self.console = Console(file=sys.stderr)
-        self.bar = Progress(
+        self.bar = Bar(
             SpinnerColumn(),
             TextColumn("{task.completed}/{task.total}"),
             BarColumn(bar_width=24),
@@ -44,13 +43,11 @@ class TrainingProgress:
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
 
     def __enter__(self) -> "TrainingProgress":
-        if not self.bar.disable:
-            self.bar.start()
+        self.bar.start()
         return self
 
     def __exit__(self, *exception) -> None:
-        if not self.bar.disable:
-            self.bar.stop()
+        self.bar.stop()
 
     def update(self, entry: dict[str, Any]) -> None:
         """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
