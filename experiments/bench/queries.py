@@ -15,7 +15,7 @@ QUERIES = 1000
 
 
 def measure(report: Report, effort: Effort) -> None:
-    """Throughput with the images in the host's memory, latency of one query, compilation."""
+    """Throughput with the images in the host's memory, latency of one query inside of `jit` and outside, compilation."""
     count = 2 * BLOCK if effort.quick else QUERIES
     say(f"queries: {count} in blocks of {BLOCK}")
     with tempfile.TemporaryDirectory() as folder:
@@ -26,9 +26,13 @@ def measure(report: Report, effort: Effort) -> None:
     plan = run.field.plan(run.state.params, run.dataset.receiver())
     predictor = functools.partial(render_pas, run.field, run.state.params, plan)
     first = timed(lambda: predictor(blocks[0]))
-    seconds = interleaved(
-        {"all": lambda: [np.asarray(predictor(block)) for block in blocks], "single": lambda: predictor(single)}, effort
-    )
+    calls = {
+        "all": lambda: [np.asarray(predictor(block)) for block in blocks],
+        "single": lambda: predictor(single),
+        "outside": lambda: run.field.render(run.state.params, plan, single),
+    }
+    seconds = interleaved(calls, effort)
     report.add(f"compile_s_queries_b{BLOCK}", first, "s", "lower")
     report.add_sample("queries_per_s", count / seconds["all"], "1/s", "higher")
     report.add_time("single_query", seconds["single"])
+    report.add_time("single_query_outside_of_jit", seconds["outside"])

@@ -59,7 +59,8 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
     field = wave.make_field(DatasetScene(dataset).mesh())
     params, receiver = tracers.known_params(field, dataset), dataset.receiver()
     plan = field.plan(params, receiver)
-    some, tens = dataset.query(first_links(dataset, BLOCK_TX)).tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
+    asked = dataset.query(first_links(dataset, BLOCK_TX))
+    some, tens = asked.tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
 
     def block() -> Any:
         paths = wave.trace(plan, some)
@@ -68,12 +69,17 @@ def measure_scene(report: Report, effort: Effort, number: str) -> None:
     def single() -> Any:
         return answer(params, plan, wave.trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
 
+    def outside() -> Any:
+        return field.render(params, plan, jax.tree.map(lambda leaf: leaf[:1], asked))
+
     ready, traced = (lambda: field.plan(params, receiver)), (lambda: wave.trace(plan, some))
-    seconds = interleaved({"receiver": ready, "trace": traced, "block": block, "single": single}, effort)
+    calls = {"receiver": ready, "trace": traced, "block": block, "single": single, "outside": outside}
+    seconds = interleaved(calls, effort)
     report.add_time(f"rays_scene{number}_receiver_ready", seconds["receiver"])
     report.add_time(f"rays_scene{number}_transmitter", seconds["trace"] / len(some))
     report.add_time(f"rays_scene{number}_spectrum_in_blocks", seconds["block"] / len(some) / len(tens))
     report.add_time(f"rays_scene{number}_query_of_{len(tens)}_frequencies", seconds["single"])
+    report.add_time(f"rays_scene{number}_query_outside_of_jit", seconds["outside"])
 
 
 def _measure_hall(report: Report, effort: Effort, facets: int) -> None:

@@ -79,14 +79,18 @@ def test_walls_come_back(truth, tmp_path):
 
 @pytest.mark.heavy
 def test_a_receiver_comes_back(truth, tmp_path, rng):
-    """It is said to stand 2 cm from where it stands; walls, which stand where they are said to, do not go with it."""
-    step = rng.normal(size=3)
-    step *= 0.02 / np.linalg.norm(step)
-    (place, report), _ = learned(truth, PARTS, tmp_path, tuple(np.add(RX, step)))
-    left = np.linalg.norm(np.asarray(place.field.motion.receiver[0]) + step)
-    print(step, place.field.motion.receiver, report.typical_mm)
-    assert report.kept and left < 6e-3
-    assert report.typical_mm < 8
+    """It is said to stand 2 cm from where it stands; walls, which stand where they are said to, do not go with it. In one
+    direction of several a part of it is left, which walls can take on just as well: in a bare room every draw comes back to
+    half of it or better, the median of three to 6 mm."""
+    left = []
+    for draw in range(3):
+        step = rng.normal(size=3)
+        step *= 0.02 / np.linalg.norm(step)
+        (place, report), _ = learned(truth, PARTS, tmp_path / str(draw), tuple(np.add(RX, step)))
+        left.append(np.linalg.norm(np.asarray(place.field.motion.receiver[0]) + step))
+        print(step, place.field.motion.receiver, report.typical_mm)
+        assert report.kept and report.typical_mm < 8
+    assert max(left) < 10e-3 and np.median(left) < 6e-3
 
 
 @pytest.mark.heavy

@@ -1,8 +1,10 @@
 """What the EM feature networks say of every Gaussian and query (paper, sections 4.2 and 4.5), in two steps: what depends on the
 Gaussian alone, once for all queries, and the rest."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
@@ -69,6 +71,7 @@ def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceN
     return attenuation, RadianceNetwork(config.radiance_widths, heads), PowerNetwork(config.width)
 
 
+@partial(jax.jit, static_argnames="config")
 def gaussian_features(
     gaussians: Gaussians, weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
 ) -> GaussianFeatures:
@@ -87,6 +90,7 @@ def gaussian_features(
     return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
 
 
+@partial(jax.jit, static_argnames="config")
 def query_features(
     gaussians: Gaussians,
     weights: Weights,
@@ -112,6 +116,7 @@ def query_features(
     return QueryFeatures(delta, signal_activation(signal), jnp.einsum("n,nbw->bw", shares, hidden, precision=EXACT))
 
 
+@partial(jax.jit, static_argnames="config")
 def received_power_db(
     summary: Float[Array, "b width"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig, query: Query
 ) -> Float[Array, " b"]:

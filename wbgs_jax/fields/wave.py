@@ -40,6 +40,7 @@ from wbgs_jax.propagation.facets import Facets
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.motion import Motion, still
+from wbgs_jax.propagation.padding import padded_edges
 from wbgs_jax.propagation.simplify import facets_that_fit
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
@@ -147,7 +148,7 @@ class WaveField(Field):
                 "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
-        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas)
+        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
         """Returns a receiver of the data where it has been found to stand, and its tuning; any other one as it is, in tune."""
@@ -204,7 +205,7 @@ class WaveField(Field):
         """Returns the field of a scene in which things stand elsewhere (host)."""
         facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
         total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
-        places = {"facets": facets, "edges": edges_of_facets(facets), "motion": total}
+        places = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": total}
         return dataclasses.replace(self, **{name: to_device(place) for name, place in places.items()})
 
     def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
@@ -255,7 +256,8 @@ class WaveField(Field):
 
     def sizes(self, params: WaveParams) -> dict[str, int]:
         """Returns the numbers of materials, facets and edges."""
-        counts = self.known_thickness.shape[0], self.facets.offset.shape[0], self.edges.length.shape[0]
+        edges = int(np.count_nonzero(np.asarray(self.edges.length)))
+        counts = self.known_thickness.shape[0], self.facets.offset.shape[0], edges
         return dict(zip(("materials", "facets", "edges"), counts, strict=True))
 
     @classmethod
@@ -289,7 +291,7 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     """
     config = config or WaveConfig()
     facets = facets_that_fit(mesh, config.max_facets)
-    edges = edges_of_facets(facets)
+    edges = padded_edges(edges_of_facets(facets))
     movers = int(facets.mover.max()) + 1
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)

@@ -7,7 +7,6 @@ Neither the geometry nor what the networks make of a Gaussian alone depends on t
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -47,8 +46,6 @@ from wbgs_jax.types import (
 )
 
 INITIAL_ATTENUATION = 0.3
-_compiled_features = jax.jit(gaussian_features, static_argnames="config")
-"""For plans that are made outside of a compiled function."""
 TILE_SLACK = 1.4
 """Room in the tile lists for footprints that grow during training."""
 
@@ -122,7 +119,7 @@ class WidebandField(Field):
         Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
         are needed under jit (`splat.geometry_plan`).
         """
-        return self._plan(params, receiver, limits, None, _compiled_features)
+        return self._plan(params, receiver, limits, None)
 
     def _plan(
         self,
@@ -130,12 +127,11 @@ class WidebandField(Field):
         receiver: Receiver,
         limits: TileLimits | None,
         offset: Float[Array, "n 2"] | None,
-        features_of: Callable[..., GaussianFeatures],
     ) -> WidebandPlan:
         check_receiver(receiver)
         geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
-        features = features_of(params.gaussians, params.networks, frame, receiver, self.config)
+        features = gaussian_features(params.gaussians, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
@@ -159,7 +155,7 @@ class WidebandField(Field):
         self, params: WidebandParams, cache: None, batch: Batch, limits: TileLimits | None = None, probe: Any = None
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
-        planned = self._plan(params, batch.receiver, limits, probe, gaussian_features)
+        planned = self._plan(params, batch.receiver, limits, probe)
         seen = self._render(params, planned, batch.links.query, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:

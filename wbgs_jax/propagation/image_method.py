@@ -16,6 +16,7 @@ from wbgs_jax._util.pytree import pytree, to_device
 from wbgs_jax.propagation.crossings import planes_of
 from wbgs_jax.propagation.edges import Edges
 from wbgs_jax.propagation.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
+from wbgs_jax.propagation.padding import filled
 
 SIDE = 1e-4
 """Metres: points nearer to a plane than this are on neither side."""
@@ -87,6 +88,7 @@ def make_search(
     mirror_areas: Sequence[float],
     mirror_area_after_edge: float,
     mirror_area_before_edge: float,
+    padded: bool = False,
 ) -> Search:
     """Returns what the paths of a receiver are searched in; found on the host in double precision, so not under `jax.jit`.
 
@@ -96,23 +98,37 @@ def make_search(
         mirror_areas: smallest facets that reflect on paths of 1, 2, ... reflections, square metres each.
         mirror_area_after_edge: smallest facet that reflects a wave after an edge has diffracted it, square metres.
         mirror_area_before_edge: smallest facet that reflects a wave before an edge diffracts it, square metres.
+        padded: whether chains and pairs are filled up to sizes that seldom change (`padding.py`).
 
     Returns:
         float32 and int32 arrays on the device.
     """
     facets, edges = jax.tree.map(_on_host, (facets, edges))
     rx = np.asarray(receiver_position, np.float64)
-    search = Search(
-        facets,
-        edges,
-        rx,
-        outline_of(facets),
-        planes_of(facets),
-        receiver_chains(facets, rx, mirror_areas),
-        diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge),
-    )
-    on_device: Search = to_device(search)
-    return on_device
+    chains = receiver_chains(facets, rx, mirror_areas)
+    pairs = diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge)
+    if padded:
+        chains, pairs = tuple(_padded(one, facets) for one in chains), _padded_pairs(pairs, facets)
+    search: Search = to_device(Search(facets, edges, rx, outline_of(facets), planes_of(facets), chains, pairs))
+    return search
+
+
+def _padded(chains: Chains, facets: Facets) -> Chains:
+    """Returns chains, and behind them some that reflect nothing."""
+    facet = filled(chains.facet)
+    return Chains(facet, _in_the_plane(chains.image, facets, facet))
+
+
+def _padded_pairs(pairs: DiffractedChains, facets: Facets) -> DiffractedChains:
+    """Returns pairs, and behind those with a mirror behind the edge some that reflect nothing; of the others there are as many
+    as of padded edges."""
+    after = filled(pairs.after)
+    return DiffractedChains(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), pairs.before)
+
+
+def _in_the_plane(image: Float[AnyArray, "*n 3"], facets: Facets, mirror: Int[np.ndarray, "*k"]) -> Float[np.ndarray, "*k 3"]:
+    """Returns images, and behind them points of the mirrors' own planes, where no wave is headed for."""
+    return np.concatenate([image, np.asarray(facets.corners)[mirror[len(image) :], 0]])
 
 
 def _on_host(leaf: AnyArray) -> np.ndarray:
@@ -173,13 +189,14 @@ def diffracted_chains(
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
     start, end = edges.start, edges.start + edges.direction * edges.length[:, None]
     segment = np.stack([start, end, end, end], 1)
-    most = MOST_PAIRS // max(len(segment), 1)
+    real = edges.length > 0  # others are padding
+    most = MOST_PAIRS // max(int(np.count_nonzero(real)), 1)
     largest_first = np.argsort(-area, kind="stable")
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= after_area), most)])
     height = normal[mirrors] @ rx - offset[mirrors]
     image = rx - 2 * height[:, None] * normal[mirrors]
     seen = _seen(image, np.broadcast_to(rx, image.shape), mirrors, segment, corners, normal, offset, slack)
-    place, edge = np.nonzero(seen & (np.abs(height) > SIDE)[:, None])
+    place, edge = np.nonzero(seen & (np.abs(height) > SIDE)[:, None] & real)
     after = np.stack([mirrors[place], edge], 1)
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= before_area), most)])
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)

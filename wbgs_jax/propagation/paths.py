@@ -171,7 +171,7 @@ def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
         valid &= hits & _inside(here, search.outline, facet)
         vertices.append((here, facet, REFLECTED))
     length = jnp.linalg.norm(chains.image[:, 0] - tx, axis=-1)
-    return _candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / length, c)
+    return _candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
 
 
 def _on_mirror(start, goal, normal, offset):

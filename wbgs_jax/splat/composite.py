@@ -33,6 +33,7 @@ JOB_GROUPS = 8
 Divides the jobs of all limits."""
 
 
+@jax.jit
 def composite(
     means2d: Float[Array, "n 2"],
     conics: Float[Array, "n 3"],
