@@ -18,6 +18,8 @@ from wbgs_jax.viewer.app import Latest
 from wbgs_jax.viewer.asking import Asker
 
 PLACE, HZ = np.array([0.4, -0.3, 1.2]), 10e9
+DRAGS = 10
+"""Times that the mouse tries."""
 
 
 @pytest.fixture(scope="module")
@@ -186,10 +188,14 @@ def test_a_drag_in_a_browser_changes_the_picture(tmp_path):
     before, place = viewer.said.spectrum.image.copy(), viewer.position
     with window(viewer) as opened:
         opened.tab("Paths")
-        opened.page.wait_for_timeout(2000)
-        updates = drag(viewer, opened, 60.0, 3.0)
-        opened.page.wait_for_timeout(1500)
-        assert updates > 0 and np.linalg.norm(viewer.position - place) > 0.05
+        for _ in range(DRAGS):  # a browser without a graphics card, on busy cores, may take a while to draw what is dragged
+            opened.page.wait_for_timeout(2000)
+            drag(viewer, opened, 60.0, 3.0)
+            opened.page.wait_for_timeout(1500)
+            if np.linalg.norm(viewer.position - place) > 0.05:
+                break
+        viewer.wait()
+        assert np.linalg.norm(viewer.position - place) > 0.05
         assert (viewer.said.spectrum.image != before).mean() > 0.01
         before = viewer.said.spectrum.image.copy()
         viewer.set(viewer.controls.material.thickness, 7.0)
