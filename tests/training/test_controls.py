@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import signal
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -272,3 +273,61 @@ def test_a_control_is_left_out_where_its_settings_are(dataset, tmp_path, monkeyp
 
 def test_the_settings_of_the_toy_are_its_own():
     assert SETTINGS.field == RippleConfig()
+
+
+@dataclass(frozen=True)
+class Seeking(Watching):
+    """Long work before the first step: two stages, which change the tilt."""
+
+    def due(self, step, steps):
+        return step == 0
+
+    def apply(self, field, params, statistics, context, step, rng):
+        for stage in ("seeking", "found"):
+            context.say(stage)
+        found = params | {"tilt": jnp.full(3, 0.25)}
+        return Edit(found, self.statistics(found), None, {"found": 3})
+
+
+def interrupt_epochs(monkeypatch):
+    def epoch(run):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "epoch", epoch)
+
+
+def test_long_work_before_the_first_step_is_shown_and_kept(dataset, tmp_path, monkeypatch, capsys):
+    """It is killed in the first epoch; resumed, it goes on with what was found, and seeks nothing."""
+    use(monkeypatch, Watching, Seeking)
+    with monkeypatch.context() as patch:
+        interrupt_epochs(patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(dataset, "layered", SETTINGS, SEED, tmp_path)
+    assert [line.split(" (")[0] for line in capsys.readouterr().err.splitlines()] == ["seeking", "found"]
+    again = Run(dataset, "layered", SETTINGS, SEED, tmp_path)
+    assert again.restore() and again.step == 0
+    np.testing.assert_array_equal(again.state.params["tilt"], 0.25)
+    train(dataset, "layered", SETTINGS, SEED, tmp_path, resume=True)
+    assert "seeking" not in capsys.readouterr().err
+    assert [entry for entry in entries(tmp_path) if "found" in entry] == [{"step": 0, "found": 3}]
+    use(monkeypatch, Watching, Seeking)
+    train(dataset, "layered", SETTINGS, SEED, tmp_path / "whole")
+    assert [_untimed(entry) for entry in entries(tmp_path)] == [_untimed(entry) for entry in entries(tmp_path / "whole")]
+
+
+def _untimed(entry):
+    return {name: value for name, value in entry.items() if name != "seconds"}
+
+
+def test_an_interrupt_does_not_wait_for_the_end_of_long_work(dataset, tmp_path, monkeypatch, capsys):
+    class Impatient(Seeking):
+        def apply(self, field, params, statistics, context, step, rng):
+            signal.raise_signal(signal.SIGINT)
+            return super().apply(field, params, statistics, context, step, rng)
+
+    use(monkeypatch, Watching, Impatient)
+    with pytest.raises(loop.Interrupted, match=r"before the first step.*--resume"):
+        train(dataset, "layered", SETTINGS, SEED, tmp_path)
+    assert "found" not in capsys.readouterr().err
+    use(monkeypatch, Watching, Seeking)
+    assert train(dataset, "layered", SETTINGS, SEED, tmp_path, resume=True).steps == SETTINGS.optim.steps

@@ -40,6 +40,8 @@ class Context(NamedTuple):
     """Of the field's `prepare`."""
     train: np.ndarray
     """Indices of the training links."""
+    say: Callable[[str], None] = lambda stage: None
+    """Told what long work turns to next; raises where it is to stop."""
 
 
 @runtime_checkable

@@ -10,6 +10,7 @@ the mesh as it was, each with as much doubt as suits it.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as having
 from typing import Any
@@ -91,6 +92,8 @@ class _Heard:
     spectra: Int[np.ndarray, " n"]
     config: SearchConfig
     rng: np.random.Generator
+    say: Callable[[str], None]
+    """Told what is looked for next."""
 
     def told(self, now: Place) -> Told:
         """Returns what they say of a place, in an order drawn anew."""
@@ -99,6 +102,7 @@ class _Heard:
     def named(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
         """Names the materials: as far as places are believed, or as if all of them were known; with the thicknesses that the
         scene does not say, or in those that they have."""
+        self.say("search: materials, as far as places are known")
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
         once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
         if sized:
@@ -121,15 +125,20 @@ class _Heard:
 
 
 def learn_geometry(
-    place: Place, data: TrainingData, train: Int[np.ndarray, " n"], config: SearchConfig, rng: np.random.Generator
+    place: Place,
+    data: TrainingData,
+    train: Int[np.ndarray, " n"],
+    config: SearchConfig,
+    rng: np.random.Generator,
+    say: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Place, GeometryReport]:
     """Returns the field with its surfaces where training spectra say they are, its materials named there, and the paths of all
-    transmitters; as it was, where that explains spectra no worse."""
+    transmitters; as it was, where that explains spectra no worse. `say` is told of what is looked for next."""
     tx = np.asarray(data.links.tx_index)
     some_tx = rng.permutation(np.unique(tx[train]))[: config.geometry_tx]
     own = train[np.isin(tx[train], some_tx)]
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
-    heard, all_heard = _Heard(data, own, config, rng), _Heard(data, train, config, rng)
+    heard, all_heard = _Heard(data, own, config, rng, say), _Heard(data, train, config, rng, say)
     alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
     start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds, sized=True)
     now, receiver = _followed(start, heard, links, HELD_RECEIVER, named=True), HELD_RECEIVER
@@ -167,6 +176,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
     for highest in np.unique(frequency):
+        heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _traced(now.field.moved(motion), now.params, links, data), none
             now = heard.named(now, 1) if named else now

@@ -169,19 +169,22 @@ class Run:
             "Check these spectra, or start again with smaller learning rates"
         )
 
-    def control(self) -> None:
-        """Lets every host control act that is due."""
+    def control(self, say: Callable[[str], None] = lambda stage: None) -> bool:
+        """Lets every host control act that is due, and returns whether any was; `say` is told of long work."""
+        acted = False
         for number, control in enumerate(self.controls):
             if control.due(self.step, self.settings.optim.steps):
                 begin, step = time.perf_counter(), self.step
                 rng = np.random.default_rng([self.seed, control.stream, step])
-                context = Context(self.data, self.cache, self.dataset.train)
+                context = Context(self.data, self.cache, self.dataset.train, say)
                 edit = control.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
                 check_alike(self.state, f"what the {type(control).__name__} made of the parameters")
                 self.seconds += time.perf_counter() - begin
                 if edit.report:
                     self.log({"step": step} | edit.report)
+                acted = True
+        return acted
 
     def _commit(self, number: int, edit: Edit) -> None:
         """Puts a control's edit into the state, moments and all."""
@@ -282,16 +285,27 @@ def train(
     check_data(dataset, get_field(field))
     settings = limit_steps(settings, len(dataset.train))
     run = Run(dataset, field, settings, seed, folder, devices)
-    if resume:
-        run.restore()
+    resumed = resume and run.restore()
     check_alike((run.state, run.field), "what training begins with")
     total = settings.optim.steps
     with deferred_interrupt() as interrupt, TrainingProgress(total, run.step, is_first()) as progress:
-        if run.step == 0:
-            run.control()
+        if not resumed:
+            _begin(run, progress, interrupt)
         while run.step < total:
             _advance(run, total, progress, interrupt)
     return TrainResult(run.field, run.state.params, run.step, run.seconds, run.compilations)
+
+
+def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:
+    """Does what is due before the first step, and saves what that took."""
+
+    def say(stage: str) -> None:
+        progress.stage(stage)
+        if any_process(interrupt["set"]):
+            raise Interrupted("stopped before the first step; run the same command with --resume to begin again")
+
+    if run.control(say):
+        run.save()
 
 
 def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:

@@ -28,6 +28,7 @@ class TrainingProgress:
         self.total, self.done, self.start_step, self.shown = total, done, done, shown
         self.held_out: dict[str, float] = {}
         self.started = self.last_line = time.monotonic()
+        self.compiled = False
         self.console = Console(file=sys.stderr)
         self.bar = Bar(
             SpinnerColumn(),
@@ -49,13 +50,19 @@ class TrainingProgress:
     def __exit__(self, *exception) -> None:
         self.bar.stop()
 
+    def stage(self, what: str) -> None:
+        """Shows what is done before the first step."""
+        self.bar.update(self.task, status=f"{what} ...")
+        if self.shown and not self.console.is_terminal:
+            print(f"{what} ({time.monotonic() - self.started:.0f} s)", file=sys.stderr, flush=True)
+
     def update(self, entry: dict[str, Any]) -> None:
         """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
         step = int(entry["step"])
         self.held_out = {name: entry[name] for name in HELD_OUT if entry.get(name) is not None} or self.held_out
         shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in UNSHOWN}
         figures = [f"{name} {value:.4g}" for name, value in shown.items() if value is not None]
-        elapsed = max(time.monotonic() - self.started, 1e-9)
+        elapsed = max(time.monotonic() - self.started, 1e-9)  # the first epoch's: with all that came before it
         rate = (step - self.start_step) / elapsed
         status = "  ".join([*figures, f"{rate:.1f} steps/s"])
         self.bar.update(self.task, completed=step, status=status)
@@ -64,3 +71,5 @@ class TrainingProgress:
             self.last_line = time.monotonic()
             left = (self.total - step) / max(rate, 1e-9)
             print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)
+        if not self.compiled:  # neither searches nor compilation come again
+            self.compiled, self.started, self.start_step = True, time.monotonic(), step

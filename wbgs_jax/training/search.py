@@ -66,32 +66,37 @@ class Search:
     ) -> Edit:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field with its
         surfaces moved if the mesh is doubtful."""
-        config, data, cache = self.config, context.data, context.cache
+        config, data, cache, say = self.config, context.data, context.cache, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
         told = Told(field, cache, data, spectra)
         if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
+            say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
             params, named = search_materials(params, told.scores(config.spectra), config, usual=True)
             params, gain = search_gain(params, told.scores(config.spectra))
             return Edit(params, (), None, {"search": dataclasses.asdict(named), "gain_db": gain}, field, cache)
         if config.antenna_rounds:
+            say("search: antennas")
             params, _ = self._antennas(params, told, report)
         if config.rounds:
+            say("search: materials")
             params, named = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
+            say("search: idealisations")
             for _ in range(SWEEPS):
                 params = self._idealisations(params, told, report)
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
                 params, _ = search_materials(params, told.scores(config.ideal_spectra), config)
+            say("search: how far surfaces may be off")
             _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             field = self._tuning(params, told, report)
             told = dataclasses.replace(told, field=field)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
-                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng)
+                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
                 params, field, cache = place.params, place.field, place.cache
                 told = Told(field, cache, data, spectra)
