@@ -38,12 +38,11 @@ def trusting(params, spectra, power):
 
 
 def parts(run, params, index):
-    """What the two fields say by themselves."""
-    field = run.field
-    return [
-        observe_links(one, own, run.dataset, index)
-        for one, own in ((field.wave, params.wave), (field.wideband, params.wideband))
-    ]
+    """What the coherent field says, and the splatting one that sees it."""
+    field, dataset = run.field, run.dataset
+    wave = observe_links(field.wave, params.wave, dataset, index)
+    plan = field.wideband.plan(params.wideband, dataset.receiver())
+    return wave, field.wideband.render_given(params.wideband, plan, dataset.query(index), jnp.asarray(wave.pas))
 
 
 @pytest.mark.heavy
@@ -79,18 +78,33 @@ def test_the_share_is_what_explains_other_links_best(run, share):
 
 
 @pytest.mark.heavy
-def test_its_loss_is_the_sum_and_no_field_knows_of_the_other(run):
+def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     field, params = run.field, run.state.params
     batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)
+    given = jnp.asarray(observe_links(field.wave, params.wave, run.dataset, run.dataset.train[:2]).pas)
 
-    @jax.jit
-    def losses(params):
+    def both(params):
+        return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0]
+
+    def one_by_one(params):
         coherent, _ = field.wave.loss(params.wave, run.cache, batch)
-        blurred, _ = field.wideband.loss(params.wideband, None, batch, run.limits, field.probe(params))
-        return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0], coherent + blurred
+        return coherent + field.wideband.loss(params.wideband, None, batch, run.limits, field.probe(params), given)[0]
 
-    both, total = losses(params)
-    assert float(both) == pytest.approx(float(total), rel=1e-6)
+    (loss, gradient), (expected, other) = (jax.jit(jax.value_and_grad(f))(params) for f in (both, one_by_one))
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    for (path, leaf), wanted in zip(jax.tree_util.tree_leaves_with_path(gradient), jax.tree.leaves(other), strict=True):
+        rounding = 1e-7 + 1e-4 * float(jnp.abs(wanted).max())  # turns of spheres are nothing but rounding
+        np.testing.assert_allclose(leaf, wanted, rtol=1e-2, atol=rounding, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.heavy
+def test_the_splatting_field_answers_to_the_coherent_one(run):
+    field, params, index = run.field, run.state.params, run.dataset.validation[:2]
+    plan, query = field.wideband.plan(params.wideband, run.dataset.receiver()), run.dataset.query(index)
+    dark, bright = (
+        field.wideband.render_given(params.wideband, plan, query, jnp.full((2, 90, 360), level)).pas for level in (0.0, 1.0)
+    )
+    assert float(jnp.abs(dark - bright).max()) > 1e-3
 
 
 def test_elsewhere_it_is_the_coherent_field(run):

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 from synthetic import FIELDS
 
 from wbgs_jax.data.surface import surface_from_points
 from wbgs_jax.fields import wideband
-from wbgs_jax.fields.em_features import MAX_ATTENUATION
+from wbgs_jax.fields.em_features import DARK, MAX_ATTENUATION, given_features
 from wbgs_jax.fields.wideband import INITIAL_ATTENUATION, WidebandField, make_field
 from wbgs_jax.splat import TileLimits, slots_for
 from wbgs_jax.types import Query, make_query, make_receiver
@@ -243,3 +244,18 @@ def test_coinciding_positions_have_finite_gradients(rng, points):
 
     for gradient in jax.tree.leaves(gradients(params, query)):
         assert bool(jnp.isfinite(gradient).all())
+
+
+def test_networks_see_given_spectra_between_pixels_and_across_the_seam(rng):
+    """Against a library's linear interpolation."""
+    given = rng.uniform(size=(2, 90, 360))
+    pixel = np.stack([rng.uniform(-0.5, 359.5, 50), rng.uniform(0, 100, 50)], -1)
+    pixel[:2, 0] = -0.4, 359.3
+    around = np.concatenate([given[..., -1:], given, given[..., :1]], -1)
+    expected = [
+        RegularGridInterpolator((np.arange(90), np.arange(-1, 361)), one)(np.minimum(pixel[:, ::-1], (89, 400)))
+        for one in around
+    ]
+    seen = given_features(jnp.asarray(given), jnp.asarray(pixel))
+    np.testing.assert_allclose(seen[..., 0].T, expected, atol=1e-4)
+    np.testing.assert_allclose(seen[..., 1].T, np.log(np.array(expected) + DARK), atol=2e-3)

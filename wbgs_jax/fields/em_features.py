@@ -21,11 +21,13 @@ from wbgs_jax.fields.networks import (
 from wbgs_jax.fields.wideband_settings import WidebandConfig
 from wbgs_jax.radio.array import EXACT, array_response, steering_vector
 from wbgs_jax.radio.channel import free_space_db
-from wbgs_jax.radio.geometry import smooth_length, to_local
+from wbgs_jax.radio.geometry import angles_to_pixel, direction_to_angles, smooth_length, to_local
 from wbgs_jax.types import Gaussians, Query, Receiver
 
 MAX_ATTENUATION = 0.99
-RELATIVE_FEATURES = 7
+RELATIVE_FEATURES, GIVEN_FEATURES = 7, 2
+DARK = 0.02
+"""Keeps the logarithm of dark pixels finite."""
 POWER_UNIT_DB = 10.0
 Weights = dict[str, Any]
 """Of all networks, by name."""
@@ -62,6 +64,8 @@ class GaussianFeatures:
     """Unit vectors from the Gaussians to the receiver, world frame."""
     steering: Complex[Array, "n elements"] | None
     """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
+    pixel: Float[Array, "n 2"]
+    """Where the Gaussians' centres lie in an image, (column, row), without gradient."""
 
 
 def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork, PowerNetwork]:
@@ -87,7 +91,8 @@ def gaussian_features(
     back = receiver.position - means
     fixed = receiver.unit == "wavelengths"
     steering = steering_vector(receiver.element_positions, direction) if fixed else None
-    return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
+    pixel = jax.lax.stop_gradient(angles_to_pixel(*direction_to_angles(direction), config.projection))
+    return GaussianFeatures(sums, direction, back / smooth_length(back), steering, pixel)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -99,14 +104,17 @@ def query_features(
     receiver: Receiver,
     config: WidebandConfig,
     query: Query,
+    given: Float[Array, "b 90 360"] | None = None,
 ) -> QueryFeatures:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
-    4.5), and a summary of every query."""
+    4.5), and a summary of every query. Networks that were made for it see, in the direction of every Gaussian, spectra that
+    another field gives."""
     attenuation, radiance, _ = make_networks(config)
     both, frequency = _query_inputs(gaussians.means, features, frame, receiver, config, query)
-    outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both, method="of_queries")
+    seen = [] if given is None else [given_features(given, features.pixel)]
+    outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both + seen, method="of_queries")
     hidden, delta_f = outputs
-    signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency])
+    signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency, *seen])
     if config.frequency_heads:
         u = scale_frequency(query.frequency_hz)
         powers = jnp.concatenate([jnp.ones_like(u)[:, None], legendre(u, config.frequency_heads)], -1)
@@ -148,6 +156,22 @@ def _query_inputs(
     if config.attenuation_frequency:
         both.append(encoded)
     return both, [encoded] if config.radiance_frequency else []
+
+
+def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) -> Float[Array, "n b 2"]:
+    """Returns spectra in the directions of Gaussians, between pixels linearly, and their logarithms; below the lowest row of
+    pixels, what they say there."""
+    rows, columns = given.shape[-2:]
+    row = jnp.clip(pixel[:, 1], 0, rows - 1)
+    above, left = jnp.minimum(jnp.floor(row), rows - 2), jnp.floor(pixel[:, 0])
+    down, right = row - above, pixel[:, 0] - left
+
+    def at(i: int, j: int) -> Float[Array, "b n"]:
+        return given[:, above.astype(jnp.int32) + i, (left.astype(jnp.int32) + j) % columns]
+
+    upper, lower = ((1 - right) * at(i, 0) + right * at(i, 1) for i in (0, 1))
+    said = ((1 - down) * upper + down * lower).T
+    return jnp.stack([said, jnp.log(said + DARK)], -1)
 
 
 def encoded_frequency(frequency_hz: Float[Array, " b"], config: WidebandConfig) -> Float[Array, "b d"]:

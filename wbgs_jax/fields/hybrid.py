@@ -3,8 +3,9 @@
     PAS = w PAS of the waves + (1 - w) PAS of the Gaussians
 
 The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
-needs neither and blurs. Both are trained on the same batches; the share w, query by query, is what explains validation
-transmitters best (trust.py).
+needs neither and blurs. Its networks see what the coherent field says, and so learn where that is wrong: behind furniture that
+the mesh lacks, say. Both are trained on the same batches; the share w, query by query, is what explains validation transmitters
+best (trust.py).
 Without a mesh it is the splatting field by itself.
 """
 
@@ -116,7 +117,8 @@ class HybridField(Field):
     def init(self, key: Key[Array, ""]) -> HybridParams:
         """Returns initial parameters, both fields trusted alike."""
         wave = None if self.wave is None else self.wave.init(key)
-        return HybridParams(wave, self.wideband.init(key), Trust(constant(0.5), constant(0.5)))
+        wideband = self.wideband.init(key, given=wave is not None)
+        return HybridParams(wave, wideband, Trust(constant(0.5), constant(0.5)))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
         """Returns the paths of all transmitters of some links (host)."""
@@ -142,7 +144,7 @@ class HybridField(Field):
     def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
         if coherent is None:
             return self.wideband.render(params.wideband, plan.wideband, query)
-        blurred = self.wideband.render(params.wideband, plan.wideband, query)
+        blurred = self.wideband.render_given(params.wideband, plan.wideband, query, coherent.pas)
         told = features(query, plan.wave.receiver.position, coherent, blurred)
         spectra, power = (share_of(share, told) for share in (params.trust.spectra, params.trust.power))
         pas = spectra[:, None, None] * coherent.pas + (1 - spectra)[:, None, None] * blurred.pas
@@ -156,11 +158,13 @@ class HybridField(Field):
     def loss(
         self, params: HybridParams, cache: PreparedPaths | None, batch: Batch, limits: Any = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the sum of both losses: neither field knows of the other."""
-        loss, aux = self.wideband.loss(params.wideband, None, batch, limits, probe)
+        """Returns the sum of both losses. What the splatting field makes of the coherent one is no reason to change that."""
         if self.wave is None:
-            return loss, aux
-        coherent, other = self.wave.loss(params.wave, cache, batch)
+            return self.wideband.loss(params.wideband, None, batch, limits, probe)
+        seen = self.wave.render_links(params.wave, self.wave.plan(params.wave, batch.receiver, None, cache), cache, batch.links)
+        coherent, other = self.wave.compared(params.wave, seen, batch)
+        given = jax.lax.stop_gradient(seen.pas)
+        loss, aux = self.wideband.loss(params.wideband, None, batch, limits, probe, given)
         figures = {f"{name}_wave": value for name, value in other.metrics.items()} | aux.metrics
         return loss + coherent, aux._replace(metrics=figures)
 
@@ -197,7 +201,8 @@ class HybridField(Field):
 
     def splatted(self, params: HybridParams, plan: HybridPlan, query: Query) -> Splatted:
         """Returns the Gaussians of the splatting field with their attenuation and signal."""
-        return self.wideband.splatted(params.wideband, plan.wideband, query)
+        given = None if self.wave is None else self.wave.render(params.wave, plan.wave, query).pas
+        return self.wideband.splatted(params.wideband, plan.wideband, query, given)
 
     def electrical(self, params: HybridParams) -> Electrical | None:
         """Returns the materials of the coherent field."""
@@ -272,7 +277,7 @@ def _scores(
     """Returns the features of every link, and what every share of the coherent field is worth on it: SSIM, and the negative
     error of the power (dB)."""
     coherent: Any = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
-    blurred: Any = hybrid.wideband.render(params.wideband, plan.wideband, batch.links.query)
+    blurred: Any = hybrid.wideband.render_given(params.wideband, plan.wideband, batch.links.query, coherent.pas)
     told = features(batch.links.query, batch.receiver.position, coherent, blurred)
     shares, spectra, power = jnp.asarray(SHARES, jnp.float32), None, None
     if batch.pas is not None:

@@ -189,8 +189,12 @@ class WaveField(Field):
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
         facet corrections. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum of 1."""
-        config, plan = self.config, self.plan(params, batch.receiver, cache=cache)
-        seen = self.render_links(params, plan, cache, batch.links)
+        plan = self.plan(params, batch.receiver, cache=cache)
+        return self.compared(params, self.render_links(params, plan, cache, batch.links), batch)
+
+    def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
+        """Returns the loss of what it says of a batch."""
+        config = self.config
         loss, aux = compare(seen, _heard_alone(batch, seen), config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)

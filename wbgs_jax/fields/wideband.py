@@ -7,6 +7,7 @@ Neither the geometry nor what the networks make of a Gaussian alone depends on t
 """
 
 import dataclasses
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -19,6 +20,7 @@ from wbgs_jax._util.pytree import pytree, static, with_leaves
 from wbgs_jax.config import PRESETS, check_positive, check_share
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, Splatted, compare, power_error_db, register, with_field
 from wbgs_jax.fields.em_features import (
+    GIVEN_FEATURES,
     MAX_ATTENUATION,
     RELATIVE_FEATURES,
     Frame,
@@ -106,10 +108,11 @@ class WidebandField(Field):
         """Returns the field whose Gaussians start on the surfaces of a scene."""
         return make_field(scene.surface(config.gaussians, seed, config.sampling), config, cls)
 
-    def init(self, key: Key[Array, ""]) -> WidebandParams:
+    def init(self, key: Key[Array, ""], given: bool = False) -> WidebandParams:
         """Returns isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest
-        neighbours, in slots that leave density control some room, and random networks."""
-        return _init(self, key)
+        neighbours, in slots that leave density control some room, and random networks, which see what another field gives if
+        they are to."""
+        return _init(self, key, given)
 
     def plan(
         self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None
@@ -138,10 +141,23 @@ class WidebandField(Field):
         """Returns the spectra of B queries, and their received power."""
         return self._render(params, plan, query)
 
-    def _render(self, params: WidebandParams, plan: WidebandPlan, query: Query, detached: bool = False) -> Observation:
+    def render_given(
+        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"]
+    ) -> Observation:
+        """Returns the same with networks that see the spectra that another field gives."""
+        return self._render(params, plan, query, given)
+
+    def _render(
+        self,
+        params: WidebandParams,
+        plan: WidebandPlan,
+        query: Query,
+        given: Float[Array, "b 90 360"] | None = None,
+        detached: bool = False,
+    ) -> Observation:
         """Detached power has no gradient with respect to what the spectra are made of."""
         check_query(query)
-        features = _features(params, plan, query)
+        features = _features(params, plan, query, given)
         spectra = render_splats(plan.geometry, features.attenuation, features.signal)
         summary = jax.lax.stop_gradient(features.summary) if detached else features.summary
         known = plan.frame, plan.receiver, plan.config
@@ -152,11 +168,17 @@ class WidebandField(Field):
         return jnp.zeros((params.gaussians.means.shape[0], 2))
 
     def loss(
-        self, params: WidebandParams, cache: None, batch: Batch, limits: TileLimits | None = None, probe: Any = None
+        self,
+        params: WidebandParams,
+        cache: None,
+        batch: Batch,
+        limits: TileLimits | None = None,
+        probe: Any = None,
+        given: Float[Array, "b 90 360"] | None = None,
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
         planned = self._plan(params, batch.receiver, limits, probe)
-        seen = self._render(params, planned, batch.links.query, detached=batch.pas is not None)
+        seen = self._render(params, planned, batch.links.query, given, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
             loss += self.config.power_weight * error_db
@@ -178,9 +200,12 @@ class WidebandField(Field):
         grown = fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
         return TileLimits(max(grown.entries, limits.entries), max(grown.jobs, limits.jobs))
 
-    def splatted(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Splatted:
+    def splatted(
+        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
+    ) -> Splatted:
         """Returns the Gaussians with their attenuation and signal for B queries."""
-        return Splatted(params.gaussians, *em_features(params, plan, query))
+        features = _features(params, plan, query, given)
+        return Splatted(params.gaussians, features.attenuation, features.signal)
 
     def portable(self, plan: WidebandPlan) -> WidebandPlan:
         """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
@@ -219,9 +244,9 @@ def make_field(
     return cls(surface, frame, config or WidebandConfig())
 
 
-@jax.jit
-def _init(field: WidebandField, key: Key[Array, ""]) -> WidebandParams:
-    return WidebandParams(_initial_gaussians(field.surface, field.config.features), _initial_networks(key, field))
+@partial(jax.jit, static_argnames="given")
+def _init(field: WidebandField, key: Key[Array, ""], given: bool) -> WidebandParams:
+    return WidebandParams(_initial_gaussians(field.surface, field.config.features), _initial_networks(key, field, given))
 
 
 def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
@@ -240,7 +265,7 @@ def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
     )
 
 
-def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, Any]:
+def _initial_networks(key: Key[Array, ""], field: WidebandField, given: bool) -> dict[str, Any]:
     """Returns initial weights; the inputs matter by their shapes only."""
     config, points = field.config, field.surface.points
     attenuation, radiance, power = make_networks(config)
@@ -249,11 +274,12 @@ def _initial_networks(key: Key[Array, ""], field: WidebandField) -> dict[str, An
     tx = [positional_encoding(points[:1], config.tx_octaves)[None]]
     frequency = encoded_frequency(jnp.full((1,), 1e9, points.dtype), config)[None]
     relative = [jnp.zeros((len(points), 1, RELATIVE_FEATURES), points.dtype)] if config.relative else []
-    query = tx + relative + ([frequency] if config.attenuation_frequency else [])
+    seen = [jnp.zeros((len(points), 1, GIVEN_FEATURES), points.dtype)] if given else []
+    query = tx + relative + ([frequency] if config.attenuation_frequency else []) + seen
     key_attenuation, key_radiance = jax.random.split(key)
     outputs: Any
     outputs, weights = attenuation.init_with_output(key_attenuation, gaussian, query)
-    inputs = [outputs[0], *([frequency] if config.radiance_frequency else [])]
+    inputs = [outputs[0], *([frequency] if config.radiance_frequency else []), *seen]
     summary, scaled_frequency = (jnp.zeros((1, size), points.dtype) for size in (config.width, 1))
     known = [summary, tx[0][0], *([scaled_frequency] if config.sees_frequency else [])]
     return {
@@ -280,7 +306,9 @@ def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tup
     return features.attenuation, features.signal
 
 
-def _features(params: WidebandParams, plan: WidebandPlan, query: Query) -> QueryFeatures:
+def _features(
+    params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
+) -> QueryFeatures:
     known = plan.frame, plan.receiver, plan.config
     features = plan.features or gaussian_features(params.gaussians, params.networks, *known)
-    return query_features(params.gaussians, params.networks, features, *known, query)
+    return query_features(params.gaussians, params.networks, features, *known, query, given)
