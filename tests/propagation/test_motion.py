@@ -104,6 +104,15 @@ def test_the_jacobian_says_what_the_changes_say(kind, rng):
     np.testing.assert_allclose(by_jacobian[alive], length_changes(paths, search, motion)[alive], atol=1e-6)
 
 
+def test_without_paths_nothing_depends_on_anything():
+    """A mesh without an edge has none that are diffracted."""
+    search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
+    none = jax.tree.map(lambda leaf: leaf[:0], trace(search, TX).diffracted)
+    assert length_jacobian(none, search, len(PARTS)).shape == (0, 6 * len(PARTS) + 6)
+    gradient = length_gradient(none, search, len(PARTS))
+    assert coherence(gradient, jnp.ones(len(PARTS) + 1), jnp.float32(100.0)).shape == (0, 0)
+
+
 def test_lengths_follow_the_transmitter(rng):
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
     step = rng.normal(0, 1e-3, 3)

@@ -68,7 +68,7 @@ def length_jacobian(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Arra
     """Returns the derivative of `length_changes` with respect to all numbers of its motion, as `ravel_pytree` orders them."""
     turn, mover = _turns(paths, surfaces)
     lever = jnp.cross(_arms(paths, surfaces, mover, movers), turn)
-    own = [_by_mover(of, mover, movers).reshape(len(turn), -1) for of in (turn, lever)]
+    own = [_by_mover(of, mover, movers).reshape(len(turn), 3 * movers) for of in (turn, lever)]
     return jnp.concatenate([*own, _arriving(paths), jnp.zeros((len(turn), 3))], 1)
 
 
@@ -94,7 +94,7 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
         spread: standard deviation of every place along each axis, metres.
         wavenumber: radians a metre.
     """
-    phase = (wavenumber * gradient * spread[:, None]).reshape(len(gradient), -1)
+    phase = (wavenumber * gradient * spread[:, None]).reshape(len(gradient), 3 * gradient.shape[1])
     variance = jnp.sum(phase**2, -1)
     both = jnp.matmul(phase, phase.T, precision=EXACT)
     return jnp.exp(-0.5 * jnp.maximum(variance[:, None] + variance - 2 * both, 0))

@@ -114,7 +114,7 @@ def _among_all(own: Inexact[Array, "k numbers"], receiver: Int[Array, ""], recei
     """Returns the derivative with respect to a motion of all receivers, from that of one of them: the others' are 0."""
     places, shift, turn = own[:, :-6], own[:, -6:-3], own[:, -3:]
     none = jnp.zeros((len(own), receivers, 3), own.dtype)
-    ends = [none.at[:, receiver].set(one).reshape(len(own), -1) for one in (shift, turn)]
+    ends = [none.at[:, receiver].set(one).reshape(len(own), 3 * receivers) for one in (shift, turn)]
     return jnp.concatenate([places, *ends], 1)
 
 
