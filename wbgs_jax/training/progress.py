@@ -62,14 +62,14 @@ class TrainingProgress:
         self.held_out = {name: entry[name] for name in HELD_OUT if entry.get(name) is not None} or self.held_out
         shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in UNSHOWN}
         figures = [f"{name} {value:.4g}" for name, value in shown.items() if value is not None]
-        elapsed = max(time.monotonic() - self.started, 1e-9)  # the first epoch's: with all that came before it
-        rate = (step - self.start_step) / elapsed
-        status = "  ".join([*figures, f"{rate:.1f} steps/s"])
+        elapsed = max(time.monotonic() - self.started, 1e-9)
+        rate = (step - self.start_step) / elapsed if self.compiled else None
+        status = "  ".join([*figures, *([] if rate is None else [f"{rate:.1f} steps/s"])])
         self.bar.update(self.task, completed=step, status=status)
         due = time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total
         if due and self.shown and not self.console.is_terminal:
             self.last_line = time.monotonic()
-            left = (self.total - step) / max(rate, 1e-9)
-            print(f"step {step}/{self.total}  {status}  {left:.0f} s left", file=sys.stderr, flush=True)
-        if not self.compiled:  # neither searches nor compilation come again
+            left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
+            print(f"step {step}/{self.total}  {status}{left}", file=sys.stderr, flush=True)
+        if not self.compiled:  # neither searches nor compilation come again: what they took tells no rate
             self.compiled, self.started, self.start_step = True, time.monotonic(), step
