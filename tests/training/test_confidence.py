@@ -64,6 +64,15 @@ def test_what_says_nothing_is_left_out(rng):
     assert weights[0] == pytest.approx(1.0, abs=0.25)
 
 
+def test_few_transmitters_tell_of_few_features(rng):
+    """Eight can say that one helps; what a fit to six of them would make of other answers has no end."""
+    for _ in range(20):
+        known, error, tx = drawn(rng, 8, per_tx=1, slope=1.0, noise=0.1)
+        weights = fit(known, error + known[:, 1:].sum(1), tx, SETS)[2]
+        assert not np.any(weights[1:-1])
+    assert fit(*drawn(rng, 8, slope=1.0, noise=0.1), SETS)[2][0] == pytest.approx(1.0, abs=0.5)
+
+
 def test_a_transmitter_is_not_judged_by_itself(rng):
     """Ten spectra of one transmitter that are alike are one piece of evidence."""
     known, error, tx = drawn(rng, 8, per_tx=10)

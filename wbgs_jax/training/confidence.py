@@ -1,7 +1,8 @@
 """What the validation part says about how sure a trained field's answers are, on the host.
 
 Every transmitter is left out in turn, so that what is left of the scores is that of transmitters that were not looked at. Of a
-few sets of features, each with the ones before, the largest is taken that lowers the mean squared rest by more than chance.
+few sets of features, each with the ones before, the largest is taken that lowers the mean squared rest by more than chance;
+small validation parts can tell of few features only.
 """
 
 from typing import Any
@@ -38,6 +39,8 @@ SETS = (0, 1, 3, 5, FEATURES)
 """Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
 POWER_SETS = (0, 1, 2, POWER_FEATURES)
 """The same of received powers: none, the distance, and the power itself, and the frequency."""
+ENOUGH = 5
+"""Transmitters for every feature, at least: of fewer a regression learns their own errors by heart."""
 RIDGE = 1.0
 """Of the scaled features: that of one spectrum."""
 _features, _power_features = jax.jit(features), jax.jit(power_features)
@@ -104,6 +107,7 @@ def fit(
     and what is left of these errors; `sets` are the numbers of features that are tried."""
     mean, scale = known.mean(0), known.std(0) + 1e-6
     scaled = (known - mean) / scale
+    sets = tuple(size for size in sets if ENOUGH * size <= len(np.unique(tx_index)))
     rests = {size: left_out(scaled[:, :size], error, tx_index) for size in sets}
     chosen = sets[0]
     for size in sets[1:]:
