@@ -127,7 +127,7 @@ def test_lengths_follow_the_transmitter(rng):
 
 def test_coherence_is_the_mean_of_phases_over_places(rng):
     """Against draws of places from normal distributions."""
-    gradient, spread, wavenumber = rng.normal(size=(5, 4, 3)), rng.uniform(0.0, 2e-3, 4), 400.0
+    gradient, spread, wavenumber = rng.normal(size=(5, 4, 3)), rng.uniform(1e-3, 2e-3, 4), 400.0
     found = coherence(*(jnp.asarray(x, jnp.float32) for x in (gradient, spread, wavenumber)))
     places = rng.normal(size=(200_000, 4, 3)) * spread[:, None]
     phases = np.exp(-1j * wavenumber * np.einsum("kmx,nmx->nk", gradient, places))
