@@ -13,6 +13,7 @@ import pytest
 from commands import assert_error_for_people, call
 from jaxtyping import Array, Float
 from synthetic import FREQUENCIES_HZ, tiny_scene
+from toys import metrics_of
 
 import wbgs_jax as wb
 from wbgs_jax import eval as eval_command
@@ -104,12 +105,6 @@ def trained(tmp_path_factory):
         return runs[kind, n_rx]
 
     return make
-
-
-def metrics_of(folder):
-    """Curve entries without the wall-clock time."""
-    entries = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in entry.items() if key != "seconds"} for entry in entries]
 
 
 def assert_equal_trees(a, b):

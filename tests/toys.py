@@ -1,6 +1,7 @@
 """What tests of training share: fields that compile in no time, which know nothing and learn a little, and settings."""
 
 import contextlib
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -111,3 +112,9 @@ def toy_settings(**changes: Any) -> Settings:
     """As `synthetic.tiny_settings`, of a toy field without host controls."""
     loop = LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2)
     return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0), loop), changes)
+
+
+def metrics_of(folder):
+    """Curve entries without the wall-clock time."""
+    entries = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in entry.items() if key != "seconds"} for entry in entries]

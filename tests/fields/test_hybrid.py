@@ -42,7 +42,7 @@ def parts(run, params, index):
     field, dataset = run.field, run.dataset
     wave = observe_links(field.wave, params.wave, dataset, index)
     plan = field.wideband.plan(params.wideband, dataset.receiver())
-    return wave, field.wideband.render_given(params.wideband, plan, dataset.query(index), jnp.asarray(wave.pas))
+    return wave, field.wideband.render(params.wideband, plan, dataset.query(index), jnp.asarray(wave.pas))
 
 
 @pytest.mark.heavy
@@ -102,7 +102,7 @@ def test_the_splatting_field_answers_to_the_coherent_one(run):
     field, params, index = run.field, run.state.params, run.dataset.validation[:2]
     plan, query = field.wideband.plan(params.wideband, run.dataset.receiver()), run.dataset.query(index)
     dark, bright = (
-        field.wideband.render_given(params.wideband, plan, query, jnp.full((2, 90, 360), level)).pas for level in (0.0, 1.0)
+        field.wideband.render(params.wideband, plan, query, jnp.full((2, 90, 360), level)).pas for level in (0.0, 1.0)
     )
     assert float(jnp.abs(dark - bright).max()) > 1e-3
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import tiny_dataset
-from toys import RippleConfig, RippleField, registered, toy_settings
+from toys import RippleConfig, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import DensityConfig, SearchConfig
@@ -289,18 +289,15 @@ class Seeking(Watching):
         return Edit(found, self.statistics(found), None, {"found": 3})
 
 
-def interrupt_epochs(monkeypatch):
-    def epoch(run):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Run, "epoch", epoch)
-
-
 def test_long_work_before_the_first_step_is_shown_and_kept(dataset, tmp_path, monkeypatch, capsys):
     """It is killed in the first epoch; resumed, it goes on with what was found, and seeks nothing."""
     use(monkeypatch, Watching, Seeking)
+
+    def killed(run):
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        interrupt_epochs(patch)
+        patch.setattr(Run, "epoch", killed)
         with pytest.raises(KeyboardInterrupt):
             train(dataset, "layered", SETTINGS, SEED, tmp_path)
     assert [line.split(" (")[0] for line in capsys.readouterr().err.splitlines()] == ["seeking", "found"]
@@ -310,13 +307,8 @@ def test_long_work_before_the_first_step_is_shown_and_kept(dataset, tmp_path, mo
     train(dataset, "layered", SETTINGS, SEED, tmp_path, resume=True)
     assert "seeking" not in capsys.readouterr().err
     assert [entry for entry in entries(tmp_path) if "found" in entry] == [{"step": 0, "found": 3}]
-    use(monkeypatch, Watching, Seeking)
     train(dataset, "layered", SETTINGS, SEED, tmp_path / "whole")
-    assert [_untimed(entry) for entry in entries(tmp_path)] == [_untimed(entry) for entry in entries(tmp_path / "whole")]
-
-
-def _untimed(entry):
-    return {name: value for name, value in entry.items() if name != "seconds"}
+    assert metrics_of(tmp_path) == metrics_of(tmp_path / "whole")
 
 
 def test_an_interrupt_does_not_wait_for_the_end_of_long_work(dataset, tmp_path, monkeypatch, capsys):

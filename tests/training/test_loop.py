@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import json
 import shutil
 import signal
 
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from synthetic import tiny_dataset, tiny_settings
-from toys import GROWING, RippleField, registered, toy_settings
+from toys import GROWING, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
@@ -70,12 +69,6 @@ def final_state(dataset, folder, case):
     run = Run(dataset, *case, 0, folder)
     assert run.restore() and run.step == STEPS
     return run.state
-
-
-def metrics_of(folder):
-    """Curve entries without the wall-clock time."""
-    entries = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in entry.items() if key != "seconds"} for entry in entries]
 
 
 def assert_same_run(dataset, folder, other, case):

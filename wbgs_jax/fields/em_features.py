@@ -21,7 +21,7 @@ from wbgs_jax.fields.networks import (
 from wbgs_jax.fields.wideband_settings import WidebandConfig
 from wbgs_jax.radio.array import EXACT, array_response, steering_vector
 from wbgs_jax.radio.channel import free_space_db
-from wbgs_jax.radio.geometry import angles_to_pixel, direction_to_angles, smooth_length, to_local
+from wbgs_jax.radio.geometry import smooth_length, to_local
 from wbgs_jax.types import Gaussians, Query, Receiver
 
 MAX_ATTENUATION = 0.99
@@ -64,8 +64,6 @@ class GaussianFeatures:
     """Unit vectors from the Gaussians to the receiver, world frame."""
     steering: Complex[Array, "n elements"] | None
     """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
-    pixel: Float[Array, "n 2"]
-    """Where the Gaussians' centres lie in an image, (column, row), without gradient."""
 
 
 def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork, PowerNetwork]:
@@ -91,8 +89,7 @@ def gaussian_features(
     back = receiver.position - means
     fixed = receiver.unit == "wavelengths"
     steering = steering_vector(receiver.element_positions, direction) if fixed else None
-    pixel = jax.lax.stop_gradient(angles_to_pixel(*direction_to_angles(direction), config.projection))
-    return GaussianFeatures(sums, direction, back / smooth_length(back), steering, pixel)
+    return GaussianFeatures(sums, direction, back / smooth_length(back), steering)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -104,14 +101,13 @@ def query_features(
     receiver: Receiver,
     config: WidebandConfig,
     query: Query,
-    given: Float[Array, "b 90 360"] | None = None,
+    given: Float[Array, "n b 2"] | None = None,
 ) -> QueryFeatures:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
-    4.5), and a summary of every query. Networks that were made for it see, in the direction of every Gaussian, spectra that
-    another field gives."""
+    4.5), and a summary of every query. Networks that were made for it see what another field gives (`given_features`)."""
     attenuation, radiance, _ = make_networks(config)
     both, frequency = _query_inputs(gaussians.means, features, frame, receiver, config, query)
-    seen = [] if given is None else [given_features(given, features.pixel)]
+    seen = [] if given is None else [given]
     outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both + seen, method="of_queries")
     hidden, delta_f = outputs
     signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency, *seen])

@@ -144,7 +144,7 @@ class HybridField(Field):
     def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
         if coherent is None:
             return self.wideband.render(params.wideband, plan.wideband, query)
-        blurred = self.wideband.render_given(params.wideband, plan.wideband, query, coherent.pas)
+        blurred = self.wideband.render(params.wideband, plan.wideband, query, coherent.pas)
         told = features(query, plan.wave.receiver.position, coherent, blurred)
         spectra, power = (share_of(share, told) for share in (params.trust.spectra, params.trust.power))
         pas = spectra[:, None, None] * coherent.pas + (1 - spectra)[:, None, None] * blurred.pas
@@ -277,7 +277,7 @@ def _scores(
     """Returns the features of every link, and what every share of the coherent field is worth on it: SSIM, and the negative
     error of the power (dB)."""
     coherent: Any = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
-    blurred: Any = hybrid.wideband.render_given(params.wideband, plan.wideband, batch.links.query, coherent.pas)
+    blurred: Any = hybrid.wideband.render(params.wideband, plan.wideband, batch.links.query, coherent.pas)
     told = features(batch.links.query, batch.receiver.position, coherent, blurred)
     shares, spectra, power = jnp.asarray(SHARES, jnp.float32), None, None
     if batch.pas is not None:

@@ -28,6 +28,7 @@ from wbgs_jax.fields.em_features import (
     QueryFeatures,
     encoded_frequency,
     gaussian_features,
+    given_features,
     make_networks,
     query_features,
     received_power_db,
@@ -137,14 +138,11 @@ class WidebandField(Field):
         features = gaussian_features(params.gaussians, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
-    def render(self, params: WidebandParams, plan: WidebandPlan, query: Query) -> Observation:
-        """Returns the spectra of B queries, and their received power."""
-        return self._render(params, plan, query)
-
-    def render_given(
-        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"]
+    def render(
+        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
     ) -> Observation:
-        """Returns the same with networks that see the spectra that another field gives."""
+        """Returns the spectra of B queries, and their received power; networks that were made for it see the spectra that
+        another field gives."""
         return self._render(params, plan, query, given)
 
     def _render(
@@ -204,8 +202,7 @@ class WidebandField(Field):
         self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
     ) -> Splatted:
         """Returns the Gaussians with their attenuation and signal for B queries."""
-        features = _features(params, plan, query, given)
-        return Splatted(params.gaussians, features.attenuation, features.signal)
+        return Splatted(params.gaussians, *em_features(params, plan, query, given))
 
     def portable(self, plan: WidebandPlan) -> WidebandPlan:
         """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
@@ -299,10 +296,12 @@ def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Ar
     return render_splats(plan.geometry, *em_features(params, plan, query))
 
 
-def em_features(params: WidebandParams, plan: WidebandPlan, query: Query) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
+def em_features(
+    params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
+) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
     4.5)."""
-    features = _features(params, plan, query)
+    features = _features(params, plan, query, given)
     return features.attenuation, features.signal
 
 
@@ -311,4 +310,5 @@ def _features(
 ) -> QueryFeatures:
     known = plan.frame, plan.receiver, plan.config
     features = plan.features or gaussian_features(params.gaussians, params.networks, *known)
-    return query_features(params.gaussians, params.networks, features, *known, query, given)
+    seen = None if given is None else given_features(given, jax.lax.stop_gradient(plan.geometry.splats.means2d))
+    return query_features(params.gaussians, params.networks, features, *known, query, seen)

@@ -15,6 +15,13 @@ from wbgs_jax._util.pytree import replaced
 from wbgs_jax.fields import Field
 from wbgs_jax.training.data import TrainingData
 
+Say = Callable[[str], None]
+"""Told what long work turns to next; raises where it is to stop."""
+
+
+def silent(stage: str) -> None:
+    """Tells nobody."""
+
 
 class Edit(NamedTuple):
     """What a control did."""
@@ -40,8 +47,7 @@ class Context(NamedTuple):
     """Of the field's `prepare`."""
     train: np.ndarray
     """Indices of the training links."""
-    say: Callable[[str], None] = lambda stage: None
-    """Told what long work turns to next; raises where it is to stop."""
+    say: Say = silent
 
 
 @runtime_checkable

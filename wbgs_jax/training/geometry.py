@@ -10,7 +10,6 @@ the mesh as it was, each with as much doubt as suits it.
 """
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from dataclasses import field as having
 from typing import Any
@@ -25,6 +24,7 @@ from wbgs_jax.config import SearchConfig
 from wbgs_jax.propagation.motion import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.adjustment import adjust
+from wbgs_jax.training.controls import Say, silent
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.descent import descend
 from wbgs_jax.training.materials import search_materials
@@ -92,8 +92,7 @@ class _Heard:
     spectra: Int[np.ndarray, " n"]
     config: SearchConfig
     rng: np.random.Generator
-    say: Callable[[str], None]
-    """Told what is looked for next."""
+    say: Say
 
     def told(self, now: Place) -> Told:
         """Returns what they say of a place, in an order drawn anew."""
@@ -130,7 +129,7 @@ def learn_geometry(
     train: Int[np.ndarray, " n"],
     config: SearchConfig,
     rng: np.random.Generator,
-    say: Callable[[str], None] = lambda stage: None,
+    say: Say = silent,
 ) -> tuple[Place, GeometryReport]:
     """Returns the field with its surfaces where training spectra say they are, its materials named there, and the paths of all
     transmitters; as it was, where that explains spectra no worse. `say` is told of what is looked for next."""

@@ -28,7 +28,7 @@ from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.training import checkpoint, curves
-from wbgs_jax.training.controls import Context, Control, Edit, OfPart
+from wbgs_jax.training.controls import Context, Control, Edit, OfPart, Say, silent
 from wbgs_jax.training.data import TrainingData, training_data
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
@@ -169,7 +169,7 @@ class Run:
             "Check these spectra, or start again with smaller learning rates"
         )
 
-    def control(self, say: Callable[[str], None] = lambda stage: None) -> bool:
+    def control(self, say: Say = silent) -> bool:
         """Lets every host control act that is due, and returns whether any was; `say` is told of long work."""
         acted = False
         for number, control in enumerate(self.controls):
