@@ -86,14 +86,14 @@ class SearchConfig:
     """Training spectra that are looked at for how far the elements of arrays are out of tune; 0: they are in tune."""
     geometry: bool = True
     """Whether surfaces of a doubtful mesh are moved."""
-    geometry_snapshots: int = 640
+    geometry_snapshots: int = 1500
     """Snapshots that every step of that looks at ..."""
     geometry_steps: int = 240
     """... or, where only spectra are known, steps at every frequency."""
     geometry_doubt: float = 5e-4
     """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
-    geometry_tx: int = 160
-    """Transmitters that are looked at for that."""
+    geometry_tx: int = 640
+    """Transmitters that are looked at for that; the last time, all of them."""
     geometry_width: float = 0.02
     """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""
     geometry_spectra: int = 64

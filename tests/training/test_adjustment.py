@@ -12,7 +12,7 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
-from wbgs_jax.propagation.motion import Motion, length_changes
+from wbgs_jax.propagation.motion import Motion, length_changes, length_jacobian
 from wbgs_jax.training.adjustment import adjust, length_variances, normal_equations
 
 N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
@@ -70,6 +70,13 @@ def certain(run):
     return jnp.zeros((pairs, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
 
 
+def equations(run, motion, index, data=None):
+    """Of eights of snapshots; the block after them is none of them."""
+    blocks = jnp.concatenate([index.reshape(-1, 8), jnp.zeros((1, 8), index.dtype)])
+    of = run.field, run.state.params, motion, run.cache, run.data if data is None else data
+    return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1))
+
+
 @pytest.mark.heavy
 def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
     motion = drawn(rng, run, 0.2)
@@ -80,7 +87,7 @@ def test_the_vector_is_the_gradient_of_the_log_decorrelation(run, rng):
         return truth.shape[-1] * jnp.sum(log_decorrelation(snapshots(flat, tree, links), truth))
 
     expected = -np.asarray(jax.grad(objective)(ravel_pytree(motion)[0]))
-    _, found = normal_equations(run.field, run.state.params, motion, run.cache, run.data, index, certain(run))
+    _, found = equations(run, motion, index)
     assert np.abs(expected).max() > 1
     np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())
 
@@ -98,7 +105,7 @@ def test_the_matrix_is_that_of_the_jacobian(run, rng):
         left = np.linalg.norm(t - factor * y) / norm
         a = (a - np.outer(y, y.conj() @ a) / np.vdot(y, y)) * factor / norm
         expected = expected + 2 * len(t) * (a.conj().T @ a).real / (left**2 + GOOD_MATCH)
-    found, _ = normal_equations(run.field, run.state.params, motion, run.cache, run.data, index, certain(run))
+    found, _ = equations(run, motion, index)
     np.testing.assert_allclose(found, expected, atol=0.01 * np.abs(expected).max())
     assert np.linalg.matrix_rank(expected) > 10
 
@@ -107,8 +114,8 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
     """One number that is uncertain: the variance is its square times that of the derivative."""
     flat, back = ravel_pytree(run.field.motion)
     number, width = rng.integers(flat.size), 3e-3
-    root = jnp.zeros((flat.size, flat.size)).at[number, number].set(width)
-    found = np.asarray(length_variances(run.cache, root, len(run.field.motion.shift), len(RECEIVERS)))
+    covariance = jnp.zeros((flat.size, flat.size)).at[number, number].set(width**2)
+    found = np.asarray(length_variances(run.cache, covariance, len(run.field.motion.shift)))
     motion = back(jnp.zeros_like(flat).at[number].set(width))
     for k, name in enumerate(("specular", "diffracted")):
         paths = getattr(run.cache.paths, name)
@@ -118,6 +125,22 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
         own = found[:, : changes.shape[1]] if k == 0 else found[:, -changes.shape[1] :]
         alive = np.asarray(paths.alive)
         np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)
+
+
+def test_variances_of_lengths_know_what_places_share(run, rng):
+    """Any covariance: those of all lengths are J C J^T, written out."""
+    movers, size = len(run.field.motion.shift), ravel_pytree(run.field.motion)[0].size
+    root = rng.normal(0, 1e-3, (size, 5))
+    found = np.asarray(length_variances(run.cache, jnp.asarray(root @ root.T, jnp.float32), movers))
+    for pair, receiver in enumerate(np.asarray(run.cache.receiver_index)):
+        paths = jax.tree.map(lambda leaf, pair=pair: leaf[pair], run.cache.paths)
+        some = [length_jacobian(one, run.cache.surfaces, movers) for one in (paths.specular, paths.diffracted)]
+        own = np.concatenate([np.asarray(one, np.float64) for one in some])
+        jacobian = np.zeros((len(own), size))
+        jacobian[:, : 6 * movers], last = own[:, : 6 * movers], 6 * movers + 3 * int(receiver)
+        jacobian[:, last : last + 3] = own[:, 6 * movers : 6 * movers + 3]
+        alive = np.concatenate([np.asarray(paths.specular.alive), np.asarray(paths.diffracted.alive)])
+        np.testing.assert_allclose(found[pair][alive], ((jacobian @ root) ** 2).sum(1)[alive], rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.heavy
@@ -138,10 +161,8 @@ def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
         float(jnp.mean(log_decorrelation(snapshots(ravel_pytree(m)[0], tree, links), heard))) for m in (still, found)
     )
     assert after < before - 1, (before, after)
-    equations = normal_equations(run.field, run.state.params, still, run.cache, data, jnp.resize(index, 16), certain(run))
-    unseen = (
-        np.diag(equations[0]) * prior < 1e-6
-    )  # along walls and about their normals: no path says anything of it but rounding
+    curvature, _ = equations(run, still, jnp.resize(index, 16), data)
+    unseen = np.diag(curvature) * prior < 1e-6  # along walls and about their normals: no path says anything of it but rounding
     assert 0 < unseen.sum() < len(unseen)
     np.testing.assert_allclose(np.diag(covariance)[unseen], prior[unseen], rtol=1e-3)
     assert np.abs(np.asarray(ravel_pytree(found)[0])[unseen]).max() < 1e-2 * np.sqrt(prior[unseen].min())

@@ -66,10 +66,25 @@ def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Ar
 
 def length_jacobian(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k numbers"]:
     """Returns the derivative of `length_changes` with respect to all numbers of its motion, as `ravel_pytree` orders them."""
+    number, derivative = length_terms(paths, surfaces, movers)
+    none = jnp.zeros((len(number), 6 * movers + 6))
+    return none.at[jnp.arange(len(number))[:, None], number].add(derivative)
+
+
+def length_terms(paths: Paths, surfaces: Surfaces, movers: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
+    """Returns the numbers of a motion, as `ravel_pytree` orders them, that the lengths of K paths depend on, and the derivatives:
+    what is most of a `length_jacobian` is 0. A number may be there more than once; derivatives add."""
     turn, mover = _turns(paths, surfaces)
     lever = jnp.cross(_arms(paths, surfaces, mover, movers), turn)
-    own = [_by_mover(of, mover, movers).reshape(len(turn), 3 * movers) for of in (turn, lever)]
-    return jnp.concatenate([*own, _arriving(paths), jnp.zeros((len(turn), 3))], 1)
+    legs = [(paths.interaction_leg == leg) & jnp.any(turn != 0, -1) for leg in range(MAX_ORDER)]  # a leg ends in one bend
+    here = jnp.stack(legs, 1)
+    bends = [jnp.sum(jnp.where(here[..., None], of[:, None], 0), 2) for of in (turn, lever)]
+    first = 3 * jnp.sum(jnp.where(here, mover[:, None], 0), 2)
+    shift = first[..., None] + jnp.arange(3)
+    receiver = jnp.broadcast_to(6 * movers + jnp.arange(3), (len(turn), 3))
+    number = jnp.stack([shift, shift + 3 * movers], 1).reshape(len(turn), 6 * MAX_ORDER)
+    derivative = jnp.stack(bends, 1).reshape(number.shape)
+    return jnp.concatenate([number, receiver], 1), jnp.concatenate([derivative, _arriving(paths)], 1)
 
 
 def length_gradient(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k places 3"]:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Complex, Float, Inexact, Int
 
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.fields.wave_channel import arrivals_at, element_gains
-from wbgs_jax.propagation.motion import Motion, length_jacobian
+from wbgs_jax.propagation.motion import Motion, length_jacobian, length_terms
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import FAINTEST, Arrivals
@@ -40,8 +40,6 @@ LONGEST_STEP = 0.1
 """In wavelengths of the highest frequency: beyond, phases are not linear."""
 ARM = 3.0
 """Metres from its centre at which a turn moves a surface as far as a shift."""
-TINY = 1e-7
-"""Metres or radians: added to standard deviations, for the sake of their factorisation."""
 
 
 def adjust(
@@ -72,14 +70,15 @@ def adjust(
     flat, back = ravel_pytree(motion)
     start = np.asarray(ravel_pytree(field.motion)[0], np.float64)
     moves, stiffness = np.asarray(flat, np.float64), 1 / np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
-    root = np.linalg.cholesky(covariance + TINY**2 * np.eye(len(moves)))
-    variance = length_variances(cache, jnp.asarray(root, jnp.float32), len(motion.shift), len(motion.receiver))
+    variance = length_variances(cache, jnp.asarray(covariance, jnp.float32), len(motion.shift))
     frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)
     for _ in range(ROUNDS):
-        some = jnp.asarray(rng.choice(pool, -(-min(count, len(pool)) // AT_ONCE) * AT_ONCE), jnp.int32)
+        blocks = -(-min(count, len(pool)) // AT_ONCE)
+        some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # of one shape, whatever the pool: compiled once
+        some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
         now = back(jnp.asarray(moves, jnp.float32))
-        equations = normal_equations(field, params, now, cache, data, some, variance)
+        equations = normal_equations(field, params, now, cache, data, jnp.asarray(some), variance, jnp.asarray(blocks))
         curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
         precision = curvature + np.diag(stiffness)
         step = np.linalg.solve(precision, pull - stiffness * (start + moves))
@@ -93,14 +92,17 @@ def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
     return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
 
 
-@partial(jax.jit, static_argnames=("movers", "receivers"))
-def length_variances(cache: Any, root: Float[Array, "p p"], movers: int, receivers: int) -> Float[Array, "pairs k"]:
-    """Returns the variances (square metres) of the lengths of all paths, from a square root of the covariance of the motion."""
+@partial(jax.jit, static_argnames="movers")
+def length_variances(cache: Any, covariance: Float[Array, "p p"], movers: int) -> Float[Array, "pairs k"]:
+    """Returns the variances (square metres) of the lengths of all paths, from the covariance of the motion."""
 
     def of_pair(pair: Any) -> Float[Array, " k"]:
         paths, receiver = pair
-        lengths = _among_all(_jacobian(cache, paths, movers), receiver, receivers)
-        return jnp.sum(jnp.matmul(lengths, root, precision=EXACT) ** 2, -1)
+        terms = [length_terms(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)]
+        number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
+        number = jnp.where(number < 6 * movers, number, number + 3 * receiver)
+        shared = covariance[number[:, :, None], number[:, None, :]]
+        return jnp.maximum(jnp.einsum("ki,kij,kj->k", derivative, shared, derivative, precision=EXACT), 0)
 
     variances: Float[Array, "pairs k"] = jax.lax.map(of_pair, (cache.paths, cache.receiver_index))
     return variances
@@ -125,10 +127,11 @@ def normal_equations(
     motion: Motion,
     cache: Any,
     data: TrainingData,
-    index: Int[Array, " n"],
+    index: Int[Array, "blocks b"],
     variance: Float[Array, "pairs k"],
+    blocks: Int[Array, ""],
 ) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
-    """Returns the matrix J^T W J and the vector J^T W r of some snapshots, a multiple of `AT_ONCE`: what is left of them is
+    """Returns the matrix J^T W J and the vector J^T W r of some snapshots, the first so many blocks: what is left of them is
     about r - J (a further motion), in units of its standard deviation."""
 
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
@@ -144,20 +147,21 @@ def normal_equations(
         voltages = element_voltages(arrived, plan.receiver, frequency)
         if plan.tuning is not None:
             voltages = voltages * element_gains(plan.tuning)
-        lengths = _jacobian(cache, paths, len(motion.shift)).astype(voltages.dtype)
-        changes = -1j * wavenumber * jnp.matmul(voltages.T, lengths, precision=EXACT)
+        parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
+        real, imaginary = jnp.split(jnp.matmul(parts.T, _jacobian(cache, paths, len(motion.shift)), precision=EXACT), 2)
+        changes = wavenumber * (imaginary - 1j * real)
         changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))
         changes = _among_all(changes, asked.receiver_index, len(motion.receiver))
         return _whitened(jnp.sum(voltages, 0), changes, batch.snapshots[0])
 
-    def add(total: Any, links: Int[Array, " b"]) -> tuple[Any, None]:
-        changes, left = jax.vmap(one)(links)
+    def add(block: Int[Array, ""], total: Any) -> Any:
+        changes, left = jax.vmap(one)(index[block])
         changes, left = changes.reshape(-1, changes.shape[-1]), left.reshape(-1)
         curvature = jnp.matmul(changes.T, changes, precision=EXACT)
-        return (total[0] + curvature, total[1] + jnp.matmul(changes.T, left, precision=EXACT)), None
+        return total[0] + curvature, total[1] + jnp.matmul(changes.T, left, precision=EXACT)
 
     size = ravel_pytree(motion)[0].size
-    total, _ = jax.lax.scan(add, (jnp.zeros((size, size)), jnp.zeros(size)), index.reshape(-1, AT_ONCE))
+    total: Any = jax.lax.fori_loop(0, blocks, add, (jnp.zeros((size, size)), jnp.zeros(size)))
     return total
 
 

@@ -5,8 +5,8 @@ frequencies come first, and each narrows it down for the next: every mover of th
 motion whose effect on phases is first-order (propagation/motion.py), found by least squares (`adjustment.py`) or, where there
 are no snapshots, by descent (`descent.py`); now and then things are moved and paths traced again. Materials are named as far as
 places are known by then, since powers tell where phases cannot, and by phases once places are found; then all is gone through
-once more. A prior keeps what no path sees where it was. What comes out is kept if it says training spectra surely better than
-the mesh as it was, each with as much doubt as suits it.
+once more, or twice where thicknesses are unknown. A prior keeps what no path sees where it was. What comes out is kept if it
+says training spectra surely better than the mesh as it was, each with as much doubt as suits it.
 """
 
 import dataclasses
@@ -38,11 +38,16 @@ SPREAD = 0.05
 prior says."""
 TRACED_AGAIN = 5.0
 """Ratio of frequencies after which surfaces are moved and paths traced again."""
+APART = 1.5
+"""Ratio of two frequencies up to which snapshots are looked at one after the other, at least, but for the highest."""
 TURN = 1e-3
 """Standard deviation (radians) of how far surfaces are turned."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
 """Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
 in common is easily taken for the receiver's; and free, where spectra are surely better for it."""
+MORE = 2
+"""Times that places are found again, with the materials that they told: where thicknesses are unknown, those follow places, and
+places thicknesses."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
@@ -147,9 +152,12 @@ def learn_geometry(
     now = _retraced(now, _fresh(now.params, place.params), data.links, data)
     now = all_heard.named(all_heard.guessed(now), 1)
     moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
-    if data.snapshots is not None:  # places are found better with the right materials; a third time finds no more
-        now = _followed(_traced(moved[-1].field, moved[-1].params, links, data), heard, links, receiver, named=False)
-        moved.append(all_heard.named(_retraced(now, now.params, data.links, data), 1, "snapshots"))
+    sized = bool(np.any(np.asarray(place.field.known_thickness) == 0))
+    again = 0 if data.snapshots is None else MORE if sized else 1
+    for _ in range(again):
+        now = _followed(moved[-1], all_heard, data.links, receiver, named=False)
+        now = _retraced(now, now.params, data.links, data)
+        moved.append(all_heard.named(now, 1, "snapshots", sized=sized))
     return _judged(place, moved, all_heard)
 
 
@@ -174,7 +182,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
-    for highest in np.unique(frequency):
+    for highest in _standing_apart(frequency):
         heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _traced(now.field.moved(motion), now.params, links, data), none
@@ -191,6 +199,15 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
             now = dataclasses.replace(now, params=params)
     known = covariance if data.snapshots is not None else None
     return Place(now.field.moved(motion), now.params, now.cache, known)
+
+
+def _standing_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
+    """Returns frequencies that are not much higher than the one before, ascending; the lowest and the highest are among them."""
+    lowest, *others = np.unique(frequency_hz).tolist()
+    found = [lowest]
+    for one in others:
+        found += [one] if one >= APART * found[-1] else []
+    return [*found[:-1], *sorted({found[-1], max([lowest, *others])})]
 
 
 def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Motion:
