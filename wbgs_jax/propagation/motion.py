@@ -72,8 +72,8 @@ def length_jacobian(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Arra
 
 
 def length_terms(paths: Paths, surfaces: Surfaces, movers: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
-    """Returns the numbers of a motion, as `ravel_pytree` orders them, that the lengths of K paths depend on, and the derivatives:
-    what is most of a `length_jacobian` is 0. A number may be there more than once; derivatives add."""
+    """Returns the numbers of a motion, as `ravel_pytree` orders them, that the lengths of K paths depend on, and the
+    derivatives: most of a `length_jacobian` is 0. A number may be there more than once; its derivatives add."""
     turn, mover = _turns(paths, surfaces)
     lever = jnp.cross(_arms(paths, surfaces, mover, movers), turn)
     legs = [(paths.interaction_leg == leg) & jnp.any(turn != 0, -1) for leg in range(MAX_ORDER)]  # a leg ends in one bend

@@ -202,7 +202,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
 
 
 def _standing_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
-    """Returns frequencies that are not much higher than the one before, ascending; the lowest and the highest are among them."""
+    """Returns frequencies of the data that stand apart, ascending; the lowest and the highest are among them."""
     lowest, *others = np.unique(frequency_hz).tolist()
     found = [lowest]
     for one in others:
