@@ -13,7 +13,7 @@ from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
-from wbgs_jax.training.geometry import GeometryReport, Place, learn_geometry
+from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
 from wbgs_jax.training.scores import make_scores
@@ -50,6 +50,12 @@ def learned(truth, parts, folder, receiver=RX):
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots, (receiver,))
     place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
+
+
+def test_frequencies_are_looked_at_where_they_stand_apart_and_the_highest_always():
+    of_data = np.array([94.0, 1.0, 2.4, 2.5, 5.0, 77.0, 60.0, 2.4]) * 1e9
+    np.testing.assert_allclose(frequencies_apart(of_data), np.array([1, 2.4, 5, 60, 94]) * 1e9)
+    assert frequencies_apart(np.full(3, 3e9)) == [3e9]
 
 
 @pytest.mark.heavy

@@ -182,7 +182,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
-    for highest in _standing_apart(frequency):
+    for highest in frequencies_apart(frequency):
         heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _traced(now.field.moved(motion), now.params, links, data), none
@@ -201,13 +201,13 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     return Place(now.field.moved(motion), now.params, now.cache, known)
 
 
-def _standing_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
+def frequencies_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
     """Returns frequencies of the data that stand apart, ascending; the lowest and the highest are among them."""
     lowest, *others = np.unique(frequency_hz).tolist()
-    found = [lowest]
+    found, highest = [lowest], max([lowest, *others])
     for one in others:
-        found += [one] if one >= APART * found[-1] else []
-    return [*found[:-1], *sorted({found[-1], max([lowest, *others])})]
+        found += [one] if one == highest or one >= APART * found[-1] else []
+    return found
 
 
 def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Motion:
