@@ -12,8 +12,9 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
-from wbgs_jax.propagation.motion import Motion, length_changes, length_jacobian
-from wbgs_jax.training.adjustment import adjust, length_variances, normal_equations
+from wbgs_jax.propagation.motion import Motion, length_changes, length_terms
+from wbgs_jax.training import adjustment
+from wbgs_jax.training.adjustment import adjust, adjusted_numbers, length_variances, normal_equations, places_of
 
 N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
 RECEIVERS = RX, (5.2, 2.9, 1.6)
@@ -70,11 +71,23 @@ def certain(run):
     return jnp.zeros((pairs, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
 
 
-def equations(run, motion, index, data=None):
+def everything(run):
+    return np.arange(ravel_pytree(run.field.motion)[0].size, dtype=np.int32)
+
+
+def variances(run, covariance, numbers, others):
+    place = places_of(numbers, len(others))
+    own = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
+    return np.asarray(length_variances(run.cache, *own, place, len(run.field.motion.shift)))
+
+
+def equations(run, motion, index, data=None, numbers=None):
     """Of eights of snapshots; the block after them is none of them."""
     blocks = jnp.concatenate([index.reshape(-1, 8), jnp.zeros((1, 8), index.dtype)])
     of = run.field, run.state.params, motion, run.cache, run.data if data is None else data
-    return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1))
+    every = everything(run) if numbers is None else numbers
+    place = places_of(every, ravel_pytree(motion)[0].size)
+    return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1), place, every)
 
 
 @pytest.mark.heavy
@@ -115,7 +128,7 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
     flat, back = ravel_pytree(run.field.motion)
     number, width = rng.integers(flat.size), 3e-3
     covariance = jnp.zeros((flat.size, flat.size)).at[number, number].set(width**2)
-    found = np.asarray(length_variances(run.cache, covariance, len(run.field.motion.shift)))
+    found = variances(run, covariance, everything(run), np.zeros(flat.size))
     motion = back(jnp.zeros_like(flat).at[number].set(width))
     for k, name in enumerate(("specular", "diffracted")):
         paths = getattr(run.cache.paths, name)
@@ -127,20 +140,49 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
         np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)
 
 
-def test_variances_of_lengths_know_what_places_share(run, rng):
-    """Any covariance: those of all lengths are J C J^T, written out."""
-    movers, size = len(run.field.motion.shift), ravel_pytree(run.field.motion)[0].size
-    root = rng.normal(0, 1e-3, (size, 5))
-    found = np.asarray(length_variances(run.cache, jnp.asarray(root @ root.T, jnp.float32), movers))
+@pytest.mark.parametrize("most", [3, 1000])
+def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch):
+    """Any covariance of what is adjusted, and any variances of the rest: those of all lengths are J C J^T, written out."""
+    monkeypatch.setattr(adjustment, "MOST", most)
+    numbers, movers = adjusted_numbers(run.cache, run.field.motion), len(run.field.motion.shift)
+    size = ravel_pytree(run.field.motion)[0].size
+    root, others = rng.normal(0, 1e-3, (len(numbers), 5)), rng.uniform(0, 1e-6, size)
+    others[numbers] = 0
+    found = variances(run, root @ root.T, numbers, others)
     for pair, receiver in enumerate(np.asarray(run.cache.receiver_index)):
         paths = jax.tree.map(lambda leaf, pair=pair: leaf[pair], run.cache.paths)
-        some = [length_jacobian(one, run.cache.surfaces, movers) for one in (paths.specular, paths.diffracted)]
-        own = np.concatenate([np.asarray(one, np.float64) for one in some])
-        jacobian = np.zeros((len(own), size))
-        jacobian[:, : 6 * movers], last = own[:, : 6 * movers], 6 * movers + 3 * int(receiver)
-        jacobian[:, last : last + 3] = own[:, 6 * movers : 6 * movers + 3]
-        alive = np.concatenate([np.asarray(paths.specular.alive), np.asarray(paths.diffracted.alive)])
-        np.testing.assert_allclose(found[pair][alive], ((jacobian @ root) ** 2).sum(1)[alive], rtol=1e-3, atol=1e-9)
+        expected, alive = [], np.concatenate([np.asarray(paths.specular.alive), np.asarray(paths.diffracted.alive)])
+        for some in (paths.specular, paths.diffracted):
+            number, derivative = (np.asarray(a) for a in length_terms(some, run.cache.surfaces, movers))
+            number = np.where(number < 6 * movers, number, number + 3 * int(receiver))
+            jacobian = np.zeros((len(number), size))
+            np.add.at(jacobian, (np.arange(len(number))[:, None], number), derivative)
+            expected.append(((jacobian[:, numbers] @ root) ** 2).sum(1) + jacobian**2 @ others)
+        np.testing.assert_allclose(found[pair][alive], np.concatenate(expected)[alive], rtol=1e-3, atol=1e-9)
+
+
+def test_the_movers_that_most_paths_meet_are_adjusted(run, monkeypatch):
+    """All of them where there are few; every receiver in any case."""
+    np.testing.assert_array_equal(adjusted_numbers(run.cache, run.field.motion), everything(run))
+    monkeypatch.setattr(adjustment, "MOST", 2)
+    movers, meets = len(run.field.motion.shift), np.zeros(len(run.field.motion.shift))
+    for some in (run.cache.paths.specular, run.cache.paths.diffracted):
+        number, derivative = jax.vmap(lambda paths: length_terms(paths, run.cache.surfaces, movers))(some)
+        shifts = np.asarray(some.alive)[..., None] & (np.asarray(number) < 3 * movers)
+        np.add.at(meets, np.asarray(number)[shifts] // 3, np.asarray(derivative)[shifts] ** 2)
+    chosen = np.sort(np.argsort(-meets)[:2])
+    shifts = np.concatenate([3 * m + np.arange(3) for m in chosen])
+    expected = np.concatenate([shifts, 3 * movers + shifts, everything(run)[6 * movers :]])
+    np.testing.assert_array_equal(adjusted_numbers(run.cache, run.field.motion), expected)
+
+
+@pytest.mark.heavy
+def test_fewer_numbers_have_the_rows_and_columns_of_all(run, rng):
+    motion, (index, *_), every = drawn(rng, run, 0.2), parts_of(run, 8), everything(run)
+    some = np.sort(rng.choice(every, len(every) // 2, replace=False))
+    (matrix, vector), (own, its) = equations(run, motion, index), equations(run, motion, index, numbers=some)
+    np.testing.assert_allclose(own, np.asarray(matrix)[np.ix_(some, some)], atol=1e-5 * np.abs(matrix).max())
+    np.testing.assert_allclose(its, np.asarray(vector)[some], atol=1e-4 * np.abs(vector).max())
 
 
 @pytest.mark.heavy
@@ -155,7 +197,7 @@ def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
     prior = np.asarray(ravel_pytree(widths)[0], float) ** 2
     found, covariance, frequency = still, np.diag(prior), np.asarray(links.query.frequency_hz)
     for highest in FREQUENCIES:
-        pool, known = np.flatnonzero(frequency <= highest), (found, covariance, widths)
+        pool, known = np.flatnonzero(frequency <= highest), (found, covariance, widths, everything(run))
         found, covariance = adjust(run.field, run.state.params, run.cache, *known, data, pool, 64, rng)
     before, after = (
         float(jnp.mean(log_decorrelation(snapshots(ravel_pytree(m)[0], tree, links), heard))) for m in (still, found)

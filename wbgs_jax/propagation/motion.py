@@ -64,16 +64,9 @@ def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Ar
     return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(_arriving(paths), motion.receiver, precision=EXACT)
 
 
-def length_jacobian(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k numbers"]:
-    """Returns the derivative of `length_changes` with respect to all numbers of its motion, as `ravel_pytree` orders them."""
-    number, derivative = length_terms(paths, surfaces, movers)
-    none = jnp.zeros((len(number), 6 * movers + 6))
-    return none.at[jnp.arange(len(number))[:, None], number].add(derivative)
-
-
 def length_terms(paths: Paths, surfaces: Surfaces, movers: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
-    """Returns the numbers of a motion, as `ravel_pytree` orders them, that the lengths of K paths depend on, and the
-    derivatives: most of a `length_jacobian` is 0. A number may be there more than once; its derivatives add."""
+    """Returns the numbers of a motion (of one receiver), as `ravel_pytree` orders them, that the lengths of K paths depend on,
+    and the derivatives of `length_changes` with respect to them. A number may be there twice; its derivatives add."""
     turn, mover = _turns(paths, surfaces)
     lever = jnp.cross(_arms(paths, surfaces, mover, movers), turn)
     legs = [(paths.interaction_leg == leg) & jnp.any(turn != 0, -1) for leg in range(MAX_ORDER)]  # a leg ends in one bend

@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float, Inexact, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.fields.wave_channel import arrivals_at, element_gains
-from wbgs_jax.propagation.motion import Motion, length_jacobian, length_terms
+from wbgs_jax.propagation.motion import Motion, length_terms
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import FAINTEST, Arrivals
@@ -38,6 +38,9 @@ ALIKE = 30.0
 whose error is its own."""
 LONGEST_STEP = 0.1
 """In wavelengths of the highest frequency: beyond, phases are not linear."""
+MOST = 256
+"""Movers that are adjusted, at most: a step costs the square of their number. Others stay, and are believed as far as the prior
+says."""
 ARM = 3.0
 """Metres from its centre at which a turn moves a surface as far as a shift."""
 
@@ -47,43 +50,64 @@ def adjust(
     params: Any,
     cache: Any,
     motion: Motion,
-    covariance: Float[np.ndarray, "p p"],
+    covariance: Float[np.ndarray, "q q"],
     widths: Motion,
+    numbers: Int[np.ndarray, " q"],
     data: TrainingData,
     pool: Int[np.ndarray, " n"],
     count: int,
     rng: np.random.Generator,
-) -> tuple[Motion, Float[np.ndarray, "p p"]]:
+) -> tuple[Motion, Float[np.ndarray, "q q"]]:
     """Returns the motion by which snapshots up to some frequency are explained best, and its covariance.
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
         cache: paths of the links of the pool.
         motion: the one to start with, of all receivers.
-        covariance: of all of its numbers (as `ravel_pytree` orders them) by lower frequencies, or by the prior.
+        covariance: of the numbers that are adjusted, by lower frequencies, or by the prior.
         widths: standard deviations of the prior of the whole motion, that of the field included.
+        numbers: those of the motion that are adjusted (`adjusted_numbers`).
         data: with snapshots.
         pool: links, up to the highest frequency that counts.
         count: snapshots that a step looks at, drawn anew for each.
         rng: draws them.
     """
     flat, back = ravel_pytree(motion)
-    start = np.asarray(ravel_pytree(field.motion)[0], np.float64)
-    moves, stiffness = np.asarray(flat, np.float64), 1 / np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
-    variance = length_variances(cache, jnp.asarray(covariance, jnp.float32), len(motion.shift))
+    start, moves = np.asarray(ravel_pytree(field.motion)[0], np.float64)[numbers], np.array(flat, np.float64)
+    width, place = np.asarray(ravel_pytree(widths)[0], np.float64), places_of(numbers, flat.size)
+    stiffness = 1 / width[numbers] ** 2
+    others = np.where(place < len(numbers), 0, width**2).astype(np.float32)
+    variance = length_variances(cache, jnp.asarray(covariance, jnp.float32), others, place, len(motion.shift))
     frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
-    furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)
+    furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
     for _ in range(ROUNDS):
         blocks = -(-min(count, len(pool)) // AT_ONCE)
         some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # of one shape, whatever the pool: compiled once
         some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
         now = back(jnp.asarray(moves, jnp.float32))
-        equations = normal_equations(field, params, now, cache, data, jnp.asarray(some), variance, jnp.asarray(blocks))
+        equations = normal_equations(field, params, now, cache, data, some, variance, np.int32(blocks), place, numbers)
         curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
         precision = curvature + np.diag(stiffness)
-        step = np.linalg.solve(precision, pull - stiffness * (start + moves))
-        moves = moves + np.clip(step, -furthest, furthest)
+        step = np.linalg.solve(precision, pull - stiffness * (start + moves[numbers]))
+        moves[numbers] += np.clip(step, -furthest, furthest)
     return back(jnp.asarray(moves, jnp.float32)), np.linalg.inv(precision)
+
+
+def adjusted_numbers(cache: Any, motion: Motion) -> Int[np.ndarray, " q"]:
+    """Returns which numbers of a motion are adjusted, as `ravel_pytree` orders them: those of all receivers, and those of the
+    movers that change the lengths of paths most, at most `MOST` of these."""
+    movers, size = len(motion.shift), ravel_pytree(motion)[0].size
+    felt = np.asarray(_felt(cache, movers, size))[: 3 * movers].reshape(movers, 3).sum(1)
+    chosen = np.sort(np.argsort(-felt, kind="stable")[:MOST])
+    shifts = (3 * chosen[:, None] + np.arange(3)).reshape(-1)
+    return np.concatenate([shifts, 3 * movers + shifts, np.arange(6 * movers, size)]).astype(np.int32)
+
+
+def places_of(numbers: Int[np.ndarray, " q"], size: int) -> Int[np.ndarray, " p"]:
+    """Returns the place of every number of a motion among those that are adjusted; their count for the others."""
+    place = np.full(size, len(numbers), np.int32)
+    place[numbers] = np.arange(len(numbers))
+    return place
 
 
 def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
@@ -92,32 +116,50 @@ def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
     return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
 
 
+@partial(jax.jit, static_argnames=("movers", "size"))
+def _felt(cache: Any, movers: int, size: int) -> Float[Array, " p"]:
+    """Returns how strongly the lengths of all paths together depend on every number of a motion."""
+
+    def add(total: Float[Array, " p"], pair: Any) -> tuple[Float[Array, " p"], None]:
+        paths, receiver = pair
+        number, derivative = _terms(cache, paths, receiver, movers)
+        alive = jnp.concatenate([paths.specular.alive, paths.diffracted.alive])
+        return total.at[number].add(jnp.where(alive[:, None], derivative**2, 0)), None
+
+    return jax.lax.scan(add, jnp.zeros(size), (cache.paths, cache.receiver_index))[0]
+
+
 @partial(jax.jit, static_argnames="movers")
-def length_variances(cache: Any, covariance: Float[Array, "p p"], movers: int) -> Float[Array, "pairs k"]:
-    """Returns the variances (square metres) of the lengths of all paths, from the covariance of the motion."""
+def length_variances(
+    cache: Any, covariance: Float[Array, "q q"], others: Float[Array, " p"], place: Int[Array, " p"], movers: int
+) -> Float[Array, "pairs k"]:
+    """Returns the variances (square metres) of the lengths of all paths.
+
+    Args:
+        cache: of the paths.
+        covariance: of the numbers of the motion that are adjusted.
+        others: variances of those that are not; 0 for the rest.
+        place: of every number among the adjusted ones (`places_of`).
+        movers: of the motion.
+    """
+    shared = jnp.pad(covariance, (0, 1))
 
     def of_pair(pair: Any) -> Float[Array, " k"]:
         paths, receiver = pair
-        terms = [length_terms(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)]
-        number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
-        number = jnp.where(number < 6 * movers, number, number + 3 * receiver)
-        shared = covariance[number[:, :, None], number[:, None, :]]
-        return jnp.maximum(jnp.einsum("ki,kij,kj->k", derivative, shared, derivative, precision=EXACT), 0)
+        number, derivative = _terms(cache, paths, receiver, movers)
+        own = place[number]
+        known = jnp.einsum("ki,kij,kj->k", derivative, shared[own[:, :, None], own[:, None, :]], derivative, precision=EXACT)
+        return jnp.maximum(known, 0) + jnp.sum(derivative**2 * others[number], -1)
 
     variances: Float[Array, "pairs k"] = jax.lax.map(of_pair, (cache.paths, cache.receiver_index))
     return variances
 
 
-def _jacobian(cache: Any, paths: Any, movers: int) -> Float[Array, "k numbers"]:
-    return jnp.concatenate([length_jacobian(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)])
-
-
-def _among_all(own: Inexact[Array, "k numbers"], receiver: Int[Array, ""], receivers: int) -> Inexact[Array, "k p"]:
-    """Returns the derivative with respect to a motion of all receivers, from that of one of them: the others' are 0."""
-    places, shift, turn = own[:, :-6], own[:, -6:-3], own[:, -3:]
-    none = jnp.zeros((len(own), receivers, 3), own.dtype)
-    ends = [none.at[:, receiver].set(one).reshape(len(own), 3 * receivers) for one in (shift, turn)]
-    return jnp.concatenate([places, *ends], 1)
+def _terms(cache: Any, paths: Any, receiver: Int[Array, ""], movers: int) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
+    """Returns the numbers of a motion of all receivers that all paths to one of them depend on, and the derivatives."""
+    terms = [length_terms(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)]
+    number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
+    return jnp.where(number < 6 * movers, number, number + 3 * receiver), derivative
 
 
 @jax.jit
@@ -130,9 +172,12 @@ def normal_equations(
     index: Int[Array, "blocks b"],
     variance: Float[Array, "pairs k"],
     blocks: Int[Array, ""],
-) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
+    place: Int[Array, " p"],
+    numbers: Int[Array, " q"],
+) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
     """Returns the matrix J^T W J and the vector J^T W r of some snapshots, the first so many blocks: what is left of them is
-    about r - J (a further motion), in units of its standard deviation."""
+    about r - J (a further motion), in units of its standard deviation. J has the columns of the numbers that are adjusted."""
+    movers, receivers, q = len(motion.shift), len(motion.receiver), len(numbers)
 
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))
@@ -147,11 +192,13 @@ def normal_equations(
         voltages = element_voltages(arrived, plan.receiver, frequency)
         if plan.tuning is not None:
             voltages = voltages * element_gains(plan.tuning)
+        number, derivative = _terms(cache, paths, asked.receiver_index, movers)
+        lengths = jnp.zeros((len(number), q + 1)).at[jnp.arange(len(number))[:, None], place[number]].add(derivative)
         parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
-        real, imaginary = jnp.split(jnp.matmul(parts.T, _jacobian(cache, paths, len(motion.shift)), precision=EXACT), 2)
-        changes = wavenumber * (imaginary - 1j * real)
-        changes = changes.at[:, -3:].add(_turned(voltages, arrived, plan.receiver, frequency))
-        changes = _among_all(changes, asked.receiver_index, len(motion.receiver))
+        real, imaginary = jnp.split(jnp.matmul(parts.T, lengths[:, :q], precision=EXACT), 2)
+        turns = place[6 * movers + 3 * receivers + 3 * asked.receiver_index + jnp.arange(3)]
+        turned = _turned(voltages, arrived, plan.receiver, frequency)
+        changes = (wavenumber * (imaginary - 1j * real)).at[:, turns].add(turned)
         return _whitened(jnp.sum(voltages, 0), changes, batch.snapshots[0])
 
     def add(block: Int[Array, ""], total: Any) -> Any:
@@ -160,8 +207,7 @@ def normal_equations(
         curvature = jnp.matmul(changes.T, changes, precision=EXACT)
         return total[0] + curvature, total[1] + jnp.matmul(changes.T, left, precision=EXACT)
 
-    size = ravel_pytree(motion)[0].size
-    total: Any = jax.lax.fori_loop(0, blocks, add, (jnp.zeros((size, size)), jnp.zeros(size)))
+    total: Any = jax.lax.fori_loop(0, blocks, add, (jnp.zeros((q, q)), jnp.zeros(q)))
     return total
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.propagation.motion import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.training.adjustment import adjust
+from wbgs_jax.training.adjustment import adjust, adjusted_numbers
 from wbgs_jax.training.controls import Say, silent
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.descent import descend
@@ -85,8 +85,8 @@ class Place:
     """A field that can be `moved`."""
     params: Any
     cache: Any
-    covariance: Float[np.ndarray, "p p"] | None = None
-    """Of the motion that led there, as `ravel_pytree` orders its numbers; None where it is not known."""
+    known: Float[np.ndarray, "m 3 3"] | None = None
+    """Covariances of where the movers stand (square metres); None where they are not known."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,8 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
-    covariance = np.diag(np.asarray(ravel_pytree(widths)[0], np.float64) ** 2)
+    variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.cache, none)
+    covariance = np.diag(variances[numbers])
     for highest in frequencies_apart(frequency):
         heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
@@ -192,12 +193,12 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
         pool = heard.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, before = config.geometry_snapshots, (motion, covariance, widths)
-            motion, covariance = adjust(now.field, now.params, now.cache, *before, data, pool, count, heard.rng)
+            motion, covariance = adjust(now.field, now.params, now.cache, *before, numbers, data, pool, count, heard.rng)
         else:
             count = config.geometry_steps
             params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
             now = dataclasses.replace(now, params=params)
-    known = covariance if data.snapshots is not None else None
+    known = _known(covariance, numbers, variances, len(none.shift)) if data.snapshots is not None else None
     return Place(now.field.moved(motion), now.params, now.cache, known)
 
 
@@ -223,7 +224,7 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
     best = int(np.argmin([own.mean() for own in after]))
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
-    sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.covariance)
+    sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.known)
     report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes, bodies=bodies)
     return chosen if kept else as_it_was, report
 
@@ -240,20 +241,30 @@ def _sizes(motion: Motion) -> dict[str, float]:
     }
 
 
-def _bodies(motion: Motion, covariance: Float[np.ndarray, "p p"] | None) -> list[dict[str, float]]:
-    """Returns how far every mover was shifted, and how well it is known where it stands."""
-    if covariance is None:
-        return []
-    shifts, found = 1e3 * np.linalg.norm(np.asarray(motion.shift), axis=-1), []
-    for mover, shift in enumerate(shifts.tolist()):
-        own = slice(3 * mover, 3 * mover + 3)  # shifts come first
-        best, _, least = 1e3 * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance[own, own]), 0))
-        found.append({"shift_mm": round(shift, 3), "best_known_mm": round(best, 3), "least_known_mm": round(least, 3)})
+def _known(
+    covariance: Float[np.ndarray, "q q"], numbers: Int[np.ndarray, " q"], variances: Float[np.ndarray, " p"], movers: int
+) -> Float[np.ndarray, "m 3 3"]:
+    """Returns the covariances of the shifts of all movers: of those that were adjusted as known by now, of others the prior."""
+    found = variances[: 3 * movers].reshape(movers, 3)[:, None] * np.eye(3)
+    for first in range(0, int(np.sum(numbers < 3 * movers)), 3):  # shifts come first, three numbers a mover
+        own = slice(first, first + 3)
+        found[numbers[first] // 3] = covariance[own, own]
     return found
 
 
+def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[dict[str, float]]:
+    """Returns how far every mover was shifted, and how well it is known where it stands."""
+    if known is None:
+        return []
+    shifts = 1e3 * np.linalg.norm(np.asarray(motion.shift), axis=-1)
+    off = 1e3 * np.sqrt(np.maximum(np.linalg.eigvalsh(known), 0))
+    names = "shift_mm", "best_known_mm", "least_known_mm"
+    rows = np.round(np.stack([shifts, off[:, 0], off[:, 2]], -1), 3).tolist()
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
 def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
-    return dataclasses.replace(_traced(now.field, params, links, data), covariance=now.covariance)
+    return dataclasses.replace(_traced(now.field, params, links, data), known=now.known)
 
 
 def _traced(field: Any, params: Any, links: Links, data: TrainingData) -> Place:
