@@ -14,7 +14,7 @@ from wave_runs import PARTS, RX, places, run_in
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
 from wbgs_jax.propagation.motion import Motion, length_changes, length_terms
 from wbgs_jax.training import adjustment
-from wbgs_jax.training.adjustment import adjust, adjusted_numbers, length_variances, normal_equations, places_of
+from wbgs_jax.training.adjustment import adjust, adjusted_numbers, length_variances, normal_equations
 
 N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
 RECEIVERS = RX, (5.2, 2.9, 1.6)
@@ -76,9 +76,8 @@ def everything(run):
 
 
 def variances(run, covariance, numbers, others):
-    place = places_of(numbers, len(others))
     own = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
-    return np.asarray(length_variances(run.cache, *own, place, len(run.field.motion.shift)))
+    return np.asarray(length_variances(run.cache, *own, numbers, len(run.field.motion.shift)))
 
 
 def equations(run, motion, index, data=None, numbers=None):
@@ -86,8 +85,7 @@ def equations(run, motion, index, data=None, numbers=None):
     blocks = jnp.concatenate([index.reshape(-1, 8), jnp.zeros((1, 8), index.dtype)])
     of = run.field, run.state.params, motion, run.cache, run.data if data is None else data
     every = everything(run) if numbers is None else numbers
-    place = places_of(every, ravel_pytree(motion)[0].size)
-    return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1), place, every)
+    return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1), every)
 
 
 @pytest.mark.heavy

@@ -74,10 +74,10 @@ def adjust(
     """
     flat, back = ravel_pytree(motion)
     start, moves = np.asarray(ravel_pytree(field.motion)[0], np.float64)[numbers], np.array(flat, np.float64)
-    width, place = np.asarray(ravel_pytree(widths)[0], np.float64), places_of(numbers, flat.size)
-    stiffness = 1 / width[numbers] ** 2
-    others = np.where(place < len(numbers), 0, width**2).astype(np.float32)
-    variance = length_variances(cache, jnp.asarray(covariance, jnp.float32), others, place, len(motion.shift))
+    others = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
+    stiffness, others[numbers] = 1 / others[numbers], 0
+    known = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
+    variance = length_variances(cache, *known, numbers, len(motion.shift))
     frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
     for _ in range(ROUNDS):
@@ -85,7 +85,7 @@ def adjust(
         some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # of one shape, whatever the pool: compiled once
         some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
         now = back(jnp.asarray(moves, jnp.float32))
-        equations = normal_equations(field, params, now, cache, data, some, variance, np.int32(blocks), place, numbers)
+        equations = normal_equations(field, params, now, cache, data, some, variance, np.int32(blocks), numbers)
         curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
         precision = curvature + np.diag(stiffness)
         step = np.linalg.solve(precision, pull - stiffness * (start + moves[numbers]))
@@ -97,17 +97,17 @@ def adjusted_numbers(cache: Any, motion: Motion) -> Int[np.ndarray, " q"]:
     """Returns which numbers of a motion are adjusted, as `ravel_pytree` orders them: those of all receivers, and those of the
     movers that change the lengths of paths most, at most `MOST` of these."""
     movers, size = len(motion.shift), ravel_pytree(motion)[0].size
+    if movers <= MOST:
+        return np.arange(size, dtype=np.int32)
     felt = np.asarray(_felt(cache, movers, size))[: 3 * movers].reshape(movers, 3).sum(1)
     chosen = np.sort(np.argsort(-felt, kind="stable")[:MOST])
     shifts = (3 * chosen[:, None] + np.arange(3)).reshape(-1)
     return np.concatenate([shifts, 3 * movers + shifts, np.arange(6 * movers, size)]).astype(np.int32)
 
 
-def places_of(numbers: Int[np.ndarray, " q"], size: int) -> Int[np.ndarray, " p"]:
+def _places(numbers: Int[Array, " q"], size: int) -> Int[Array, " p"]:
     """Returns the place of every number of a motion among those that are adjusted; their count for the others."""
-    place = np.full(size, len(numbers), np.int32)
-    place[numbers] = np.arange(len(numbers))
-    return place
+    return jnp.full(size, len(numbers)).at[numbers].set(jnp.arange(len(numbers)))
 
 
 def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
@@ -131,7 +131,7 @@ def _felt(cache: Any, movers: int, size: int) -> Float[Array, " p"]:
 
 @partial(jax.jit, static_argnames="movers")
 def length_variances(
-    cache: Any, covariance: Float[Array, "q q"], others: Float[Array, " p"], place: Int[Array, " p"], movers: int
+    cache: Any, covariance: Float[Array, "q q"], others: Float[Array, " p"], numbers: Int[Array, " q"], movers: int
 ) -> Float[Array, "pairs k"]:
     """Returns the variances (square metres) of the lengths of all paths.
 
@@ -139,10 +139,10 @@ def length_variances(
         cache: of the paths.
         covariance: of the numbers of the motion that are adjusted.
         others: variances of those that are not; 0 for the rest.
-        place: of every number among the adjusted ones (`places_of`).
+        numbers: those that are adjusted.
         movers: of the motion.
     """
-    shared = jnp.pad(covariance, (0, 1))
+    shared, place = jnp.pad(covariance, (0, 1)), _places(numbers, len(others))
 
     def of_pair(pair: Any) -> Float[Array, " k"]:
         paths, receiver = pair
@@ -172,12 +172,12 @@ def normal_equations(
     index: Int[Array, "blocks b"],
     variance: Float[Array, "pairs k"],
     blocks: Int[Array, ""],
-    place: Int[Array, " p"],
     numbers: Int[Array, " q"],
 ) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
     """Returns the matrix J^T W J and the vector J^T W r of some snapshots, the first so many blocks: what is left of them is
     about r - J (a further motion), in units of its standard deviation. J has the columns of the numbers that are adjusted."""
     movers, receivers, q = len(motion.shift), len(motion.receiver), len(numbers)
+    place = _places(numbers, ravel_pytree(motion)[0].size)
 
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))

@@ -152,12 +152,12 @@ def learn_geometry(
     now = _retraced(now, _fresh(now.params, place.params), data.links, data)
     now = all_heard.named(all_heard.guessed(now), 1)
     moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
-    sized = bool(np.any(np.asarray(place.field.known_thickness) == 0))
-    again = 0 if data.snapshots is None else MORE if sized else 1
+    unknown = bool(np.any(np.asarray(place.field.known_thickness) == 0))
+    again = 0 if data.snapshots is None else MORE if unknown else 1
     for _ in range(again):
         now = _followed(moved[-1], all_heard, data.links, receiver, named=False)
         now = _retraced(now, now.params, data.links, data)
-        moved.append(all_heard.named(now, 1, "snapshots", sized=sized))
+        moved.append(all_heard.named(now, 1, "snapshots", sized=True))
     return _judged(place, moved, all_heard)
 
 
