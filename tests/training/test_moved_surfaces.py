@@ -13,6 +13,7 @@ from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
+from wbgs_jax.training.antennas import antenna_candidates
 from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
@@ -40,14 +41,21 @@ def truth(tmp_path_factory):
         slope=jnp.full(len(PARTS), d),
     )
     params = dataclasses.replace(run.state.params, materials=materials)
+    return heard_in(run, params), params
+
+
+def heard_in(run, params):
+    """Snapshots of all places."""
     query = make_query(np.repeat(PLACES, len(FREQUENCIES), 0), np.tile(FREQUENCIES, N_TX))
     heard = jax.jit(wave.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
-    return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16), params
+    return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16)
 
 
-def learned(truth, parts, folder, receiver=RX):
+def learned(truth, parts, folder, receiver=RX, found=None):
+    """With an antenna that was found for the transmitters, if there is one."""
     snapshots, params = truth
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots, (receiver,))
+    params = dataclasses.replace(params, transmitter=found) if found else params
     place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
 
@@ -100,6 +108,21 @@ def test_a_receiver_comes_back(truth, tmp_path, rng):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("right", [False, True])
+def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_heard(truth, right, tmp_path, rng):
+    found = antenna_candidates()["tr38901 along +z towards -x"]
+    exact = run_in(PARTS, SETTINGS, tmp_path / "exact", PLACES, FREQUENCIES)
+    heard, params = truth
+    if right:
+        params = dataclasses.replace(params, transmitter=found)
+        heard = heard_in(exact, params)
+    (place, report), _ = learned((heard, params), shifted(PARTS, 0.006, rng), tmp_path / "shifted", found=found)
+    expected = found if right else exact.field.init(jax.random.key(0)).transmitter
+    assert report.kept and report.antennas_kept == right
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, place.params.transmitter, expected)))
+
+
+@pytest.mark.heavy
 def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_path, rng):
     """To first order: surfaces, both ends and the receiver's turn, at a frequency at which that is enough."""
     heard, params = truth
@@ -144,7 +167,7 @@ def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0])
     still = run.field.motion
     moved = run.field.moved(dataclasses.replace(still, shift=still.shift + 1e-3))
-    report = GeometryReport(-1.0, -2.0, True, 1.0, 1.0, 0.0, 0.0, 0.0)
+    report = GeometryReport(-1.0, -2.0, True, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(search, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
     run.controls = (search.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
     run.control()
@@ -174,7 +197,7 @@ def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, hig
 @pytest.mark.parametrize("metres", [0.0, 0.01])
 def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_it(truth, metres, tmp_path, rng, monkeypatch):
     run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []
-    report = GeometryReport(-1.0, -1.0, False, 1.0, 1.0, 0.0, 0.0, 0.0)
+    report = GeometryReport(-1.0, -1.0, False, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(search, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
     run.controls = (search.Search(SETTINGS.search),)
     run.control()

@@ -62,6 +62,8 @@ class GeometryReport:
     """... and with things moved."""
     kept: bool
     """Whether they stay there."""
+    antennas_kept: bool
+    """Whether the antennas are those that were found before anything was moved."""
     typical_mm: float
     """Root mean square of the shifts of movers, along all axes together ..."""
     largest_mm: float
@@ -120,6 +122,12 @@ class _Heard:
         params, _ = search_placement(now.params, self.told(now).scores(self.config.placement_spectra, compared))
         return dataclasses.replace(now, params=params)
 
+    def surprised(self, now: Place) -> float:
+        """Returns how badly some spectra are explained, as far as places are known."""
+        count = self.config.spectra
+        told = Told(now.field, now.cache, self.data, self.spectra[:: max(1, len(self.spectra) // count)])
+        return float(told.scores(count, "covariances")([now.params])[0].mean())
+
     def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
         """Returns places, each with as much doubt as suits it, the scores of some spectra at each, and their transmitters."""
         spectra = self.rng.choice(self.spectra, min(self.config.spectra, len(self.spectra)), replace=False)
@@ -143,8 +151,7 @@ def learn_geometry(
     own = train[np.isin(tx[train], some_tx)]
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
     heard, all_heard = _Heard(data, own, config, rng, say), _Heard(data, train, config, rng, say)
-    alike = dataclasses.replace(place.params, materials=place.field.init(jax.random.key(0)).materials)
-    start = heard.named(_doubted(_traced(place.field, alike, links, data), config.geometry_width), config.rounds, sized=True)
+    start = _begun(place, heard, links)
     now, receiver = _followed(start, heard, links, HELD_RECEIVER, named=True), HELD_RECEIVER
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
@@ -159,6 +166,24 @@ def learn_geometry(
         now = _retraced(now, now.params, data.links, data)
         moved.append(all_heard.named(now, 1, "snapshots", sized=True))
     return _judged(place, moved, all_heard)
+
+
+def _begun(place: Place, heard: _Heard, links: Links) -> Place:
+    """Returns the field with surfaces doubted and materials named anew, as far as places are known.
+
+    Where phases are wrong, a wrong antenna can explain them best, and materials then make up for it. So antennas that were
+    found have to explain spectra better than those of before, each with materials of its own.
+    """
+    new = place.field.init(jax.random.key(0))
+    alike = dataclasses.replace(place.params, materials=new.materials)
+    first = _doubted(_traced(place.field, alike, links, heard.data), heard.config.geometry_width)
+    before = dataclasses.replace(first.params, transmitter=new.transmitter, element=new.element)
+    begins = [first] if _equal(first.params, before) else [first, dataclasses.replace(first, params=before)]
+    return min((heard.named(one, heard.config.rounds, sized=True) for one in begins), key=heard.surprised)
+
+
+def _equal(params: Any, others: Any) -> bool:
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, params, others)))
 
 
 def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
@@ -225,7 +250,9 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
     sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.known)
-    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, **sizes, bodies=bodies)
+    antennas = [(p.params.transmitter, p.params.element) for p in (as_it_was, chosen)]
+    same = not kept or _equal(*antennas)
+    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, same, **sizes, bodies=bodies)
     return chosen if kept else as_it_was, report
 
 
@@ -279,5 +306,6 @@ def _doubted(now: Place, spread: float) -> Place:
 
 
 def _fresh(learned: Any, initial: Any) -> Any:
-    """Returns parameters as they were before, but for the materials and how far places are believed."""
-    return dataclasses.replace(initial, materials=learned.materials, placement=learned.placement)
+    """Returns parameters as they were before, but for materials, antennas and how far places are believed."""
+    known = {name: getattr(learned, name) for name in ("materials", "transmitter", "element", "placement")}
+    return dataclasses.replace(initial, **known)
