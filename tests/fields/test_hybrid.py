@@ -1,4 +1,4 @@
-"""The hybrid field: a mixture of its two fields, whose share is found on links that trained neither."""
+"""The hybrid field: a mixture of three opinions of its two fields, whose shares are found on links that trained neither."""
 
 import dataclasses
 
@@ -11,8 +11,8 @@ from synthetic import tiny_dataset, tiny_settings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field
-from wbgs_jax.fields.hybrid import HybridField, Trust
-from wbgs_jax.fields.trust import constant
+from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
+from wbgs_jax.fields.trust import Shares, constant
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
@@ -34,28 +34,33 @@ def run(dataset, tmp_path_factory):
 
 
 def trusting(params, spectra, power):
-    return dataclasses.replace(params, trust=Trust(constant(spectra), constant(power)))
+    """Each given as the share of the coherent field over the splatting one's own opinion, and of both over the informed one."""
+    return dataclasses.replace(params, trust=Trust(*(Shares(*map(constant, pair)) for pair in (spectra, power))))
 
 
-def parts(run, params, index):
-    """What the coherent field says, and the splatting one that sees it."""
+def opinions(run, params, index):
+    """What the coherent field says, the splatting one by itself, and the splatting one that sees the coherent one."""
     field, dataset = run.field, run.dataset
     wave = observe_links(field.wave, params.wave, dataset, index)
-    plan = field.wideband.plan(params.wideband, dataset.receiver())
-    return wave, field.wideband.render(params.wideband, plan, dataset.query(index), jnp.asarray(wave.pas))
+    plan, given = field.wideband.plan(params.wideband, dataset.receiver()), jnp.asarray(wave.pas)
+    return wave, *(field.wideband.render(params.wideband, plan, dataset.query(index), g) for g in (0 * given, given))
+
+
+def mixture(shares, one, other, third):
+    first, both = np.clip(shares, 1e-3, 1 - 1e-3)
+    return both * (first * one + (1 - first) * other) + (1 - both) * third
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.3, 0.8), (1.0, 1.0)])
+@pytest.mark.parametrize("shares", [((0.0, 0.4), (0.2, 0.0)), ((0.3, 0.6), (0.8, 1.0)), ((1.0, 1.0), (1.0, 0.5))])
 def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
     params, index = trusting(run.state.params, *shares), run.dataset.validation
     seen = observe_links(run.field, params, run.dataset, index)
-    wave, wideband = parts(run, params, index)
-    spectra, power = np.clip(shares, 1e-3, 1 - 1e-3)
+    said = opinions(run, params, index)
     # Roots of small powers, in single precision.
-    np.testing.assert_allclose(seen.pas, spectra * wave.pas + (1 - spectra) * wideband.pas, atol=3e-4)
-    np.testing.assert_allclose(seen.power_db, power * wave.power_db + (1 - power) * wideband.power_db, atol=1e-2)
-    np.testing.assert_allclose(seen.snapshots, wave.snapshots, rtol=1e-4, atol=1e-7)  # two programs
+    np.testing.assert_allclose(seen.pas, mixture(shares[0], *(one.pas for one in said)), atol=3e-4)
+    np.testing.assert_allclose(seen.power_db, mixture(shares[1], *(one.power_db for one in said)), atol=1e-2)
+    np.testing.assert_allclose(seen.snapshots, said[0].snapshots, rtol=1e-4, atol=1e-7)  # two programs
     plan = run.field.plan(params, run.dataset.receiver())
     again = run.field.render(params, plan, run.dataset.query(index))
     np.testing.assert_allclose(again.pas, seen.pas, atol=2e-3)  # traced by another program, in single precision, at 94 GHz
@@ -63,25 +68,35 @@ def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("share", [0.0, 0.35, 1.0])
-def test_the_share_is_what_explains_other_links_best(run, share):
+def test_the_shares_are_what_explains_other_links_best(run, share):
+    """Of truths that are mixtures of the coherent and the own opinion, and of these and the informed one."""
     params, index = run.state.params, run.dataset.validation
     batch = run.data.batch(jnp.asarray(index), run.key)
-    wave, wideband = parts(run, params, index)
-    truth = share * wave.pas + (1 - share) * wideband.pas
-    power = (1 - share) * wave.power_db + share * wideband.power_db  # that of the power is another one
+    wave, own, informed = opinions(run, params, index)
+    truth = share * wave.pas + (1 - share) * own.pas
+    power = (1 - share) * informed.power_db + share * own.power_db
     batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
     found, report = run.field.calibrate(params, run.cache, [batch])
-    assert not np.any(found.trust.spectra.weights) and not np.any(found.trust.power.weights)  # of few transmitters
-    assert float(jax.nn.sigmoid(found.trust.spectra.bias)) == pytest.approx(share, abs=0.05)
-    assert float(jax.nn.sigmoid(found.trust.power.bias)) == pytest.approx(1 - share, abs=0.05)
-    assert report["coherent_share"]["spectra"] == {"mean": pytest.approx(share, abs=0.05), "by_query": False}
+    spectra, powers = found.trust.spectra, found.trust.power
+    assert not any(np.any(one.weights) for one in (spectra.coherent, spectra.uninformed, powers.coherent))  # few transmitters
+    assert float(jax.nn.sigmoid(spectra.coherent.bias)) == pytest.approx(share, abs=0.05)
+    said = mixture(
+        [float(jax.nn.sigmoid(one.bias)) for one in (spectra.coherent, spectra.uninformed)], wave.pas, own.pas, informed.pas
+    )
+    assert np.abs(said - truth).max() < 0.1 * np.abs(wave.pas - own.pas).max()
+    weight = float(jax.nn.sigmoid(powers.uninformed.bias))
+    said = mixture([float(jax.nn.sigmoid(powers.coherent.bias)), weight], wave.power_db, own.power_db, informed.power_db)
+    assert np.abs(said - power).mean() <= np.abs(informed.power_db - power).mean() + 0.05
+    assert sum(report["shares"]["spectra"][name] for name in ("coherent", "own", "informed")) == pytest.approx(1, abs=2e-3)
+    assert report["shares"]["spectra"]["by_query"] is False
 
 
 @pytest.mark.heavy
 def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     field, params = run.field, run.state.params
     batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)
-    given = jnp.asarray(observe_links(field.wave, params.wave, run.dataset, run.dataset.train[:2]).pas)
+    seen = observe_links(field.wave, params.wave, run.dataset, run.dataset.train[:2]).pas
+    given = jnp.where(jax.random.bernoulli(batch.key, 0.5, (2, 1, 1)), jnp.asarray(seen), 0)
 
     def both(params):
         return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0]
@@ -95,6 +110,15 @@ def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     for (path, leaf), wanted in zip(jax.tree_util.tree_leaves_with_path(gradient), jax.tree.leaves(other), strict=True):
         rounding = 1e-7 + 1e-4 * float(jnp.abs(wanted).max())  # turns of spheres are nothing but rounding
         np.testing.assert_allclose(leaf, wanted, rtol=1e-2, atol=rounding, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.heavy
+def test_the_splatting_field_sees_the_coherent_one_in_half_of_the_trainings_links(run):
+    keys = jax.random.split(jax.random.key(0), 400)
+    batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)
+    told = np.array([_informed(dataclasses.replace(batch, key=key)) for key in keys])
+    assert told.shape == (400, 2, 1, 1) and abs(told.mean() - 0.5) < 0.1
+    assert 0.3 < (told[:, 0] != told[:, 1]).mean() < 0.7  # each by itself
 
 
 @pytest.mark.heavy
@@ -138,7 +162,7 @@ def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
     again = load_trained(tmp_path / "run")
     for a, b in zip(jax.tree.leaves((result.field, result.params)), jax.tree.leaves((again.field, again.params)), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert np.isfinite(float(again.params.trust.spectra.bias))
+    assert np.isfinite(float(again.params.trust.spectra.coherent.bias))
     resumed = Run(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")
     assert resumed.restore() and resumed.step == SETTINGS.optim.steps
 
@@ -159,16 +183,17 @@ def test_of_several_receivers_both_fields_answer_for_each(tmp_path):
     dataset = hold_out_validation(tiny_dataset(12, n_rx=3))
     result = train(dataset, "hybrid", SETTINGS, 0, tmp_path)
     field, params = result.field, result.params
-    trust = [jax.nn.sigmoid(share.bias) for share in (params.trust.spectra, params.trust.power)]
-    assert not np.any(params.trust.spectra.weights) and not np.any(params.trust.power.weights)
+    trust = params.trust
+    shares = [[float(jax.nn.sigmoid(one.bias)) for one in (of.coherent, of.uninformed)] for of in (trust.spectra, trust.power)]
+    assert not any(np.any(one.weights) for of in (trust.spectra, trust.power) for one in (of.coherent, of.uninformed))
     seen = observe_links(field, params, dataset, dataset.test)
     for number in range(3):
         own = dataset.test[dataset.receiver_index[dataset.test] == number]
-        wave, wideband = (
-            jax.jit(type(one).render)(one, of, one.plan(of, dataset.receiver(number)), dataset.query(own))
-            for one, of in ((field.wave, params.wave), (field.wideband, params.wideband))
-        )
+        query, receiver = dataset.query(own), dataset.receiver(number)
+        wave = jax.jit(type(field.wave).render)(field.wave, params.wave, field.wave.plan(params.wave, receiver), query)
+        plan = field.wideband.plan(params.wideband, receiver)
+        splatted = [field.wideband.render(params.wideband, plan, query, given) for given in (0 * wave.pas, wave.pas)]
         place = np.flatnonzero(dataset.receiver_index[dataset.test] == number)
-        np.testing.assert_allclose(seen.pas[place], trust[0] * wave.pas + (1 - trust[0]) * wideband.pas, atol=2e-3)
-        power = trust[1] * wave.power_db + (1 - trust[1]) * wideband.power_db
+        np.testing.assert_allclose(seen.pas[place], mixture(shares[0], *(one.pas for one in (wave, *splatted))), atol=2e-3)
+        power = mixture(shares[1], *(one.power_db for one in (wave, *splatted)))
         np.testing.assert_allclose(seen.power_db[place], power, atol=0.05)

@@ -5,7 +5,23 @@ import numpy as np
 import pytest
 
 from wbgs_jax.fields.base import Observation
-from wbgs_jax.fields.trust import FEATURES, SHARES, Scored, constant, features, learn_share, share_of
+from wbgs_jax.fields.trust import (
+    FEATURES,
+    SHARES,
+    Opinions,
+    Scored,
+    Shares,
+    constant,
+    equal,
+    features,
+    learn_share,
+    learn_shares,
+    mixed,
+    nearness,
+    reported,
+    share_of,
+    similarity,
+)
 from wbgs_jax.types import make_query
 
 
@@ -58,3 +74,35 @@ def test_features_are_finite_of_nothing_and_of_an_unknown_power():
     told = features(query, jnp.zeros(3), silent, Observation(bright))
     assert told.shape == (1, FEATURES) and np.isfinite(told).all()
     assert told[0, 3] == -60 and told[0, 4] == 0
+
+
+def test_three_opinions_come_to_the_mixture_that_is_nearest(rng):
+    """Powers: the coherent and the own opinion err to either side by chance, and the informed one is right in shadows alone."""
+    told = rng.normal(size=(600, FEATURES)).astype(np.float32)
+    truth, shadow = rng.normal(-90, 10, 600), told[:, 3] > 0
+    coherent, own = truth + rng.normal(0, np.where(shadow, 20, 2), 600), truth + rng.normal(0, np.where(shadow, 20, 2), 600)
+    said = Opinions(coherent, own, truth + rng.normal(0, np.where(shadow, 1, 20), 600))
+    shares = learn_shares(told, np.repeat(np.arange(60), 10), said, lambda one, other: nearness(truth, one, other))
+    error = np.abs(np.asarray(mixed(shares, jnp.asarray(told), said)) - truth)
+    for one in said:
+        assert error.mean() < 0.6 * np.abs(one - truth).mean()
+    report = reported(shares, told)
+    assert report["by_query"] and abs(report["coherent"] - report["own"]) < 0.2 and 0.3 < report["informed"] < 0.7
+
+
+def test_all_opinions_count_alike_at_first_and_none_can_be_left_out(rng):
+    said, told = Opinions(*rng.normal(size=(3, 4, 90, 360))), jnp.asarray(rng.normal(size=(4, FEATURES)), jnp.float32)
+    np.testing.assert_allclose(mixed(equal(), told, said), np.mean(said, 0), atol=1e-5)
+    informed = mixed(Shares(constant(0.5), constant(0.0)), told, said)
+    np.testing.assert_allclose(informed, said.informed, atol=2e-2)
+
+
+def test_what_mixtures_are_worth(rng):
+    """The best share of a truth that is a mixture is that one; links on which nothing was heard count for nothing."""
+    one, other = rng.uniform(size=(2, 70, 90, 360)).astype(np.float32)
+    worth = similarity(0.25 * one + 0.75 * other, one, other)
+    assert worth.shape == (70, len(SHARES)) and np.all(SHARES[worth.argmax(1)] == 0.25)
+    heard = np.array([-60.0, -300.0])
+    worth = nearness(heard, np.array([-50.0, -40.0]), np.array([-70.0, -90.0]))
+    np.testing.assert_allclose(worth[0], -np.abs(20 * SHARES - 10))
+    np.testing.assert_array_equal(worth[1], 0)

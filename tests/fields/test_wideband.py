@@ -259,3 +259,7 @@ def test_networks_see_given_spectra_between_pixels_and_across_the_seam(rng):
     seen = given_features(jnp.asarray(given), jnp.asarray(pixel))
     np.testing.assert_allclose(seen[..., 0].T, expected, atol=1e-4)
     np.testing.assert_allclose(seen[..., 1].T, np.log(np.array(expected) + DARK), atol=2e-3)
+    np.testing.assert_array_equal(seen[..., 2], 1)
+    dark = given_features(jnp.asarray(given * [[[0]], [[1]]]), jnp.asarray(pixel))
+    np.testing.assert_array_equal(dark[:, 0], 0)  # says nothing
+    np.testing.assert_array_equal(dark[:, 1], seen[:, 1])

@@ -25,7 +25,7 @@ from wbgs_jax.radio.geometry import smooth_length, to_local
 from wbgs_jax.types import Gaussians, Query, Receiver
 
 MAX_ATTENUATION = 0.99
-RELATIVE_FEATURES, GIVEN_FEATURES = 7, 2
+RELATIVE_FEATURES, GIVEN_FEATURES = 7, 3
 DARK = 0.02
 """Keeps the logarithm of dark pixels finite."""
 POWER_UNIT_DB = 10.0
@@ -101,7 +101,7 @@ def query_features(
     receiver: Receiver,
     config: WidebandConfig,
     query: Query,
-    given: Float[Array, "n b 2"] | None = None,
+    given: Float[Array, "n b 3"] | None = None,
 ) -> QueryFeatures:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
     4.5), and a summary of every query. Networks that were made for it see what another field gives (`given_features`)."""
@@ -154,9 +154,9 @@ def _query_inputs(
     return both, [encoded] if config.radiance_frequency else []
 
 
-def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) -> Float[Array, "n b 2"]:
-    """Returns spectra in the directions of Gaussians, between pixels linearly, and their logarithms; below the lowest row of
-    pixels, what they say there."""
+def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) -> Float[Array, "n b 3"]:
+    """Returns spectra in the directions of Gaussians, between pixels linearly, their logarithms, and 1; below the lowest row of
+    pixels, what they say there. A spectrum that is dark all over says nothing: all three are 0."""
     rows, columns = given.shape[-2:]
     row = jnp.clip(pixel[:, 1], 0, rows - 1)
     above, left = jnp.minimum(jnp.floor(row), rows - 2), jnp.floor(pixel[:, 0])
@@ -167,7 +167,8 @@ def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) 
 
     upper, lower = ((1 - right) * at(i, 0) + right * at(i, 1) for i in (0, 1))
     said = ((1 - down) * upper + down * lower).T
-    return jnp.stack([said, jnp.log(said + DARK)], -1)
+    told = jnp.any(given > 0, (-2, -1))[:, None]
+    return jnp.where(told, jnp.stack([said, jnp.log(said + DARK), jnp.ones_like(said)], -1), 0)
 
 
 def encoded_frequency(frequency_hz: Float[Array, " b"], config: WidebandConfig) -> Float[Array, "b d"]:

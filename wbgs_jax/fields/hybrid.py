@@ -1,34 +1,33 @@
 """The hybrid field: the coherent field and the paper's splatting field side by side, and how far each is to be trusted.
 
-    PAS = w PAS of the waves + (1 - w) PAS of the Gaussians
-
 The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
-needs neither and blurs. Its networks see what the coherent field says, and so learn where that is wrong: behind furniture that
-the mesh lacks, say. Both are trained on the same batches; the share w, query by query, is what explains validation transmitters
-best (trust.py).
+needs neither and blurs. Its networks may see what the coherent field says, and so learn where that is wrong: behind furniture
+that the mesh lacks, say. In training they see it for half of the queries, so that the field has two opinions: one of its own,
+which errs in other places than the coherent field, and an informed one. Both fields are trained on the same batches; what the
+three opinions count for, query by query, is what explains validation transmitters best (trust.py).
 Without a mesh it is the splatting field by itself.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
-from wbgs_jax.fields.losses import ssim
 from wbgs_jax.fields.prepared_paths import PreparedPaths
-from wbgs_jax.fields.trust import SHARES, Scored, Share, constant, features, learn_share, share_of
+from wbgs_jax.fields.trust import Opinions, Shares, equal, features, learn_shares, mixed, nearness, reported, similarity
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
-from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
+from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
 
 
@@ -42,10 +41,10 @@ class HybridConfig:
 
 @pytree
 class Trust:
-    """The coherent field's shares."""
+    """What three opinions count for."""
 
-    spectra: Share
-    power: Share
+    spectra: Shares
+    power: Shares
     """Of the received power in decibels."""
 
 
@@ -115,10 +114,10 @@ class HybridField(Field):
         return self.wideband.gives if self.wave is None else self.gives
 
     def init(self, key: Key[Array, ""]) -> HybridParams:
-        """Returns initial parameters, both fields trusted alike."""
+        """Returns initial parameters, all opinions trusted alike."""
         wave = None if self.wave is None else self.wave.init(key)
         wideband = self.wideband.init(key, given=wave is not None)
-        return HybridParams(wave, wideband, Trust(constant(0.5), constant(0.5)))
+        return HybridParams(wave, wideband, Trust(equal(), equal()))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
         """Returns the paths of all transmitters of some links (host)."""
@@ -144,12 +143,23 @@ class HybridField(Field):
     def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
         if coherent is None:
             return self.wideband.render(params.wideband, plan.wideband, query)
-        blurred = self.wideband.render(params.wideband, plan.wideband, query, coherent.pas)
-        told = features(query, plan.wave.receiver.position, coherent, blurred)
-        spectra, power = (share_of(share, told) for share in (params.trust.spectra, params.trust.power))
-        pas = spectra[:, None, None] * coherent.pas + (1 - spectra)[:, None, None] * blurred.pas
-        assert coherent.power_db is not None and blurred.power_db is not None, "both fields know powers"
-        return Observation(pas, coherent.snapshots, power * coherent.power_db + (1 - power) * blurred.power_db)
+        pas, power_db, told = self._said(params, plan, query, coherent)
+        return Observation(
+            mixed(params.trust.spectra, told, pas), coherent.snapshots, mixed(params.trust.power, told, power_db)
+        )
+
+    def _said(
+        self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
+    ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+        """Returns what spectra and powers of B queries are said to be, and what tells whom to trust."""
+        assert coherent.pas is not None, "it knows spectra"
+        nothing = jnp.zeros_like(coherent.pas)
+        own, informed = (
+            self.wideband.render(params.wideband, plan.wideband, query, given) for given in (nothing, coherent.pas)
+        )
+        told = features(query, plan.wave.receiver.position, coherent, own)
+        powers = Opinions(coherent.power_db, own.power_db, informed.power_db)
+        return Opinions(coherent.pas, own.pas, informed.pas), powers, told
 
     def probe(self, params: HybridParams) -> Any:
         """Returns that of the splatting field."""
@@ -163,7 +173,7 @@ class HybridField(Field):
             return self.wideband.loss(params.wideband, None, batch, limits, probe)
         seen = self.wave.render_links(params.wave, self.wave.plan(params.wave, batch.receiver, None, cache), cache, batch.links)
         coherent, other = self.wave.compared(params.wave, seen, batch)
-        given = jax.lax.stop_gradient(seen.pas)
+        given = jnp.where(_informed(batch), jax.lax.stop_gradient(seen.pas), 0)
         loss, aux = self.wideband.loss(params.wideband, None, batch, limits, probe, given)
         figures = {f"{name}_wave": value for name, value in other.metrics.items()} | aux.metrics
         return loss + coherent, aux._replace(metrics=figures)
@@ -174,16 +184,15 @@ class HybridField(Field):
             return params, {}
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
         plans = {number: self.plan(params, receiver, None, cache) for number, receiver in receivers.items()}
-        seen = [jax.tree.map(np.asarray, _scores(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
-        told, *scores = (None if part[0] is None else np.concatenate(part) for part in zip(*seen, strict=True))
-        assert told is not None
+        seen = [
+            jax.tree.map(np.asarray, _opinions(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches
+        ]
+        said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        shares = [constant(1.0) if s is None else learn_share(Scored(told, s, tx_index)) for s in scores]
-        report = {
-            name: {"mean": round(float(share_of(share, jnp.asarray(told)).mean()), 3), "by_query": bool(np.any(share.weights))}
-            for name, share in zip(("spectra", "power"), shares, strict=True)
-        }
-        return dataclasses.replace(params, trust=Trust(*shares)), {"coherent_share": report}
+        spectra = equal() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
+        power = equal() if heard_db is None else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
+        report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
+        return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report}
 
     def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
         """Returns every path of B queries: amplitudes, directions, lengths."""
@@ -270,20 +279,15 @@ def _receiver_of(batch: Batch) -> int:
     return int(batch.links.receiver_index[0])
 
 
+def _informed(batch: Batch) -> Bool[Array, "b 1 1"]:
+    """Returns for which links the splatting field is to see what the coherent one says: half of them, drawn anew."""
+    return jax.random.bernoulli(batch.key, 0.5, (len(batch.links.tx_index), 1, 1))
+
+
 @jax.jit
-def _scores(
+def _opinions(
     hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch
-) -> tuple[Float[Array, "b features"], Float[Array, "b shares"] | None, Float[Array, "b shares"] | None]:
-    """Returns the features of every link, and what every share of the coherent field is worth on it: SSIM, and the negative
-    error of the power (dB)."""
-    coherent: Any = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
-    blurred: Any = hybrid.wideband.render(params.wideband, plan.wideband, batch.links.query, coherent.pas)
-    told = features(batch.links.query, batch.receiver.position, coherent, blurred)
-    shares, spectra, power = jnp.asarray(SHARES, jnp.float32), None, None
-    if batch.pas is not None:
-        spectra = jax.lax.map(lambda w: ssim(w * coherent.pas + (1 - w) * blurred.pas, batch.pas), shares).T
-    if batch.received_db is not None:
-        said = shares * coherent.power_db[:, None] + (1 - shares) * blurred.power_db[:, None]
-        heard = (batch.received_db > NOT_HEARD_DB)[:, None]
-        power = jnp.where(heard, -jnp.abs(said - batch.received_db[:, None]), 0)
-    return told, spectra, power
+) -> tuple[Opinions, Opinions, Float[Array, "b features"], Float[Array, "b 90 360"] | None, Float[Array, " b"] | None]:
+    """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
+    coherent = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
+    return *hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db

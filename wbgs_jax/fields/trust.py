@@ -1,4 +1,10 @@
-"""How far the coherent field is to be trusted, query by query, learned from links that neither field was trained on.
+"""How far three opinions are to be trusted, query by query, learned from links that nothing was trained on: the coherent
+field's, the splatting field's own, and the splatting field's that has seen the first.
+
+    first = a coherent + (1 - a) own        all = b first + (1 - b) informed
+
+The coherent and the own opinion err in different places; the informed one knows what the mesh lacks, but errs where the
+coherent one does. Each share is
 
     share = sigmoid(bias + weights . z)
 
@@ -8,6 +14,7 @@ is. The weights are those by which validation links are explained best; where, l
 them no surer than a common share does, they are zero.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,8 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
-from wbgs_jax.radio.channel import beyond_free_space_db
+from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
 from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
@@ -29,6 +37,8 @@ RIDGE = 5e-3
 """Penalty on the squared weights, in the unit of the scores' spread over shares."""
 STEPS, RATE = 400, 0.03
 """Of Adam, which finds the weights."""
+BLOCK = 64
+"""Spectra that are compared at once."""
 FAINTEST_DB = 60.0
 """Received powers are told apart down to so many decibels below free space."""
 
@@ -43,6 +53,24 @@ class Share:
     """Of the features over the links that it was learned from ..."""
     scale: Float[Array, " features"]
     """... and their standard deviation."""
+
+
+@pytree
+class Shares:
+    """Of three opinions."""
+
+    coherent: Share
+    """Of the coherent field, the rest is the splatting field's own opinion ..."""
+    uninformed: Share
+    """... and of these two together, the rest is its informed one."""
+
+
+class Opinions(NamedTuple):
+    """What B links are said to be: spectra, or powers in decibels."""
+
+    coherent: Any
+    own: Any
+    informed: Any
 
 
 class Scored(NamedTuple):
@@ -61,27 +89,78 @@ def constant(share: float) -> Share:
     return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
 
 
+def equal() -> Shares:
+    """Returns the shares by which all three opinions count alike."""
+    return Shares(constant(1 / 2), constant(2 / 3))
+
+
+def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[str, Any]:
+    """Returns for people what N links trust in the mean, and whether that differs from query to query."""
+    first, both = (np.asarray(share_of(share, jnp.asarray(features))) for share in (shares.coherent, shares.uninformed))
+    means = {"coherent": first * both, "own": (1 - first) * both, "informed": 1 - both}
+    by_query = bool(np.any(shares.coherent.weights) or np.any(shares.uninformed.weights))
+    return {name: round(float(share.mean()), 3) for name, share in means.items()} | {"by_query": by_query}
+
+
 def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
     """Returns the coherent field's share, 0 to 1, of B queries."""
     scaled = (features - share.mean) / share.scale
     return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
 
 
+def mixed(shares: Shares, features: Float[Array, "b features"], said: Opinions) -> Any:
+    """Returns what three opinions come to for B queries."""
+    first = _mix(share_of(shares.coherent, features), said.coherent, said.own)
+    return _mix(share_of(shares.uninformed, features), first, said.informed)
+
+
+def _mix(share: Float[Array, " b"], one: Any, other: Any) -> Any:
+    share = share.reshape(share.shape + (1,) * (one.ndim - 1))
+    return share * one + (1 - share) * other
+
+
 def features(
-    query: Query, rx_position: Float[Array, "3"], coherent: Observation, blurred: Observation
+    query: Query, rx_position: Float[Array, "3"], coherent: Observation, own: Observation
 ) -> Float[Array, "b features"]:
-    """Returns what tells how far the coherent field is right for B queries."""
+    """Returns what tells how far the coherent field is right for B queries, beside the splatting field's own opinion."""
     octave = jnp.log2(query.frequency_hz / 1e10)
     link = query.tx_position, rx_position, query.frequency_hz
     beyond = [
         jnp.zeros_like(octave)
         if seen.power_db is None
         else jnp.clip(beyond_free_space_db(seen.power_db, *link), -FAINTEST_DB, 0.0)
-        for seen in (coherent, blurred)
+        for seen in (coherent, own)
     ]
-    brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, blurred)]
-    disagreement = jnp.log(jnp.mean(jnp.abs(coherent.pas - blurred.pas), (-2, -1)) + 1e-3)
+    brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, own)]
+    disagreement = jnp.log(jnp.mean(jnp.abs(coherent.pas - own.pas), (-2, -1)) + 1e-3)
     return jnp.stack([octave, octave**2, disagreement, *beyond, *brightness], -1)
+
+
+def learn_shares(
+    told: Float[np.ndarray, "n features"], tx_index: Int[np.ndarray, " n"], said: Opinions, worth: Callable[[Any, Any], Any]
+) -> Shares:
+    """Returns the shares that explain N links best (host), one after the other; `worth` returns what every share of a first
+    opinion, the rest a second one's, is worth on each link, (n, shares)."""
+    coherent = learn_share(Scored(told, worth(said.coherent, said.own), tx_index))
+    first = np.asarray(_mix(share_of(coherent, jnp.asarray(told)), jnp.asarray(said.coherent), jnp.asarray(said.own)))
+    return Shares(coherent, learn_share(Scored(told, worth(first, said.informed), tx_index)))
+
+
+def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
+    """Returns the SSIM of every mixture of two spectra."""
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(truth), BLOCK)]
+    return np.concatenate([np.asarray(_ssim_of_mixtures(one[own], other[own], truth[own])) for own in blocks])
+
+
+@jax.jit
+def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> Float[Array, "b shares"]:
+    return jax.lax.map(lambda share: ssim(share * one + (1 - share) * other, truth), jnp.asarray(SHARES, jnp.float32)).T
+
+
+def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
+    """Returns the negative error (dB) of every mixture of two powers; 0 where nothing was heard."""
+    said = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
+    return np.where((heard_db > NOT_HEARD_DB)[:, None], -np.abs(said - heard_db[:, None]), 0)
 
 
 def learn_share(known: Scored) -> Share:
