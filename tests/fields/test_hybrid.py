@@ -92,6 +92,14 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
 
 
 @pytest.mark.heavy
+def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
+    batch = run.data.batch(jnp.asarray(run.dataset.validation), run.key)
+    image = dataclasses.replace(batch, snapshots=None, power_db=None)
+    trust = run.field.calibrate(run.state.params, run.cache, [image])[0].trust
+    assert min(float(jax.nn.sigmoid(one.bias)) for one in (trust.power.coherent, trust.power.uninformed)) > 0.99
+
+
+@pytest.mark.heavy
 def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     field, params = run.field, run.state.params
     batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)

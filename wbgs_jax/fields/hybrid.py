@@ -24,7 +24,18 @@ from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
 from wbgs_jax.fields.prepared_paths import PreparedPaths
-from wbgs_jax.fields.trust import Opinions, Shares, equal, features, learn_shares, mixed, nearness, reported, similarity
+from wbgs_jax.fields.trust import (
+    Opinions,
+    Shares,
+    coherent_alone,
+    equal,
+    features,
+    learn_shares,
+    mixed,
+    nearness,
+    reported,
+    similarity,
+)
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
 from wbgs_jax.radio.channel import Arrivals
@@ -179,7 +190,8 @@ class HybridField(Field):
         return loss + coherent, aux._replace(metrics=figures)
 
     def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
-        """Returns the parameters with the shares of the coherent field that explain best what neither field was trained on."""
+        """Returns the parameters with the shares that explain best what neither field was trained on; of what was not observed,
+        spectra or powers, the coherent field's are taken."""
         if self.wave is None or not batches:
             return params, {}
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
@@ -189,8 +201,8 @@ class HybridField(Field):
         ]
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        spectra = equal() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
-        power = equal() if heard_db is None else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
+        spectra = coherent_alone() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
+        power = coherent_alone() if heard_db is None else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
         return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report}
 

@@ -94,6 +94,11 @@ def equal() -> Shares:
     return Shares(constant(1 / 2), constant(2 / 3))
 
 
+def coherent_alone() -> Shares:
+    """Returns the shares by which the coherent field alone counts."""
+    return Shares(constant(1.0), constant(1.0))
+
+
 def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[str, Any]:
     """Returns for people what N links trust in the mean, and whether that differs from query to query."""
     first, both = (np.asarray(share_of(share, jnp.asarray(features))) for share in (shares.coherent, shares.uninformed))
@@ -103,7 +108,7 @@ def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[
 
 
 def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
-    """Returns the coherent field's share, 0 to 1, of B queries."""
+    """Returns the share, 0 to 1, that the first of two opinions has in B queries."""
     scaled = (features - share.mean) / share.scale
     return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
 
