@@ -11,8 +11,9 @@ from wbgs_jax.fields.trust import (
     Opinions,
     Scored,
     Shares,
+    at_first,
+    coherent_alone,
     constant,
-    equal,
     features,
     learn_share,
     learn_shares,
@@ -90,11 +91,12 @@ def test_three_opinions_come_to_the_mixture_that_is_nearest(rng):
     assert report["by_query"] and abs(report["coherent"] - report["own"]) < 0.2 and 0.3 < report["informed"] < 0.7
 
 
-def test_all_opinions_count_alike_at_first_and_none_can_be_left_out(rng):
+def test_both_fields_count_alike_at_first_and_one_opinion_can_count_alone(rng):
     said, told = Opinions(*rng.normal(size=(3, 4, 90, 360))), jnp.asarray(rng.normal(size=(4, FEATURES)), jnp.float32)
-    np.testing.assert_allclose(mixed(equal(), told, said), np.mean(said, 0), atol=1e-5)
-    informed = mixed(Shares(constant(0.5), constant(0.0)), told, said)
-    np.testing.assert_allclose(informed, said.informed, atol=2e-2)
+    expected = said.coherent / 2 + (said.own + said.informed) / 4
+    np.testing.assert_allclose(mixed(at_first(), told, said), expected, atol=1e-5)
+    np.testing.assert_allclose(mixed(coherent_alone(), told, said), said.coherent, atol=2e-2)
+    np.testing.assert_allclose(mixed(Shares(constant(0.5), constant(0.0)), told, said), said.informed, atol=2e-2)
 
 
 def test_what_mixtures_are_worth(rng):

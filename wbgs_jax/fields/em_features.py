@@ -155,8 +155,8 @@ def _query_inputs(
 
 
 def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) -> Float[Array, "n b 3"]:
-    """Returns spectra in the directions of Gaussians, between pixels linearly, their logarithms, and 1; below the lowest row of
-    pixels, what they say there. A spectrum that is dark all over says nothing: all three are 0."""
+    """Returns what spectra say in the directions of Gaussians (linear between pixels; below the lowest row, as on it): the
+    value, its logarithm, and 1. A spectrum that is dark all over says nothing: all three are 0."""
     rows, columns = given.shape[-2:]
     row = jnp.clip(pixel[:, 1], 0, rows - 1)
     above, left = jnp.minimum(jnp.floor(row), rows - 2), jnp.floor(pixel[:, 0])

@@ -27,8 +27,8 @@ from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import (
     Opinions,
     Shares,
+    at_first,
     coherent_alone,
-    equal,
     features,
     learn_shares,
     mixed,
@@ -38,7 +38,7 @@ from wbgs_jax.fields.trust import (
 )
 from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
 
 
@@ -52,7 +52,7 @@ class HybridConfig:
 
 @pytree
 class Trust:
-    """What three opinions count for."""
+    """How much each of three opinions counts."""
 
     spectra: Shares
     power: Shares
@@ -125,10 +125,10 @@ class HybridField(Field):
         return self.wideband.gives if self.wave is None else self.gives
 
     def init(self, key: Key[Array, ""]) -> HybridParams:
-        """Returns initial parameters, all opinions trusted alike."""
+        """Returns initial parameters, both fields trusted alike."""
         wave = None if self.wave is None else self.wave.init(key)
         wideband = self.wideband.init(key, given=wave is not None)
-        return HybridParams(wave, wideband, Trust(equal(), equal()))
+        return HybridParams(wave, wideband, Trust(at_first(), at_first()))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
         """Returns the paths of all transmitters of some links (host)."""
@@ -202,7 +202,8 @@ class HybridField(Field):
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
         spectra = coherent_alone() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
-        power = coherent_alone() if heard_db is None else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
+        known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
+        power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
         return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report}
 
@@ -221,7 +222,7 @@ class HybridField(Field):
         return self.wideband.grow(limits, required)
 
     def splatted(self, params: HybridParams, plan: HybridPlan, query: Query) -> Splatted:
-        """Returns the Gaussians of the splatting field with their attenuation and signal."""
+        """Returns the Gaussians of the splatting field, informed of the coherent one, with their attenuation and signal."""
         given = None if self.wave is None else self.wave.render(params.wave, plan.wave, query).pas
         return self.wideband.splatted(params.wideband, plan.wideband, query, given)
 
@@ -292,8 +293,14 @@ def _receiver_of(batch: Batch) -> int:
 
 
 def _informed(batch: Batch) -> Bool[Array, "b 1 1"]:
-    """Returns for which links the splatting field is to see what the coherent one says: half of them, drawn anew."""
-    return jax.random.bernoulli(batch.key, 0.5, (len(batch.links.tx_index), 1, 1))
+    """Returns for which links the splatting field is to see what the coherent one says: half of them, drawn anew in each step,
+    and the same ones however many devices divide the batch."""
+
+    def drawn(tx: Any, frequency_hz: Any) -> Any:
+        key = jax.random.fold_in(batch.key, tx)
+        return jax.random.bernoulli(jax.random.fold_in(key, jax.lax.bitcast_convert_type(frequency_hz, jnp.uint32)))
+
+    return jax.vmap(drawn)(batch.links.tx_index, batch.links.query.frequency_hz)[:, None, None]
 
 
 @jax.jit

@@ -10,8 +10,8 @@ coherent one does. Each share is
 
 with z what is known beforehand and tells where phases fail: the frequency, how much the two fields disagree, how far below free
 space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
-is. The weights are those by which validation links are explained best; where, left out transmitter by transmitter, they explain
-them no surer than a common share does, they are zero.
+is. The weights are those by which validation links are explained best; where they explain transmitters that were left out, a
+fifth at a time, no more surely than a common share does, they are zero.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
 from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
-"""Shares of the coherent field that links are scored at."""
+"""Shares of the first of two opinions that links are scored at."""
 FEATURES = 7
 FOLDS = 5
 RIDGE = 5e-3
@@ -89,9 +89,9 @@ def constant(share: float) -> Share:
     return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
 
 
-def equal() -> Shares:
-    """Returns the shares by which all three opinions count alike."""
-    return Shares(constant(1 / 2), constant(2 / 3))
+def at_first() -> Shares:
+    """Returns the shares by which the coherent field counts half, and each opinion of the splatting one a quarter."""
+    return Shares(constant(2 / 3), constant(3 / 4))
 
 
 def coherent_alone() -> Shares:
@@ -100,7 +100,8 @@ def coherent_alone() -> Shares:
 
 
 def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[str, Any]:
-    """Returns for people what N links trust in the mean, and whether that differs from query to query."""
+    """Returns, for reports, how much each opinion counts on average over N links, and whether that differs from query to
+    query."""
     first, both = (np.asarray(share_of(share, jnp.asarray(features))) for share in (shares.coherent, shares.uninformed))
     means = {"coherent": first * both, "own": (1 - first) * both, "informed": 1 - both}
     by_query = bool(np.any(shares.coherent.weights) or np.any(shares.uninformed.weights))
@@ -144,8 +145,8 @@ def features(
 def learn_shares(
     told: Float[np.ndarray, "n features"], tx_index: Int[np.ndarray, " n"], said: Opinions, worth: Callable[[Any, Any], Any]
 ) -> Shares:
-    """Returns the shares that explain N links best (host), one after the other; `worth` returns what every share of a first
-    opinion, the rest a second one's, is worth on each link, (n, shares)."""
+    """Returns the shares that explain N links best (host), one after the other; `worth(one, other)` returns the score on each
+    link of every mixture of two opinions, by the share (`SHARES`) of the first: (n, shares)."""
     coherent = learn_share(Scored(told, worth(said.coherent, said.own), tx_index))
     first = np.asarray(_mix(share_of(coherent, jnp.asarray(told)), jnp.asarray(said.coherent), jnp.asarray(said.own)))
     return Shares(coherent, learn_share(Scored(told, worth(first, said.informed), tx_index)))
@@ -154,7 +155,7 @@ def learn_shares(
 def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
     """Returns the SSIM of every mixture of two spectra."""
     blocks = [slice(start, start + BLOCK) for start in range(0, len(truth), BLOCK)]
-    return np.concatenate([np.asarray(_ssim_of_mixtures(one[own], other[own], truth[own])) for own in blocks])
+    return np.concatenate([np.asarray(_ssim_of_mixtures(one[block], other[block], truth[block])) for block in blocks])
 
 
 @jax.jit

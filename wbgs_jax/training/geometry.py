@@ -10,6 +10,7 @@ says training spectra surely better than the mesh as it was, each with as much d
 """
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from dataclasses import field as having
 from typing import Any
@@ -50,6 +51,10 @@ MORE = 2
 places thicknesses."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
+
+
+ENDS = "transmitter", "element"
+"""Whose antennas are searched."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +128,9 @@ class _Heard:
         return dataclasses.replace(now, params=params)
 
     def surprised(self, now: Place) -> float:
-        """Returns how badly some spectra are explained, as far as places are known."""
-        count = self.config.spectra
-        told = Told(now.field, now.cache, self.data, self.spectra[:: max(1, len(self.spectra) // count)])
-        return float(told.scores(count, "covariances")([now.params])[0].mean())
+        """Returns how badly some spectra, always the same ones, are explained as far as places are known."""
+        told = Told(now.field, now.cache, self.data, np.random.default_rng(0).permutation(self.spectra))
+        return float(told.scores(self.config.spectra, "covariances")([now.params])[0].mean())
 
     def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
         """Returns places, each with as much doubt as suits it, the scores of some spectra at each, and their transmitters."""
@@ -172,14 +176,18 @@ def _begun(place: Place, heard: _Heard, links: Links) -> Place:
     """Returns the field with surfaces doubted and materials named anew, as far as places are known.
 
     Where phases are wrong, a wrong antenna can explain them best, and materials then make up for it. So antennas that were
-    found have to explain spectra better than those of before, each with materials of its own.
+    found, at either end, have to explain spectra better than those of before, each with materials of its own.
     """
-    new = place.field.init(jax.random.key(0))
+    new, seed = place.field.init(jax.random.key(0)), int(heard.rng.integers(2**32))
     alike = dataclasses.replace(place.params, materials=new.materials)
     first = _doubted(_traced(place.field, alike, links, heard.data), heard.config.geometry_width)
-    before = dataclasses.replace(first.params, transmitter=new.transmitter, element=new.element)
-    begins = [first] if _equal(first.params, before) else [first, dataclasses.replace(first, params=before)]
-    return min((heard.named(one, heard.config.rounds, sized=True) for one in begins), key=heard.surprised)
+    ends = [(getattr(place.params, end), getattr(new, end)) for end in ENDS]
+    begins = []
+    for antennas in itertools.product(*([found] if _equal(found, before) else [found, before] for found, before in ends)):
+        params = dataclasses.replace(first.params, **dict(zip(ENDS, antennas, strict=True)))
+        alike_heard = dataclasses.replace(heard, rng=np.random.default_rng(seed))  # the same spectra name materials of each
+        begins.append(alike_heard.named(dataclasses.replace(first, params=params), heard.config.rounds, sized=True))
+    return min(begins, key=heard.surprised)
 
 
 def _equal(params: Any, others: Any) -> bool:
@@ -250,8 +258,7 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
     sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.known)
-    antennas = [(p.params.transmitter, p.params.element) for p in (as_it_was, chosen)]
-    same = not kept or _equal(*antennas)
+    same = not kept or all(_equal(*(getattr(one.params, end) for one in (as_it_was, chosen))) for end in ENDS)
     report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, same, **sizes, bodies=bodies)
     return chosen if kept else as_it_was, report
 
@@ -307,5 +314,5 @@ def _doubted(now: Place, spread: float) -> Place:
 
 def _fresh(learned: Any, initial: Any) -> Any:
     """Returns parameters as they were before, but for materials, antennas and how far places are believed."""
-    known = {name: getattr(learned, name) for name in ("materials", "transmitter", "element", "placement")}
+    known = {name: getattr(learned, name) for name in ("materials", "placement", *ENDS)}
     return dataclasses.replace(initial, **known)

@@ -98,6 +98,8 @@ class Search:
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
+                if "antennas" in report and not moved.antennas_kept:
+                    report["antennas"]["taken"] = {}
                 params, field, cache = place.params, place.field, place.cache
                 told = Told(field, cache, data, spectra)
                 field = self._tuning(params, told, report)
