@@ -5,7 +5,8 @@ received power, how many decibels it is expected to be off, and within how many 
     log(margin + |error|)  = w . x + r        x: `power_features`
 
 Which features help is found on the validation part, and the interval's ends are quantiles of what is left there (split
-conformal prediction, Lei et al. 2018): it holds what it promises where transmitters are drawn as those were, not elsewhere.
+conformal prediction, Lei et al. 2018): it holds what it promises where transmitters are drawn as those were, not elsewhere. A
+hybrid field's shares, a few numbers, were learned on the same transmitters, for which its answers are a little better.
 """
 
 from pathlib import Path
