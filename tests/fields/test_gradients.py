@@ -283,15 +283,19 @@ DESIGN_HZ = 3e9
 @pytest.mark.parametrize("name", ["wideband", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nerf2", "wave"))])
 def test_an_array_in_metres_is_one_in_wavelengths_at_its_design_frequency(rng, x64, name):
     """The same spectrum and the same gradient; that of the frequency has a part more, for the array grows with it."""
-    (params, receiver, query), weights = random_arguments(rng, name), rng.normal(size=(2, 90, 360))
+    params, receiver, query = random_arguments(rng, name)
     query = replaced(query, frequency_hz=np.full(2, DESIGN_HZ))
     metre = DESIGN_HZ / SPEED_OF_LIGHT
     fixed = replaced(receiver, element_positions=receiver.element_positions / metre, unit="metres")
-    (_, expected), (d_params, d_receiver, d_query) = differentiated(name)((params, receiver, query), weights)
+    for _ in range(3):  # by chance the part is none of one draw in a thousand
+        weights = rng.normal(size=(2, 90, 360))
+        (_, expected), (d_params, d_receiver, d_query) = differentiated(name)((params, receiver, query), weights)
+        grown = np.sum(d_receiver.element_positions * receiver.element_positions) / DESIGN_HZ
+        if abs(grown) > 1e-3 * np.abs(d_query.frequency_hz).max():
+            break
+    assert abs(grown) > 1e-3 * np.abs(d_query.frequency_hz).max()
     (_, found), gradients = differentiated(name, "metres")((params, fixed, query), weights)
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    grown = np.sum(d_receiver.element_positions * receiver.element_positions) / DESIGN_HZ
-    assert abs(grown) > 1e-5 * np.abs(d_query.frequency_hz).max()  # ten times what is told apart below
     np.testing.assert_allclose(
         np.sum(gradients[2].frequency_hz), np.sum(d_query.frequency_hz) + grown, rtol=1e-6, atol=1e-6 * abs(grown)
     )

@@ -13,7 +13,7 @@ from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import search
-from wbgs_jax.training.antennas import antenna_candidates
+from wbgs_jax.training.antennas import AntennaReport, antenna_candidates
 from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
@@ -173,6 +173,24 @@ def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     run.control()
     assert run.field is moved
     assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
+
+
+@pytest.mark.heavy
+def test_an_antenna_that_was_dropped_is_reported_no_more(truth, tmp_path, monkeypatch):
+    run = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0])
+    new, antenna = run.state.params, antenna_candidates()["dipole along +x"]
+    taken = {"transmitter": "dipole along +x", "element": "dipole along +x"}
+    found = dataclasses.replace(new, transmitter=antenna, element=antenna)
+    monkeypatch.setattr(search, "search_antennas", lambda *_: (found, AntennaReport(-1.0, -2.0, taken)))
+    report = GeometryReport(-1.0, -2.0, True, False, 1.0, 1.0, 0.0, 0.0, 0.0)
+
+    def moved(place, *_):
+        return dataclasses.replace(place, params=dataclasses.replace(place.params, transmitter=new.transmitter)), report
+
+    monkeypatch.setattr(search, "learn_geometry", moved)
+    run.controls = (search.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
+    run.control()
+    assert list(json.loads((tmp_path / "metrics.jsonl").read_text())["antennas"]["taken"]) == ["element"]
 
 
 def shifted(parts, metres, rng):

@@ -80,6 +80,14 @@ def replaced(tree: T, **values: Any) -> T:
     return new
 
 
+def same(a: Any, b: Any) -> bool:
+    """Returns whether two trees have the same structure, and leaves of the same shapes and values."""
+    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+        return False
+    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.shape(x) == np.shape(y) and np.array_equal(x, y) for x, y in leaves)
+
+
 def to_device(tree: Any) -> Any:
     """Returns a tree of host arrays on the device: floating-point numbers as float32, integers and booleans as int32.
 

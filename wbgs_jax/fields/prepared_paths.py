@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import pytree, same
 from wbgs_jax.fields.wave_channel import WavePlan
 from wbgs_jax.propagation.image_method import Search, Surfaces
 from wbgs_jax.propagation.paths import Paths, TracedPaths, trace_paths
@@ -100,12 +100,5 @@ def _stacked(some: list[Paths]) -> Paths:
 def _shared_beams(plans: list[WavePlan]) -> Beams | None:
     """Returns the beams of all receivers, if they are the same."""
     first, *others = (plan.beams for plan in plans)
-    alike = all(_same(first, other) for other in others)
+    alike = all(same(first, other) for other in others)
     return first if alike else None
-
-
-def _same(a: Any, b: Any) -> bool:
-    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
-        return False
-    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return all(np.shape(x) == np.shape(y) and np.array_equal(x, y) for x, y in leaves)

@@ -19,6 +19,8 @@ from wbgs_jax.radio.patterns import PATTERN_EXPONENTS, Antenna
 from wbgs_jax.training.scores import Scores, surely_better
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
+ENDS = "transmitter", "element"
+"""Whose antennas are searched."""
 UP = ("+x", "+y", "+z")
 """Axes that an antenna may stand along: upside down it differs by a sign."""
 
@@ -67,7 +69,7 @@ def search_antennas(
     better than what is there; elements whose pattern the data say are left alone."""
     before = after = score([params])[0]
     taken, settled = dict[str, str](), 0
-    ends = ("transmitter",) if known_elements else ("transmitter", "element")
+    ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
         end, candidates = ends[turn % len(ends)], antenna_candidates()  # anew: training gives every array away once
         tried = [dataclasses.replace(params, **{end: antenna}) for antenna in candidates.values()]

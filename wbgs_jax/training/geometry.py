@@ -21,10 +21,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
+from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.propagation.motion import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.adjustment import adjust, adjusted_numbers
+from wbgs_jax.training.antennas import ENDS
 from wbgs_jax.training.controls import Say, silent
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.training.descent import descend
@@ -51,10 +53,6 @@ MORE = 2
 places thicknesses."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
-
-
-ENDS = "transmitter", "element"
-"""Whose antennas are searched."""
 
 
 @dataclass(frozen=True)
@@ -183,15 +181,11 @@ def _begun(place: Place, heard: _Heard, links: Links) -> Place:
     first = _doubted(_traced(place.field, alike, links, heard.data), heard.config.geometry_width)
     ends = [(getattr(place.params, end), getattr(new, end)) for end in ENDS]
     begins = []
-    for antennas in itertools.product(*([found] if _equal(found, before) else [found, before] for found, before in ends)):
+    for antennas in itertools.product(*([found] if same(found, before) else [found, before] for found, before in ends)):
         params = dataclasses.replace(first.params, **dict(zip(ENDS, antennas, strict=True)))
         alike_heard = dataclasses.replace(heard, rng=np.random.default_rng(seed))  # the same spectra name materials of each
         begins.append(alike_heard.named(dataclasses.replace(first, params=params), heard.config.rounds, sized=True))
     return min(begins, key=heard.surprised)
-
-
-def _equal(params: Any, others: Any) -> bool:
-    return all(jax.tree.leaves(jax.tree.map(np.array_equal, params, others)))
 
 
 def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
@@ -258,8 +252,8 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
     sizes, bodies = _sizes(chosen.field.motion), _bodies(chosen.field.motion, chosen.known)
-    same = not kept or all(_equal(*(getattr(one.params, end) for one in (as_it_was, chosen))) for end in ENDS)
-    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, same, **sizes, bodies=bodies)
+    unchanged = not kept or all(same(*(getattr(one.params, end) for one in (as_it_was, chosen))) for end in ENDS)
+    report = GeometryReport(float(before.mean()), float(after[best].mean()), kept, unchanged, **sizes, bodies=bodies)
     return chosen if kept else as_it_was, report
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.training.antennas import search_antennas
@@ -98,8 +99,10 @@ class Search:
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
-                if "antennas" in report and not moved.antennas_kept:
-                    report["antennas"]["taken"] = {}
+                if "antennas" in report:  # what is in it may have been dropped since
+                    found = report["antennas"]["taken"].items()
+                    kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
+                    report["antennas"]["taken"] = kept
                 params, field, cache = place.params, place.field, place.cache
                 told = Told(field, cache, data, spectra)
                 field = self._tuning(params, told, report)
