@@ -11,7 +11,7 @@ from wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.training.materials import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
 from wbgs_jax.training.scores import Told
-from wbgs_jax.training.thicknesses import frequencies_to_look_at, search_slabs
+from wbgs_jax.training.thicknesses import Slab, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
 SETTINGS = tiny_settings(
@@ -59,7 +59,7 @@ def test_they_are_found_with_the_materials(room, rng):
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, names, metres))
-    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, likely = search_slabs(start, heard, SETTINGS.search, 60)
     alone, _ = search_materials(start, heard.scores(60), SETTINGS.search)
     left, without = heard.scores()([found, alone]).mean(1)
     assert left < without - 0.5
@@ -67,7 +67,10 @@ def test_they_are_found_with_the_materials(room, rng):
     materials = found.materials
     reached = np.exp(np.asarray(materials.log_thickness)) * np.sqrt(1 + np.exp(np.asarray(materials.log_susceptibility)))
     assert np.median(np.abs(reached / optical - 1)) < 0.02
-    assert set(report.thickness_mm) == set(range(len(PARTS)))
+    assert set(report.thickness_mm) == set(likely) == set(range(len(PARTS)))
+    other = {material: [Slab("metal", 0.3)] for material in likely}
+    wrong, _, _ = search_slabs(start, heard, SETTINGS.search, 60, likely=other)
+    assert heard.scores()([wrong]).mean() > left + 0.1, "what is ruled out is looked at no more"
 
 
 @pytest.mark.heavy
@@ -76,7 +79,7 @@ def test_what_fits_stays(room, rng):
     names = rng.choice(["concrete", "brick", "plasterboard", "wood"], len(PARTS))
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, names, [USUAL_M[name] for name in names]))
-    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
     usual = np.log([USUAL_M[name] for name in names])
     assert not report.thickness_mm or np.abs(np.asarray(found.materials.log_thickness) - usual).max() < 0.02
     assert heard.scores()([found]).mean() < -4
@@ -88,7 +91,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     known = dataclasses.replace(room.field, known_thickness=jnp.full(len(PARTS), 0.1))
     heard = told(room, of(start, ["wood"] * len(PARTS), metres), known)
-    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
     assert not report.thickness_mm
     np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
 
@@ -100,7 +103,7 @@ def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     nothing = SearchReport(0.0, 0.0, {})
     monkeypatch.setattr("wbgs_jax.training.thicknesses.search_materials", lambda params, *_, **__: (params, nothing))
     monkeypatch.setattr("wbgs_jax.training.thicknesses._sized", lambda *_: pytest.fail("searched"))
-    found, report = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
     assert found is start and report is nothing
 
 

@@ -33,7 +33,7 @@ from wbgs_jax.training.descent import descend
 from wbgs_jax.training.materials import search_materials
 from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Compared, Told, surely_better
-from wbgs_jax.training.thicknesses import search_slabs
+from wbgs_jax.training.thicknesses import Likely, search_slabs
 from wbgs_jax.types import Links
 
 SPREAD = 0.05
@@ -47,7 +47,8 @@ TURN = 1e-3
 """Standard deviation (radians) of how far surfaces are turned."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
 """Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
-in common is easily taken for the receiver's; and free, where spectra are surely better for it."""
+in common is easily taken for the receiver's; and free, where spectra are surely better for it. Where it then goes far but they
+do not say so surely, both are followed to the end."""
 MORE = 2
 """Times that places are found again, with the materials that they told: where thicknesses are unknown, those follow places, and
 places thicknesses."""
@@ -92,6 +93,8 @@ class Place:
     cache: Any
     known: Float[np.ndarray, "m 3 3"] | None = None
     """Covariances of where the movers stand (square metres); None where they are not known."""
+    likely: Likely | None = None
+    """Slabs that materials may be; None where they have not been looked for."""
 
 
 @dataclass(frozen=True)
@@ -115,9 +118,9 @@ class _Heard:
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
         once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
         if sized:
-            params, _ = search_slabs(now.params, told, once, count, compared)
-        else:
-            params, _ = search_materials(now.params, told.scores(count, compared), once)
+            params, _, likely = search_slabs(now.params, told, once, count, compared, now.likely)
+            return dataclasses.replace(now, params=params, likely=likely)
+        params, _ = search_materials(now.params, told.scores(count, compared), once)
         return dataclasses.replace(now, params=params)
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
@@ -154,20 +157,36 @@ def learn_geometry(
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
     heard, all_heard = _Heard(data, own, config, rng, say), _Heard(data, train, config, rng, say)
     start = _begun(place, heard, links)
-    now, receiver = _followed(start, heard, links, HELD_RECEIVER, named=True), HELD_RECEIVER
+    held = _followed(start, heard, links, HELD_RECEIVER, named=True)
+    found = [(held, HELD_RECEIVER)]
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
-        now, receiver = (free, FREE_RECEIVER) if _surely_better(free, now, heard, links) else (now, receiver)
-    now = _retraced(now, _fresh(now.params, place.params), data.links, data)
-    now = all_heard.named(all_heard.guessed(now), 1)
-    moved = [now, all_heard.named(now, config.rounds, "snapshots", sized=True)]
-    unknown = bool(np.any(np.asarray(place.field.known_thickness) == 0))
+        if _surely_better(free, held, heard, links):
+            found = [(free, FREE_RECEIVER)]
+        elif _went_far(free.field.motion):
+            found += [(free, FREE_RECEIVER)]
+    begun = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
+    return _judged(place, [one for now, width in begun for one in _refined(now, width, all_heard)], all_heard)
+
+
+def _refined(now: Place, receiver: tuple[float, float], heard: _Heard) -> list[Place]:
+    """Returns where things are found by all transmitters, with ever better materials; the last is not always the best."""
+    data, config = heard.data, heard.config
+    now = dataclasses.replace(heard.named(heard.guessed(now), 1), likely=None)  # where things stood before rules nothing out
+    moved = [now, heard.named(now, config.rounds, "snapshots", sized=True)]
+    unknown = bool(np.any(np.asarray(now.field.known_thickness) == 0))
     again = 0 if data.snapshots is None else MORE if unknown else 1
     for _ in range(again):
-        now = _followed(moved[-1], all_heard, data.links, receiver, named=False)
+        now = _followed(moved[-1], heard, data.links, receiver, named=False)
         now = _retraced(now, now.params, data.links, data)
-        moved.append(all_heard.named(now, 1, "snapshots", sized=True))
-    return _judged(place, moved, all_heard)
+        moved.append(heard.named(now, 1, "snapshots", sized=True))
+    return moved
+
+
+def _went_far(motion: Motion) -> bool:
+    """Returns whether a receiver went further than one that is held does by chance: three standard deviations."""
+    far = (np.linalg.norm(motion.receiver, axis=-1), np.linalg.norm(motion.receiver_turn, axis=-1))
+    return any(bool(np.any(one > 3 * width)) for one, width in zip(far, HELD_RECEIVER, strict=True))
 
 
 def _begun(place: Place, heard: _Heard, links: Links) -> Place:
@@ -226,7 +245,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
             params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
             now = dataclasses.replace(now, params=params)
     known = _known(covariance, numbers, variances, len(none.shift)) if data.snapshots is not None else None
-    return Place(now.field.moved(motion), now.params, now.cache, known)
+    return dataclasses.replace(now, field=now.field.moved(motion), known=known)
 
 
 def frequencies_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
@@ -292,7 +311,7 @@ def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[di
 
 
 def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
-    return dataclasses.replace(_traced(now.field, params, links, data), known=now.known)
+    return dataclasses.replace(now, params=params, cache=now.field.prepare(links, data.receivers))
 
 
 def _traced(field: Any, params: Any, links: Links, data: TrainingData) -> Place:

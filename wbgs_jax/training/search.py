@@ -82,7 +82,7 @@ class Search:
             params, _ = self._antennas(params, told, report)
         if config.rounds:
             say("search: materials")
-            params, named = search_slabs(params, told, config, config.spectra)
+            params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             say("search: idealisations")
             for _ in range(SWEEPS):

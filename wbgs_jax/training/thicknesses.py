@@ -43,10 +43,22 @@ SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
 
 
+class Slab(NamedTuple):
+    """An entry of the list of materials, so many metres thick."""
+
+    entry: str
+    metres: float
+
+
+Likely = dict[int, list[Slab]]
+"""Slabs, the best first, that the first frequency cannot tell from each other, of all materials of unknown thickness."""
+
+
 def search_slabs(
-    params: Any, told: Told, config: SearchConfig, count: int, compared: Compared = "snapshots"
-) -> tuple[Any, SearchReport]:
-    """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say.
+    params: Any, told: Told, config: SearchConfig, count: int, compared: Compared = "snapshots", likely: Likely | None = None
+) -> tuple[Any, SearchReport, Likely | None]:
+    """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say; and
+    the slabs that were likely, if any were looked for.
 
     Thicknesses are searched where snapshots are known; to pictures alone materials are as thick as is usual.
 
@@ -56,26 +68,31 @@ def search_slabs(
         config: of the search for materials; `thickness_spectra` are looked at for every frequency.
         count: spectra by which materials are named.
         compared: of those.
+        likely: slabs, where those that are not likely have been ruled out before.
     """
     score, unknown = told.scores(count, compared), np.asarray(told.field.known_thickness) == 0
     named, report = search_materials(params, score, config, usual=bool(unknown.any()))
     if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
-        return named, report
+        return named, report, likely
     once = dataclasses.replace(config, rounds=1)
-    sized, anew = search_materials(_sized(named, unknown, told, config, compared), score, once)
+    params, likely = _sized(named, unknown, told, config, compared, likely)
+    sized, anew = search_materials(params, score, once)
     before, after = score([named, sized])
     if not surely_better(before - after, told.tx_index(count), SURE):
-        return named, report
+        return named, report, likely
     metres = np.exp(np.asarray(sized.materials.log_thickness))
     thick = {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(unknown)}
-    return sized, dataclasses.replace(anew, before=report.before, thickness_mm=thick)
+    return sized, dataclasses.replace(anew, before=report.before, thickness_mm=thick), likely
 
 
-def _sized(params: Any, unknown: Bool[np.ndarray, " m"], told: Told, config: SearchConfig, compared: Compared) -> Any:
-    """Returns parameters with materials and thicknesses as spectra of ever higher frequencies say."""
+def _sized(
+    params: Any, unknown: Bool[np.ndarray, " m"], told: Told, config: SearchConfig, compared: Compared, likely: Likely | None
+) -> tuple[Any, Likely]:
+    """Returns parameters with materials and thicknesses as spectra of ever higher frequencies say, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
     first, *others = frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
-    likely, score = {m: _all_slabs(first) for m in materials}, told.scores(config.thickness_spectra, compared, first)
+    likely = dict(likely or {m: _all_slabs(first) for m in materials})
+    score = told.scores(config.thickness_spectra, compared, first)
     for _ in range(2):
         for material in materials:
             params, likely[material] = _best(params, material, likely[material], score, config.thickness_glance)
@@ -87,7 +104,7 @@ def _sized(params: Any, unknown: Bool[np.ndarray, " m"], told: Told, config: Sea
             near = _slabs_near(params.materials, material, entries, frequency_hz, before)
             params, _ = _best(params, material, near, score, config.thickness_glance)
         before = frequency_hz
-    return params
+    return params, likely
 
 
 def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: float) -> list[float]:
@@ -100,28 +117,23 @@ def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: f
     return [first, *(one for one in others if one <= believed_hz)]
 
 
-class _Slab(NamedTuple):
-    entry: str
-    metres: float
-
-
-def _all_slabs(frequency_hz: float) -> list[_Slab]:
+def _all_slabs(frequency_hz: float) -> list[Slab]:
     """Returns all entries of the list in all thicknesses that differ at a frequency."""
     found = []
     for name in ITU_MATERIALS:
         steps = np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(name, frequency_hz))[:MOST]
-        found += [_Slab(name, float(metres)) for metres in (*SHEETS, *steps)]
+        found += [Slab(name, float(metres)) for metres in (*SHEETS, *steps)]
     return found
 
 
-def _slabs_near(materials: Any, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[_Slab]:
+def _slabs_near(materials: Any, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[Slab]:
     """Returns entries in thicknesses that could not be told from the present one at the frequency before."""
     optical = float(jnp.exp(materials.log_thickness[material]) * jnp.sqrt(1 + jnp.exp(materials.log_susceptibility[material])))
     around, found = int(np.ceil(frequency_hz / before_hz)), []
     for name in entries:
         steps = STEP * _wavelength(name, frequency_hz) * np.arange(-around, around + 1)
         metres = np.clip(optical / np.sqrt(ITU_MATERIALS[name][0]) + steps, THINNEST, THICKEST)
-        found += [_Slab(name, float(one)) for one in np.unique(metres)]
+        found += [Slab(name, float(one)) for one in np.unique(metres)]
     return found
 
 
@@ -130,7 +142,7 @@ def _wavelength(entry: str, frequency_hz: float) -> float:
     return SPEED_OF_LIGHT / frequency_hz / float(np.sqrt(ITU_MATERIALS[entry][0]))
 
 
-def _best(params: Any, material: int, slabs: list[_Slab], score: Scores, glance: int) -> tuple[Any, list[_Slab]]:
+def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[Any, list[Slab]]:
     """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
     better; and the likely ones of them, the best first."""
     candidates = [_made_of(params, material, slab) for slab in slabs]
@@ -143,7 +155,7 @@ def _best(params: Any, material: int, slabs: list[_Slab], score: Scores, glance:
     return close[int(np.argmin(score(close).mean(1)))], likely
 
 
-def _made_of(params: Any, material: int, slab: _Slab) -> Any:
+def _made_of(params: Any, material: int, slab: Slab) -> Any:
     return dataclasses.replace(params, materials=with_entry(params.materials, material, *slab))
 
 
