@@ -31,7 +31,7 @@ from wbgs_jax.inference.neighbours import Neighbours, correct
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 
-FEWEST, MOST = 8, 300
+FEWEST, MOST = 8, 1000
 """Validation spectra below which nothing is said; those that are looked at, at most."""
 FEW = 20
 """Rests below which their own quantiles do not reach `LEVEL`."""
