@@ -47,8 +47,8 @@ TURN = 1e-3
 """Standard deviation (radians) of how far surfaces are turned."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
 """Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
-in common is easily taken for the receiver's; and free, where spectra are surely better for it. Where it then goes far but they
-do not say so surely, both are followed to the end."""
+in common is easily taken for the receiver's; and free. If it then goes far, it stays free where spectra are surely better for
+it, and both are followed to the end where they do not say so surely."""
 MORE = 2
 """Times that places are found again, with the materials that they told: where thicknesses are unknown, those follow places, and
 places thicknesses."""
@@ -161,10 +161,10 @@ def learn_geometry(
     found = [(held, HELD_RECEIVER)]
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
-        if _surely_better(free, held, heard, links):
-            found = [(free, FREE_RECEIVER)]
-        elif _went_far(free.field.motion):
-            found += [(free, FREE_RECEIVER)]
+        if _went_far(free.field.motion):
+            say("search: whether the receiver stands elsewhere")
+            sure = _surely_better(free, held, heard, links)
+            found = [(free, FREE_RECEIVER)] if sure else [*found, (free, FREE_RECEIVER)]
     begun = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
     return _judged(place, [one for now, width in begun for one in _refined(now, width, all_heard)], all_heard)
 
