@@ -93,7 +93,7 @@ class SearchConfig:
     geometry_doubt: float = 5e-4
     """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
     geometry_tx: int = 640
-    """Transmitters that are looked at for that; the last time, all of them."""
+    """Transmitters that are looked at for that at first; once surfaces are roughly in place, all of them."""
     geometry_width: float = 0.02
     """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""
     geometry_spectra: int = 64

@@ -104,6 +104,17 @@ def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
 
 
 @pytest.mark.heavy
+def test_where_no_path_arrives_the_coherent_field_has_no_opinion_of_powers(run):
+    params, index = run.state.params, run.dataset.validation
+    plan, query = run.field.plan(params, run.dataset.receiver()), run.dataset.query(index)
+    coherent = run.field.wave.render(params.wave, plan.wave, query)
+    silent = coherent.power_db.at[0].set(-300.0)
+    powers = run.field._said(params, plan, query, coherent._replace(power_db=silent))[1]
+    np.testing.assert_array_equal(powers.coherent[0], powers.own[0])
+    np.testing.assert_array_equal(powers.coherent[1:], coherent.power_db[1:])
+
+
+@pytest.mark.heavy
 def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     field, params = run.field, run.state.params
     batch = run.data.batch(jnp.asarray(run.dataset.train[:2]), run.key)

@@ -172,14 +172,16 @@ def test_known_thickness_stays_where_it_is_in_training(run_on):
 
 
 @pytest.mark.heavy
-def test_of_powers_alone_the_unknown_gain_is_found(run_on, tmp_path, rng):
+@pytest.mark.parametrize("rounds", [0, 3])
+def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng):
     """Nobody has said what was transmitted; what reflects well and what does not is told by powers."""
-    run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS)), float(rng.uniform(-90, 40))
+    search = dataclasses.replace(SETTINGS.search, rounds=rounds, antenna_rounds=1)
+    run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search), float(rng.uniform(-90, 40))
     run.data = dataclasses.replace(
         run.data, snapshots=None, steering=None, power_db=received_power_db(run.data.snapshots) + offset
     )
     run.control()
     entry = json.loads((tmp_path / "metrics.jsonl").read_text())
-    assert entry["gain_db"] == pytest.approx(offset, abs=2.5)
-    assert entry["search"]["after"] < entry["search"]["before"] - 0.15, entry
-    assert set(entry) == {"step", "search", "gain_db"}
+    assert entry["gain_db"] == pytest.approx(offset, abs=2.5 if rounds else 10)  # wrong materials reflect more or less
+    assert set(entry) == ({"step", "search", "gain_db"} if rounds else {"step", "gain_db"})
+    assert not rounds or entry["search"]["after"] < entry["search"]["before"] - 0.15, entry

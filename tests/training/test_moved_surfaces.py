@@ -12,12 +12,14 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields import wave
-from wbgs_jax.training import search
+from wbgs_jax.training import geometry, search
 from wbgs_jax.training.antennas import AntennaReport, antenna_candidates
+from wbgs_jax.training.controls import silent
 from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
 from wbgs_jax.training.scores import make_scores
+from wbgs_jax.training.thicknesses import Slab
 from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
@@ -120,6 +122,16 @@ def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_h
     expected = found if right else exact.field.init(jax.random.key(0)).transmitter
     assert report.kept and report.antennas_kept == right
     assert all(jax.tree.leaves(jax.tree.map(np.array_equal, place.params.transmitter, expected)))
+
+
+@pytest.mark.heavy
+def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path, monkeypatch):
+    run, likely, traced = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), {0: [Slab("wood", 0.02)]}, []
+    monkeypatch.setattr(geometry, "adjust", lambda field, params, cache, motion, covariance, *_: (motion, covariance))
+    monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or run.cache)
+    heard = geometry._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
+    now = Place(run.field, run.state.params, run.cache, likely=likely)
+    assert geometry._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
 
 
 @pytest.mark.heavy

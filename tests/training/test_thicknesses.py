@@ -11,7 +11,7 @@ from wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.training.materials import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
 from wbgs_jax.training.scores import Told
-from wbgs_jax.training.thicknesses import Slab, frequencies_to_look_at, search_slabs
+from wbgs_jax.training.thicknesses import Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
 SETTINGS = tiny_settings(
@@ -105,6 +105,22 @@ def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     monkeypatch.setattr("wbgs_jax.training.thicknesses._sized", lambda *_: pytest.fail("searched"))
     found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
     assert found is start and report is nothing
+
+
+def test_of_what_no_path_meets_no_slab_is_ruled_out(room):
+    """Of two materials, the scores tell of the second alone."""
+    params, slabs = room.field.init(jax.random.key(0)), _all_slabs(2.4e9)
+
+    def score(candidates, first=None):
+        wanted = np.log(ITU_MATERIALS["glass"][0] - 1)
+        off = [abs(float(one.materials.log_susceptibility[1]) - wanted) for one in candidates]
+        return np.array(off)[:, None] + np.zeros(first or 60)
+
+    same, unseen = _best(params, 0, slabs, score, 48)
+    found, likely = _best(params, 1, slabs, score, 48)
+    assert same is params and unseen == slabs
+    assert len(likely) < len(slabs) and likely[0].entry == "glass"
+    assert float(found.materials.log_susceptibility[1]) == pytest.approx(np.log(ITU_MATERIALS["glass"][0] - 1))
 
 
 def test_frequencies_stand_apart_and_are_believed():

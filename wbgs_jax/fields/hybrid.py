@@ -163,13 +163,15 @@ class HybridField(Field):
         self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
     ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
         """Returns what spectra and powers of B queries are said to be, and what tells whom to trust."""
-        assert coherent.pas is not None, "it knows spectra"
+        assert coherent.pas is not None and coherent.power_db is not None, "it knows both"
         nothing = jnp.zeros_like(coherent.pas)
         own, informed = (
             self.wideband.render(params.wideband, plan.wideband, query, given) for given in (nothing, coherent.pas)
         )
         told = features(query, plan.wave.receiver.position, coherent, own)
-        powers = Opinions(coherent.power_db, own.power_db, informed.power_db)
+        assert own.power_db is not None, "as the coherent field does"
+        met = coherent.power_db > NOT_HEARD_DB  # without any path that has no opinion
+        powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
         return Opinions(coherent.pas, own.pas, informed.pas), powers, told
 
     def probe(self, params: HybridParams) -> Any:

@@ -10,8 +10,8 @@ coherent one does. Each share is
 
 with z what is known beforehand and tells where phases fail: the frequency, how much the two fields disagree, how far below free
 space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
-is. The weights are those by which validation links are explained best; where they explain transmitters that were left out, a
-fifth at a time, no more surely than a common share does, they are zero.
+is. The weights are those by which validation links are explained best; they are zero unless, on transmitters left out a fifth
+at a time, they do better than one common share by more than a standard error.
 """
 
 from collections.abc import Callable
@@ -95,7 +95,7 @@ def at_first() -> Shares:
 
 
 def coherent_alone() -> Shares:
-    """Returns the shares by which the coherent field alone counts."""
+    """Returns the shares by which the coherent field alone counts, within a few thousandths."""
     return Shares(constant(1.0), constant(1.0))
 
 
@@ -170,7 +170,7 @@ def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[n
 
 
 def learn_share(known: Scored) -> Share:
-    """Returns the share that explains links best (host): one for all, unless the features say surely more."""
+    """Returns the share that explains links best (host): one for all, unless the features surely improve on it."""
     common = constant(_best(known.scores))
     folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
     if len(np.unique(known.tx_index)) < 2 * FOLDS:

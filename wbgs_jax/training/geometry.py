@@ -6,7 +6,7 @@ motion whose effect on phases is first-order (propagation/motion.py), found by l
 are no snapshots, by descent (`descent.py`); now and then things are moved and paths traced again. Materials are named as far as
 places are known by then, since powers tell where phases cannot, and by phases once places are found; then all is gone through
 once more, or twice where thicknesses are unknown. A prior keeps what no path sees where it was. What comes out is kept if it
-says training spectra surely better than the mesh as it was, each with as much doubt as suits it.
+predicts training spectra surely better than the mesh as it was, each with the position uncertainty that suits it best.
 """
 
 import dataclasses
@@ -47,11 +47,11 @@ TURN = 1e-3
 """Standard deviation (radians) of how far surfaces are turned."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
 """Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
-in common is easily taken for the receiver's; and free. If it then goes far, it stays free where spectra are surely better for
-it, and both are followed to the end where they do not say so surely."""
+in common is easily taken for the receiver's; and free. If it then goes far, what was found with it free replaces the other
+where spectra are surely better for it; otherwise both are followed to the end."""
 MORE = 2
-"""Times that places are found again, with the materials that they told: where thicknesses are unknown, those follow places, and
-places thicknesses."""
+"""Times that places are found again, with the materials that they told, where thicknesses are unknown: these depend on places,
+and places on thicknesses."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
@@ -197,7 +197,7 @@ def _begun(place: Place, heard: _Heard, links: Links) -> Place:
     """
     new, seed = place.field.init(jax.random.key(0)), int(heard.rng.integers(2**32))
     alike = dataclasses.replace(place.params, materials=new.materials)
-    first = _doubted(_traced(place.field, alike, links, heard.data), heard.config.geometry_width)
+    first = _doubted(_retraced(place, alike, links, heard.data), heard.config.geometry_width)
     ends = [(getattr(place.params, end), getattr(new, end)) for end in ENDS]
     begins = []
     for antennas in itertools.product(*([found] if same(found, before) else [found, before] for found, before in ends)):
@@ -232,7 +232,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     for highest in frequencies_apart(frequency):
         heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
-            now, motion = _traced(now.field.moved(motion), now.params, links, data), none
+            now, motion = _retraced(dataclasses.replace(now, field=now.field.moved(motion)), now.params, links, data), none
             now = heard.named(now, 1) if named else now
             traced_at = float(highest)
         now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
@@ -312,10 +312,6 @@ def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[di
 
 def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
     return dataclasses.replace(now, params=params, cache=now.field.prepare(links, data.receivers))
-
-
-def _traced(field: Any, params: Any, links: Links, data: TrainingData) -> Place:
-    return Place(field, params, field.prepare(links, data.receivers))
 
 
 def _doubted(now: Place, spread: float) -> Place:

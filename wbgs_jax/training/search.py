@@ -74,9 +74,11 @@ class Search:
         if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
             say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
-            params, named = search_materials(params, told.scores(config.spectra), config, usual=True)
-            params, gain = search_gain(params, told.scores(config.spectra))
-            return Edit(params, (), None, {"search": dataclasses.asdict(named), "gain_db": gain}, field, cache)
+            if config.rounds:
+                params, named = search_materials(params, told.scores(config.spectra), config, usual=True)
+                params, gain = search_gain(params, told.scores(config.spectra))
+                report["search"] = dataclasses.asdict(named)
+            return Edit(params, (), None, report | {"gain_db": gain}, field, cache)
         if config.antenna_rounds:
             say("search: antennas")
             params, _ = self._antennas(params, told, report)

@@ -3,8 +3,8 @@
 What passes a slab, or comes back from its far side, has turned by its optical thickness, t sqrt(eps_r), in wavelengths. At low
 frequencies few thicknesses can be told from each other and one look at all of them is enough; every higher frequency then tells
 those apart that the ones before it left, just as surfaces are put in place (geometry.py). Entries of the list of materials are
-tried with the thickness that keeps the optical thickness as it is. Materials as thick as is usual are the beginning, and what
-comes out is taken if it says spectra surely better than those.
+tried with the thickness that keeps the optical thickness as it is. Materials as thick as is usual are the beginning; what comes
+out is taken if it explains snapshots surely better than the materials that were named without it.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ BELIEVED = 0.1
 SHORTLIST = 8
 """Slabs that are looked at closely: the best at a first glance."""
 ONCE_MORE = 60
-"""Slabs that are tried again when all materials have been looked at once: the best at a first glance then ..."""
+"""Slabs that are tried again when all materials have been looked at once, or surfaces have moved: the best at a glance ..."""
 ENTRIES = 6
 """... and entries of the list that are tried at higher frequencies: those of the best of them."""
 BLOCK = 32
@@ -51,7 +51,8 @@ class Slab(NamedTuple):
 
 
 Likely = dict[int, list[Slab]]
-"""Slabs, the best first, that the first frequency cannot tell from each other, of all materials of unknown thickness."""
+"""Of all materials of unknown thickness the best slabs at a first glance, the best first; all slabs of a material that no path
+has met."""
 
 
 def search_slabs(
@@ -100,7 +101,8 @@ def _sized(
     for frequency_hz in others:
         score = told.scores(config.thickness_spectra, compared, frequency_hz)
         for material in materials:
-            entries = list(dict.fromkeys(slab.entry for slab in likely[material]))[:ENTRIES]
+            seen = len(likely[material]) <= ONCE_MORE  # of what no path has met, no entry is likelier than another
+            entries = list(dict.fromkeys(slab.entry for slab in likely[material]))[: ENTRIES if seen else None]
             near = _slabs_near(params.materials, material, entries, frequency_hz, before)
             params, _ = _best(params, material, near, score, config.thickness_glance)
         before = frequency_hz
@@ -148,9 +150,9 @@ def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: 
     candidates = [_made_of(params, material, slab) for slab in slabs]
     first = np.concatenate([_scores(candidates[i : i + BLOCK], score, glance) for i in range(0, len(candidates), BLOCK)])
     order = np.argsort(first)
-    likely = [slabs[i] for i in order[:ONCE_MORE]]
     if np.ptp(first) < UNSEEN:
-        return params, likely
+        return params, slabs
+    likely = [slabs[i] for i in order[:ONCE_MORE]]
     close = [params, *(candidates[i] for i in order[:SHORTLIST])]
     return close[int(np.argmin(score(close).mean(1)))], likely
 
