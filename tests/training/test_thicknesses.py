@@ -129,3 +129,5 @@ def test_frequencies_stand_apart_and_are_believed():
     np.testing.assert_allclose(frequencies_to_look_at(of_data, 30e9), np.array([2.5, 5.2, 28.0]) * 1e9)
     np.testing.assert_allclose(frequencies_to_look_at(of_data, 1e9), [2.5e9])  # one look there is in any case
     assert frequencies_to_look_at(np.full(4, 3e9), np.inf) == [3e9]
+    few = np.array([1.0, 24.25, 77.0]) * 1e9
+    assert frequencies_to_look_at(few, np.inf) == few.tolist(), "a first look at 24.25 GHz would end at walls of 5 cm"

@@ -111,11 +111,13 @@ def _sized(
 
 def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: float) -> list[float]:
     """Returns the highest frequencies of the looks, ascending: those of the data as far as they stand apart and their phases
-    are believed, but not the lowest by itself, which tells little."""
+    are believed, but not the lowest by itself, which tells little, unless the first look at the next would miss thick walls."""
     found = [float(frequency_hz.max())]
     for one in np.unique(frequency_hz)[::-1]:
         found += [float(one)] if one * APART <= found[-1] else []
-    first, *others = found[::-1][min(1, len(found) - 1) :]
+    first, *others = found[::-1]
+    if others and len(_steps("concrete", others[0])) <= MOST:
+        first, *others = others
     return [first, *(one for one in others if one <= believed_hz)]
 
 
@@ -123,9 +125,13 @@ def _all_slabs(frequency_hz: float) -> list[Slab]:
     """Returns all entries of the list in all thicknesses that differ at a frequency."""
     found = []
     for name in ITU_MATERIALS:
-        steps = np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(name, frequency_hz))[:MOST]
-        found += [Slab(name, float(metres)) for metres in (*SHEETS, *steps)]
+        found += [Slab(name, float(metres)) for metres in (*SHEETS, *_steps(name, frequency_hz)[:MOST])]
     return found
+
+
+def _steps(entry: str, frequency_hz: float) -> Float[np.ndarray, " n"]:
+    """Returns thicknesses (metres) that differ at a frequency, up to the thickest."""
+    return np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(entry, frequency_hz))
 
 
 def _slabs_near(materials: Any, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[Slab]:
