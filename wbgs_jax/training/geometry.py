@@ -51,7 +51,7 @@ in common is easily taken for the receiver's; and free. If it then goes far, wha
 where spectra are surely better for it; otherwise both are followed to the end."""
 MORE = 2
 """Times that places are found again, with the materials that they told, where thicknesses are unknown: these depend on places,
-and places on thicknesses."""
+and places on thicknesses. Where they are known, once is enough."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
