@@ -11,6 +11,8 @@ from pathlib import Path
 # Before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("WBGS_CACHE", "")  # command lines under test leave nothing in the home folder
+# Workers have a core each: on one that is shared, the threads of a small solve mostly wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if not os.environ.get("WBGS_TEST_OPTIMISED"):
     # Nearly all of the time goes into compiling programs that run once, on next to nothing: half of it is for their speed.
     FAST_TO_COMPILE = ["--xla_backend_optimization_level=0", "--xla_llvm_disable_expensive_passes=true"]
@@ -26,12 +28,23 @@ MOST_MAPS = 25_000
 SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--draws", type=int, default=1, help="run every test of random inputs this often, on fresh ones each time")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    draws = metafunc.config.getoption("draws")
+    if draws > 1 and "rng" in metafunc.fixturenames:
+        metafunc.parametrize("rng", range(draws), indirect=True)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if "PYTEST_XDIST_WORKER" not in os.environ:
         # What one worker or command has compiled the others load.
         folder = tempfile.TemporaryDirectory(prefix="wbgs-test-cache-", ignore_cleanup_errors=True)
         config.add_cleanup(folder.cleanup)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder.name)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns about tuning flags of cached programs
     # In the environment, so that the workers of pytest-xdist draw the same.
     os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)

@@ -77,8 +77,8 @@ def test_the_first_bits_come_in_order(rng):
         assert not np.asarray(number)[~np.asarray(there)].any()
 
 
-def test_paths_cross_what_brute_force_finds_in_that_order(rng):
-    """Every path of a furnished room, leg by leg."""
+def crossings_compared(rng) -> int:
+    """Compares every path of a furnished room, leg by leg, and says how many crossings that were."""
     parts = [*room(), *(box(low, low + rng.uniform(0.3, 0.9, 3)) for low in rng.uniform(0.3, (4.5, 2.5, 1.2), (12, 3)))]
     tx, rx = rng.uniform(0.2, (5.5, 3.5, 2.4), (2, 3))
     facets = facets_of(*parts)
@@ -100,4 +100,14 @@ def test_paths_cross_what_brute_force_finds_in_that_order(rng):
             leg = paths.interaction_leg[k][paths.interaction_type[k] != NONE]
             assert (np.diff(leg) >= 0).all() and paths.interaction_leg[k][through].tolist() == [int(p) for p in places]
             met += len(crossings)
-    assert met > 20
+    return met
+
+
+def test_paths_cross_what_brute_force_finds_in_that_order(rng):
+    """One room alone may have hardly anything in the way."""
+    met = 0
+    for _ in range(5):
+        met += crossings_compared(rng)
+        if met > 20:
+            return
+    raise AssertionError(f"{met} crossings in five rooms")
