@@ -9,7 +9,7 @@ import pytest
 from experiments.catalogue import SERIES, unique_jobs
 from experiments.jobs import BASELINES, Job
 from experiments.results import FOLDER, Results
-from experiments.series import choices, tuning, wave_choices
+from experiments.series import choices, robustness, tuning, wave_choices
 from experiments.settings import settings
 from experiments.variants import OPTIMIZERS, VARIANTS
 from wbgs_jax.config import check
@@ -103,3 +103,18 @@ def test_a_table_has_seeds_their_median_and_what_is_missing(tmp_path):
 def test_every_series_is_shown(module, tmp_path):
     assert module.jobs() and "not run" in module.render(Results("quick", tmp_path))
     assert "**0." in module.render(Results("quick"))
+
+
+def test_faults_show_the_range_of_seeds_and_how_far_one_command_is_ahead(tmp_path):
+    """Of all together, the others notice the noise."""
+    results = Results("quick", tmp_path)
+    for seed, score in ((0, 0.875), (2, 0.905)):
+        (job,) = (job for job in robustness.HYBRID.jobs_of("2", "all_together") if job.seed == seed)
+        results.write(job, {"average_of_medians": score, "median_ssim": score})
+    results.write(robustness.SPLATTING.jobs_of("2", "snr_20")[0], {"average_of_medians": 0.8, "median_ssim": 0.8})
+    nothing = {"nearest_tx": {"1": 0.6, "2": 0.8}, "inverse_distance": {"1": 0.8, "2": 0.84}}
+    results.write(robustness.NOTHING.jobs_of("2", "snr_20")[0], {"baselines": nothing})
+    lines = robustness.render(results).splitlines()
+    assert "| all together | 0.890 (0.875 to 0.905, 2 seeds) |  |  |  | +0.070 |" in lines
+    assert "| snr 20 | not run | 0.800 | 0.700 | 0.820 |  |" in lines
+    assert sum("least ahead at *all together*, by +0.070" in line for line in lines) == 1
