@@ -1,5 +1,6 @@
 """Named changes of a job's settings: those of the tables, and those that the series try one at a time."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -167,6 +168,17 @@ FAULTS = {
     }.items()
 }
 """What can be wrong, one thing at a time, and the middle ones together."""
+
+
+def at_its_word(fault: str) -> str:
+    """Returns the variant with a fault (or none) in which mesh and arrays are taken to be where the data say."""
+    return "_".join(["at_its_word", *([fault] if fault else [])])
+
+
+_AT_ITS_WORD: Changes = {"search": {"geometry": False, "tuning_spectra": 0}}
+AT_ITS_WORD = {
+    at_its_word(name): dataclasses.replace(variant, changes=_AT_ITS_WORD) for name, variant in {"": Variant(), **FAULTS}.items()
+}
 _STEPS_TO_OURS: dict[str, Changes] = {
     "batch_of_8": {"optim": {"batch": 8}, "field": {"network_lr": 4e-3}},
     "small_networks": {"field": {"width": 64, "depth": 4, "skip": 2, "fusion": 1, "radiance_widths": (32,)}},
@@ -208,5 +220,6 @@ VARIANTS: dict[str, Variant] = {
     **VOLUME,
     **COHERENT,
     **FAULTS,
+    **AT_ITS_WORD,
     **TO_OURS,
 }
