@@ -9,6 +9,7 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
 
+from wbgs_jax.training import scores
 from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
@@ -47,6 +48,29 @@ def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
     first = score(candidates, 3)
     np.testing.assert_allclose(first, found[:, :3], atol=1e-4)
     np.testing.assert_array_equal(score([params, params])[0], score([params])[0])
+
+
+@pytest.mark.heavy
+def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
+    """Compiling one takes as long as scoring thousands; nor does it matter how many transmitters are prepared."""
+    params, train = run.state.params, np.asarray(run.dataset.train)
+    one_tx = train[np.asarray(run.data.links.tx_index)[train] == int(run.data.links.tx_index[train[0]])]
+    few = run.field.prepare(jax.tree.map(lambda leaf: leaf[one_tx], run.data.links), run.data.receivers)
+    candidates = [other_materials(params, rng) for _ in range(11)]
+    found = make_scores(run.field, run.cache, run.data, jnp.asarray(train))(candidates)
+    programs = scores._score._cache_size()
+    np.testing.assert_allclose(
+        make_scores(run.field, few, run.data, jnp.asarray(one_tx))(candidates[:9]), found[:9, np.isin(train, one_tx)], atol=1e-4
+    )
+    assert scores._score._cache_size() == programs
+
+
+def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
+    """In any order, some of them twice."""
+    links = jax.tree.map(lambda leaf: leaf[rng.integers(0, len(run.dataset), 8)], run.data.links)
+    taken = run.field.cache_of(run.cache, links)
+    jax.tree.map(np.testing.assert_array_equal, taken.of(links), run.cache.of(links))
+    assert len(taken.tx_index) == 8
 
 
 def test_one_transmitter_is_never_sure(rng):

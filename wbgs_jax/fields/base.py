@@ -140,6 +140,11 @@ class Field(ABC):
         """Returns what can be known of links before training (host); `receivers` has a leading axis."""
         return None
 
+    def cache_of(self, cache: Any, links: Links) -> Any:
+        """Returns what `prepare` found for B of its links alone, in a shape that depends on B and not on how many others
+        there are."""
+        return cache
+
     def render_links(self, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
         """Returns what `render` does, for links that `prepare` has seen."""
         return self.render(params, plan, links.query)

@@ -18,6 +18,8 @@ from wbgs_jax.types import Links
 
 TRACED_AT_ONCE = 16
 """Transmitters."""
+NUMBERS = ("receiver_index", "tx_index")
+"""Of a pair."""
 
 
 @pytree
@@ -38,6 +40,13 @@ class PreparedPaths:
         numbers = jnp.max(self.tx_index) + 1
         pairs, asked = (one.receiver_index * numbers + one.tx_index for one in (self, links))
         return jnp.searchsorted(pairs, asked)
+
+    def only(self, links: Links) -> "PreparedPaths":
+        """Returns the pairs of links, one for each, so that what is done with them does not depend on how many others there
+        are."""
+        place = jnp.sort(self.place(links))
+        own = {name: jax.tree.map(lambda leaf: leaf[place], getattr(self, name)) for name in ("paths", *NUMBERS)}
+        return dataclasses.replace(self, **own)
 
     def of(self, links: Links) -> TracedPaths:
         """Returns the paths of links, with their axes."""

@@ -175,6 +175,10 @@ class WaveField(Field):
         """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
         return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
+    def cache_of(self, cache: PreparedPaths, links: Links) -> PreparedPaths:
+        """Returns the paths of some links."""
+        return cache.only(links)
+
     def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
         """Returns spectra, snapshots and received power of B queries."""
         check_query(query)

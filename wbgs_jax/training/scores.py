@@ -3,7 +3,7 @@ searches before a training, and the choices after it, compare."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -15,10 +15,12 @@ from scipy.stats import norm, permutation_test
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.data import TrainingData
-from wbgs_jax.types import Batch
+from wbgs_jax.types import Batch, Links
 
 AT_ONCE = 8
 """Spectra."""
+ROOMS = (1, 2, 5, 12, 32)
+"""Numbers of candidates for which there are programs."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 Compared = Literal["snapshots", "covariances", "spectra"]
@@ -37,22 +39,35 @@ class Scores(Protocol):
 
 
 def make_scores(
-    field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+    field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
 ) -> Scores:
     """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
+
+    @cache
+    def block(start: int) -> tuple[Any, Batch]:
+        """Returns what is looked at of so many spectra; the last block repeats its last."""
+        own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
+        return _looked_at(field, prepared, data, own)
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
         structure = jax.tree.structure(candidates[0])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
-        leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, columns, strict=True))
-        if not any(differ):
-            once = _score(field, structure, differ, leaves, cache, data, spectra[:first], compared)
-            return np.repeat(np.asarray(once), len(candidates), 0)
-        return np.asarray(_score(field, structure, differ, leaves, cache, data, spectra[:first], compared))
+        padded = [list(column) + [column[-1]] * (_room(len(column)) - len(column)) for column in columns]
+        leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
+        asked = len(spectra[:first])
+        found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, asked, AT_ONCE)]
+        together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :asked]
+        return together if any(differ) else np.repeat(together, len(candidates), 0)
 
     return score
+
+
+def _room(candidates: int) -> int:
+    """Returns how many candidates a program scores: compiling one for every number takes longer than the few that are scored
+    in vain."""
+    return next((room for room in ROOMS if room >= candidates), candidates)
 
 
 @dataclass(frozen=True)
@@ -79,22 +94,29 @@ class Told:
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
 
 
+@jax.jit
+def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
+    """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
+    links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
+    return field.cache_of(prepared, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
+
+
 @partial(jax.jit, static_argnames=("structure", "differ", "compared"))
 def _score(
     field: Field,
     structure: Any,
     differ: tuple[bool, ...],
     leaves: tuple[Array, ...],
-    cache: Any,
-    data: TrainingData,
-    spectra: Int[Array, " n"],
+    prepared: Any,
+    batches: Batch,
     compared: Compared,
-) -> Float[Array, "k n"]:
+) -> Float[Array, "k m"]:
     """Returns the scores of K candidates whose leaves that differ have a leading axis; of one, where none does."""
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
-        seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
+        plan = field.plan(params, batch.receiver, None, prepared)
+        seen = field.render_links(params, plan, prepared, batch.links)
         if batch.snapshots is not None and compared == "snapshots" and seen.snapshots is not None:
             return log_decorrelation(seen.snapshots, batch.snapshots)[0]
         if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
@@ -104,14 +126,13 @@ def _score(
             return jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - batch.power_db)[0])
         return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas)))
 
-    def one(link: Int[Array, ""]) -> Float[Array, " k"]:
-        batch = data.batch(link[None], jax.random.key(0))
+    def one(batch: Batch) -> Float[Array, " k"]:
         if not any(differ):
             return compare(batch, leaves)[None]
         axes = tuple(0 if own else None for own in differ)
         return jax.vmap(lambda *leaves: compare(batch, leaves), axes)(*leaves)
 
-    return jax.lax.map(one, spectra, batch_size=AT_ONCE).T
+    return jax.vmap(one)(batches).T
 
 
 def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[float, float]:
