@@ -172,7 +172,7 @@ FAULTS = {
 
 def at_its_word(fault: str) -> str:
     """Returns the variant with a fault (or none) in which mesh and arrays are taken to be where the data say."""
-    return "_".join(["at_its_word", *([fault] if fault else [])])
+    return f"at_its_word_{fault}".rstrip("_")
 
 
 _AT_ITS_WORD: Changes = {"search": {"geometry": False, "tuning_spectra": 0}}

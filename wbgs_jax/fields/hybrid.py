@@ -134,9 +134,9 @@ class HybridField(Field):
         """Returns the paths of all transmitters of some links (host)."""
         return None if self.wave is None else self.wave.prepare(links, receivers)
 
-    def cache_of(self, cache: PreparedPaths | None, links: Links) -> PreparedPaths | None:
+    def cache_of(self, cache: Any, links: Links) -> PreparedPaths | None:
         """Returns the paths of some links."""
-        return None if self.wave is None or cache is None else self.wave.cache_of(cache, links)
+        return None if self.wave is None else self.wave.cache_of(cache, links)
 
     def plan(
         self, params: HybridParams, receiver: Receiver, limits: Any = None, cache: PreparedPaths | None = None

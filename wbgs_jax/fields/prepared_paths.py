@@ -18,8 +18,6 @@ from wbgs_jax.types import Links
 
 TRACED_AT_ONCE = 16
 """Transmitters."""
-NUMBERS = ("receiver_index", "tx_index")
-"""Of a pair."""
 
 
 @pytree
@@ -45,8 +43,10 @@ class PreparedPaths:
         """Returns the pairs of links, one for each, so that what is done with them does not depend on how many others there
         are."""
         place = jnp.sort(self.place(links))
-        own = {name: jax.tree.map(lambda leaf: leaf[place], getattr(self, name)) for name in ("paths", *NUMBERS)}
-        return dataclasses.replace(self, **own)
+        paths, receiver_index, tx_index = jax.tree.map(
+            lambda leaf: leaf[place], (self.paths, self.receiver_index, self.tx_index)
+        )
+        return dataclasses.replace(self, paths=paths, receiver_index=receiver_index, tx_index=tx_index)
 
     def of(self, links: Links) -> TracedPaths:
         """Returns the paths of links, with their axes."""

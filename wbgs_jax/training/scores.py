@@ -1,9 +1,9 @@
 """How badly candidates for a field's parameters explain some training spectra, and whether one is surely better: what the
 searches before a training, and the choices after it, compare."""
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -20,7 +20,8 @@ from wbgs_jax.types import Batch, Links
 AT_ONCE = 8
 """Spectra."""
 ROOMS = (1, 2, 5, 12, 32)
-"""Numbers of candidates for which there are programs."""
+"""Numbers of candidates for which there are programs: compiling one for every number takes longer than the few candidates that
+are scored in vain. More than the largest are scored one block after the other."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 Compared = Literal["snapshots", "covariances", "spectra"]
@@ -39,22 +40,25 @@ class Scores(Protocol):
 
 
 def make_scores(
-    field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+    field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
 ) -> Scores:
     """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
 
-    @cache
+    @functools.cache
     def block(start: int) -> tuple[Any, Batch]:
         """Returns what is looked at of so many spectra; the last block repeats its last."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
-        return _looked_at(field, prepared, data, own)
+        return _looked_at(field, cache, data, own)
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+        if len(candidates) > ROOMS[-1]:
+            return np.concatenate([score(candidates[i : i + ROOMS[-1]], first) for i in range(0, len(candidates), ROOMS[-1])])
         structure = jax.tree.structure(candidates[0])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
-        padded = [list(column) + [column[-1]] * (_room(len(column)) - len(column)) for column in columns]
+        vain = next(room for room in ROOMS if room >= len(candidates)) - len(candidates)
+        padded = [column + column[-1:] * vain for column in columns]
         leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
         asked = len(spectra[:first])
         found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, asked, AT_ONCE)]
@@ -62,12 +66,6 @@ def make_scores(
         return together if any(differ) else np.repeat(together, len(candidates), 0)
 
     return score
-
-
-def _room(candidates: int) -> int:
-    """Returns how many candidates a program scores: compiling one for every number takes longer than the few that are scored
-    in vain."""
-    return next((room for room in ROOMS if room >= candidates), candidates)
 
 
 @dataclass(frozen=True)
@@ -95,19 +93,19 @@ class Told:
 
 
 @jax.jit
-def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
+def _looked_at(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
     """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
-    return field.cache_of(prepared, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
+    return field.cache_of(cache, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
-@partial(jax.jit, static_argnames=("structure", "differ", "compared"))
+@functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
 def _score(
     field: Field,
     structure: Any,
     differ: tuple[bool, ...],
     leaves: tuple[Array, ...],
-    prepared: Any,
+    cache: Any,
     batches: Batch,
     compared: Compared,
 ) -> Float[Array, "k m"]:
@@ -115,8 +113,7 @@ def _score(
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
-        plan = field.plan(params, batch.receiver, None, prepared)
-        seen = field.render_links(params, plan, prepared, batch.links)
+        seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
         if batch.snapshots is not None and compared == "snapshots" and seen.snapshots is not None:
             return log_decorrelation(seen.snapshots, batch.snapshots)[0]
         if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:

@@ -37,8 +37,6 @@ ONCE_MORE = 60
 """Slabs that are tried again when all materials have been looked at once, or surfaces have moved: the best at a glance ..."""
 ENTRIES = 6
 """... and entries of the list that are tried at higher frequencies: those of the best of them."""
-BLOCK = 32
-"""Slabs that are scored at once; so many, always, that nothing is compiled twice."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
 
@@ -154,7 +152,7 @@ def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: 
     """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
     better; and the likely ones of them, the best first."""
     candidates = [_made_of(params, material, slab) for slab in slabs]
-    first = np.concatenate([_scores(candidates[i : i + BLOCK], score, glance) for i in range(0, len(candidates), BLOCK)])
+    first = score(candidates, glance).mean(1)
     order = np.argsort(first)
     if np.ptp(first) < UNSEEN:
         return params, slabs
@@ -165,9 +163,3 @@ def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: 
 
 def _made_of(params: Any, material: int, slab: Slab) -> Any:
     return dataclasses.replace(params, materials=with_entry(params.materials, material, *slab))
-
-
-def _scores(candidates: list[Any], score: Scores, glance: int) -> Float[np.ndarray, " k"]:
-    """Returns the mean scores of at most a block of candidates at a first glance."""
-    padded = candidates + candidates[-1:] * (BLOCK - len(candidates))
-    return score(padded, glance)[: len(candidates)].mean(1)
