@@ -52,6 +52,9 @@ where spectra are surely better for it; otherwise both are followed to the end."
 MORE = 2
 """Times that places are found again, with the materials that they told, where thicknesses are unknown: these depend on places,
 and places on thicknesses. Where they are known, once is enough."""
+MOST = 5
+"""Times at most where the receiver is free: it can be far from where it was said to be, and walls that stand right take long to
+give back what they took on for it. Places are found again until it goes no further than a held one may."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 
@@ -161,7 +164,7 @@ def learn_geometry(
     found = [(held, HELD_RECEIVER)]
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
-        if _went_far(free.field.motion):
+        if _went_far(free.field.motion, 3.0):  # further than by chance
             say("search: whether the receiver stands elsewhere")
             sure = _surely_better(free, held, heard, links)
             found = [(free, FREE_RECEIVER)] if sure else [*found, (free, FREE_RECEIVER)]
@@ -175,18 +178,22 @@ def _refined(now: Place, receiver: tuple[float, float], heard: _Heard) -> list[P
     now = dataclasses.replace(heard.named(heard.guessed(now), 1), likely=None)  # where things stood before rules nothing out
     moved = [now, heard.named(now, config.rounds, "snapshots", sized=True)]
     unknown = bool(np.any(np.asarray(now.field.known_thickness) == 0))
-    again = 0 if data.snapshots is None else MORE if unknown else 1
-    for _ in range(again):
+    least = 0 if data.snapshots is None else MORE if unknown else 1
+    most = MOST if least and receiver == FREE_RECEIVER else least
+    for times in range(1, most + 1):
+        before = moved[-1].field.motion
         now = _followed(moved[-1], heard, data.links, receiver, named=False)
         now = _retraced(now, now.params, data.links, data)
         moved.append(heard.named(now, 1, "snapshots", sized=True))
+        if times >= least and not _went_far(jax.tree.map(np.subtract, now.field.motion, before), 1.0):
+            break
     return moved
 
 
-def _went_far(motion: Motion) -> bool:
-    """Returns whether a receiver went further than one that is held does by chance: three standard deviations."""
+def _went_far(motion: Motion, deviations: float) -> bool:
+    """Returns whether a receiver went further than so many standard deviations of how far one goes that is held."""
     far = (np.linalg.norm(motion.receiver, axis=-1), np.linalg.norm(motion.receiver_turn, axis=-1))
-    return any(bool(np.any(one > 3 * width)) for one, width in zip(far, HELD_RECEIVER, strict=True))
+    return any(bool(np.any(one > deviations * width)) for one, width in zip(far, HELD_RECEIVER, strict=True))
 
 
 def _begun(place: Place, heard: _Heard, links: Links) -> Place:
