@@ -119,7 +119,7 @@ _NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
 _NO_SEARCH: Changes = {"search": {"rounds": 0}}
-_AS_IT_IS: Changes = {"search": {"geometry": False}}
+_AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0}}
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
@@ -175,7 +175,7 @@ def at_its_word(fault: str) -> str:
     return f"at_its_word_{fault}".rstrip("_")
 
 
-_AT_ITS_WORD: Changes = {"search": {"geometry": False, "tuning_spectra": 0}}
+_AT_ITS_WORD: Changes = {"search": {"geometry": False, "absent_spectra": 0, "tuning_spectra": 0}}
 AT_ITS_WORD = {
     at_its_word(name): dataclasses.replace(variant, changes=_AT_ITS_WORD) for name, variant in {"": Variant(), **FAULTS}.items()
 }

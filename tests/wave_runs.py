@@ -10,6 +10,7 @@ from synthetic import tiny_scene
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
 from wbgs_jax.training.loop import Run
+from wbgs_jax.types import make_query
 
 RX = (1.0, 1.0, 1.2)
 PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
@@ -38,6 +39,14 @@ def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None
         meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": THICKNESS} for i in range(len(parts))]},
     )
     return Run(scene_dataset(scene), "wave", settings, 0, folder)
+
+
+def heard_in(run, params, tx_positions, frequencies_hz):
+    """Snapshots of all places at all frequencies (tx, 1, freq, 16), paths and all."""
+    n_tx, n = len(tx_positions), len(frequencies_hz)
+    query = make_query(np.repeat(tx_positions, n, 0), np.tile(frequencies_hz, n_tx))
+    heard = jax.jit(wave.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
+    return np.asarray(heard).reshape(n_tx, 1, n, 16)
 
 
 @jax.jit

@@ -80,6 +80,10 @@ class SearchConfig:
     """Training spectra that are looked at for them."""
     antenna_sure: float = 3.0
     """Standard errors by which another antenna must fit better than the one that is there."""
+    absent_spectra: int = 768
+    """Training spectra of low frequencies that are looked at for bodies of the mesh that are not there; 0: all are there ..."""
+    absent_glance: int = 96
+    """... and the first of them, by which bodies are narrowed down to a few."""
     ideal_spectra: int = 96
     """Training spectra that are looked at for what ray tracers leave out."""
     tuning_spectra: int = 320

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 from synthetic import tiny_settings
-from wave_runs import PARTS, RX, places, run_in
+from wave_runs import PARTS, RX, heard_in, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import geometry, search
@@ -43,14 +43,7 @@ def truth(tmp_path_factory):
         slope=jnp.full(len(PARTS), d),
     )
     params = dataclasses.replace(run.state.params, materials=materials)
-    return heard_in(run, params), params
-
-
-def heard_in(run, params):
-    """Snapshots of all places."""
-    query = make_query(np.repeat(PLACES, len(FREQUENCIES), 0), np.tile(FREQUENCIES, N_TX))
-    heard = jax.jit(wave.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
-    return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16)
+    return heard_in(run, params, PLACES, FREQUENCIES), params
 
 
 def learned(truth, parts, folder, receiver=RX, found=None):
@@ -116,7 +109,7 @@ def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_h
     heard, params = truth
     if right:
         params = dataclasses.replace(params, transmitter=found)
-        heard = heard_in(exact, params)
+        heard = heard_in(exact, params, PLACES, FREQUENCIES)
     (place, report), _ = learned((heard, params), shifted(PARTS, 0.006, rng), tmp_path / "shifted", found=found)
     expected = found if right else exact.field.init(jax.random.key(0)).transmitter
     assert report.kept and report.antennas_kept == right

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Key
+from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
@@ -215,6 +215,18 @@ class WaveField(Field):
         total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
         places = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": total}
         return dataclasses.replace(self, **{name: to_device(place) for name, place in places.items()})
+
+    def without(self, movers: Int[np.ndarray, " k"]) -> "WaveField":
+        """Returns the field of a scene in which some movers are not there (host)."""
+        stays = np.setdiff1d(np.arange(len(self.motion.shift)), movers)
+        own = np.isin(np.asarray(self.facets.mover), stays)
+        left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], self.facets)
+        facets = dataclasses.replace(left, mover=np.searchsorted(stays, left.mover).astype(np.int32))
+        motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
+        placement = self.first_placement[np.append(stays, -1)]
+        parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
+        moved = {name: to_device(part) for name, part in parts.items()}
+        return dataclasses.replace(self, **moved, first_placement=placement)
 
     def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""

@@ -68,7 +68,7 @@ class WaveConfig:
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """There are a few numbers a material to learn, no networks."""
 SEARCH = {
-    "smoke": SearchConfig(rounds=1, spectra=32, antenna_rounds=0, tuning_spectra=0, geometry=False),
+    "smoke": SearchConfig(rounds=1, spectra=32, antenna_rounds=0, absent_spectra=0, tuning_spectra=0, geometry=False),
     "cpu": SearchConfig(),
     "gpu": SearchConfig(),
 }

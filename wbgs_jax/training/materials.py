@@ -106,7 +106,12 @@ def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], e
 
 def with_entry(materials: Any, material: int, name: str, metres: float | None = None) -> Any:
     """Returns a copy in which one material is an entry of ITU-R P.2040, so many metres thick, or as thick as before."""
-    permittivity, c, d = ITU_MATERIALS[name]
+    return with_properties(materials, material, *ITU_MATERIALS[name], metres)
+
+
+def with_properties(materials: Any, material: int, permittivity: float, c: float, d: float, metres: float | None = None) -> Any:
+    """Returns a copy in which one material has another relative permittivity (above 1), the conductivity c f^d (S/m, f in GHz),
+    and is so many metres thick, or as thick as before."""
     new = {"log_susceptibility": np.log(permittivity - 1), "log_conductivity": np.log(c), "slope": d}
     new |= {} if metres is None else {"log_thickness": np.log(metres)}
     return dataclasses.replace(materials, **{leaf: _with(getattr(materials, leaf), material, new[leaf]) for leaf in new})

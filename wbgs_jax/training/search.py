@@ -1,8 +1,9 @@
-"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, idealisations, tuning,
-places.
+"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, bodies that are not
+there, idealisations, tuning, places.
 
-The first two are a choice among known ones by how well they explain some training spectra; surfaces are moved where the mesh is
-doubtful, and how far they may still be off is guessed. Training goes on from there.
+The first two are a choice among known ones by how well they explain some training spectra; bodies without which spectra are
+explained better are left out of the mesh; surfaces are moved where it is doubtful, and how far they may still be off is
+guessed. Training goes on from there.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ import numpy as np
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
+from wbgs_jax.training.absent import search_absent
 from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.controls import Context, Edit
 from wbgs_jax.training.geometry import Place, learn_geometry
@@ -65,8 +67,8 @@ class Search:
     def apply(
         self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field with its
-        surfaces moved if the mesh is doubtful."""
+        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field without
+        bodies that are not there, its surfaces moved if the mesh is doubtful."""
         config, data, cache, say = self.config, context.data, context.cache, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
@@ -86,6 +88,11 @@ class Search:
             say("search: materials")
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
+            if config.absent_spectra:
+                say("search: bodies that are not there")
+                params, told, absent = search_absent(params, told, config)
+                report["absent"] = dataclasses.asdict(absent)
+                field, cache = told.field, told.cache
             say("search: idealisations")
             for _ in range(SWEEPS):
                 params = self._idealisations(params, told, report)

@@ -1,0 +1,106 @@
+"""Bodies that the mesh has and the room does not are left out of it; those that are there stay, even in a wrong mesh."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rooms import box
+from synthetic import tiny_settings
+from wave_runs import PARTS, heard_in, places, run_in
+
+from wbgs_jax.training.absent import absent_movers
+from wbgs_jax.training.materials import ITU_MATERIALS
+from wbgs_jax.training.scores import Told
+
+N_TX, FREQUENCIES = 60, np.array([1e9, 4e9, 16e9])
+PLACES = places(N_TX, 0.4)
+SETTINGS = tiny_settings(
+    "wave",
+    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    optim={"steps": 4, "min_steps": 4},
+    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absent_glance": 24, "tuning_spectra": 0},
+)
+
+
+def of_concrete(run):
+    """Parameters in which everything is of concrete."""
+    permittivity, c, d = ITU_MATERIALS["concrete"]
+    params = run.state.params
+    values = {"log_susceptibility": np.log(permittivity - 1), "log_conductivity": np.log(c), "slope": d}
+    leaves = {name: jnp.full_like(getattr(params.materials, name), value) for name, value in values.items()}
+    return dataclasses.replace(params, materials=dataclasses.replace(params.materials, **leaves))
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """Snapshots of a room of concrete, in all places."""
+    run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("true"), PLACES, FREQUENCIES)
+    return heard_in(run, of_concrete(run), PLACES, FREQUENCIES)
+
+
+def told_of(parts, truth, folder):
+    run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, truth)
+    return run, Told(run.field, run.cache, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+
+
+def anything(rng):
+    """A box a metre high that stands in nobody's way: neither the receiver's nor the other box's."""
+    low = rng.uniform((1.6, 0.6, 0.3), (2.4, 3.0, 1.0))
+    return box(low, low + rng.uniform(0.4, 0.6, 3) + (0, 0, 0.5))
+
+
+def corners(field):
+    return np.unique(np.round(np.sort(np.asarray(field.facets.corners).reshape(-1, 12), 1), 5), axis=0)
+
+
+def test_a_field_without_a_mover_is_that_of_the_mesh_without_it(truth, tmp_path, rng):
+    extra = anything(rng)
+    more, _ = told_of([*PARTS, extra], truth, tmp_path / "more")
+    fewer, _ = told_of(PARTS, truth, tmp_path / "fewer")
+    middle = np.asarray(more.field.facets.corners).mean(1)
+    mover = np.unique(
+        np.asarray(more.field.facets.mover)[np.all(np.abs(middle - extra.bounds.mean(0)) < 0.55 * extra.extents, -1)]
+    )
+    assert len(mover) == 1
+    left = more.field.without(mover)
+    np.testing.assert_allclose(corners(left), corners(fewer.field), atol=1e-5)
+    assert (
+        left.motion.shift.shape == fewer.field.motion.shift.shape
+        and left.first_placement.shape == fewer.field.first_placement.shape
+    )
+    assert np.count_nonzero(left.edges.length) == np.count_nonzero(fewer.field.edges.length)
+    params = of_concrete(more)
+    alike = dataclasses.replace(left.init(jax.random.key(0)), materials=params.materials)
+    more.field = left
+    np.testing.assert_allclose(heard_in(more, alike, PLACES, FREQUENCIES), truth, atol=1e-5 * np.abs(truth).max())
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("metres", [0.0, 0.02])
+def test_what_is_there_stays(metres, truth, tmp_path, rng):
+    """Also where all of it stands two centimetres off."""
+    wrong = [part.copy().apply_translation(rng.normal(0, metres, 3)) for part in PARTS]
+    run, told = told_of(wrong, truth, tmp_path)
+    assert not len(absent_movers(of_concrete(run), told, SETTINGS.search))
+
+
+@pytest.mark.heavy
+def test_what_is_not_there_is_left_out_and_a_training_goes_on_without_it(truth, tmp_path, rng):
+    extra = anything(rng)
+    run, _ = told_of([*PARTS, extra], truth, tmp_path)
+    facets = run.field.facets.offset.shape[0]
+    run.control()
+    report = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[0])["absent"]
+    print(extra.bounds, report)
+    assert len(report["centres"]) == 1 and report["after"] < report["before"] - 0.1
+    np.testing.assert_allclose(report["centres"][0], extra.bounds.mean(0), atol=1e-3)
+    assert run.field.facets.offset.shape[0] == facets - 6
+    run.epoch()
+    run.save()
+    again, _ = told_of([*PARTS, extra], truth, tmp_path)
+    assert again.restore() and again.field.facets.offset.shape[0] == facets - 6
+    for ours, theirs in zip(jax.tree.leaves(again.state.params), jax.tree.leaves(run.state.params), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
