@@ -23,7 +23,8 @@ SERIES = (HYBRID, AT_WORD, SPLATTING)
 LEARN_NOTHING = {"nearest_tx": "nearest TX", "inverse_distance": "1/d² weighting"}
 NOTE = (
     "Scene {scene}: averages over ten frequencies of the median SSIM, profile `{profile}`, of one seed (it draws faults too),"
-    " or the median of several and their range. *At its word*: without the search for where surfaces, receiver and arrays are."
+    " or the median of several and their range. *At its word*: without the search for absent bodies and for where"
+    " surfaces, receiver and arrays are."
     " The last column is the first minus the best of the last three; where a fault is of the mesh alone, these are of"
     " data in which nothing is wrong, and of all together they notice the noise."
 )

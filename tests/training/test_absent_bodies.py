@@ -11,7 +11,7 @@ from rooms import box
 from synthetic import tiny_settings
 from wave_runs import PARTS, heard_in, places, run_in
 
-from wbgs_jax.training.absent import absent_movers
+from wbgs_jax.training.absent import absent_movers, search_absent
 from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.scores import Told
 
@@ -21,7 +21,7 @@ SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
     optim={"steps": 4, "min_steps": 4},
-    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absent_glance": 24, "tuning_spectra": 0},
+    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absent_spectra": 768, "absent_glance": 24, "tuning_spectra": 0},
 )
 
 
@@ -84,7 +84,27 @@ def test_what_is_there_stays(metres, truth, tmp_path, rng):
     """Also where all of it stands two centimetres off."""
     wrong = [part.copy().apply_translation(rng.normal(0, metres, 3)) for part in PARTS]
     run, told = told_of(wrong, truth, tmp_path)
-    assert not len(absent_movers(of_concrete(run), told, SETTINGS.search))
+    _, same, report = search_absent(of_concrete(run), told, SETTINGS.search)
+    assert same is told and not report.centres and report.after == report.before
+
+
+@pytest.mark.heavy
+def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
+    """At high frequencies alone, where places are not believed; and bodies that have lost all of their facets change nothing."""
+    run, told = told_of([*PARTS, anything(rng)], truth, tmp_path)
+    params = of_concrete(run)
+    high = dataclasses.replace(told, spectra=told.spectra[told.frequency_hz() > 2e9])
+    assert not len(absent_movers(params, high, SETTINGS.search))
+    ghosts = [jnp.concatenate([leaf, jnp.zeros((2, 3))]) for leaf in (run.field.motion.shift, run.field.motion.turn)]
+    motion = dataclasses.replace(run.field.motion, shift=ghosts[0], turn=ghosts[1])
+    mover = jnp.where(run.field.facets.mover > 0, run.field.facets.mover + 2, 0)  # two have lost all of their facets
+    facets = dataclasses.replace(run.field.facets, mover=mover)
+    surfaces = dataclasses.replace(run.cache.surfaces, facets=dataclasses.replace(run.cache.surfaces.facets, mover=mover))
+    field = dataclasses.replace(run.field, facets=facets, motion=motion)
+    large = dataclasses.replace(told, field=field, cache=dataclasses.replace(run.cache, surfaces=surfaces))
+    np.testing.assert_array_equal(
+        absent_movers(params, large, SETTINGS.search), absent_movers(params, told, SETTINGS.search) + 2
+    )
 
 
 @pytest.mark.heavy

@@ -1,12 +1,13 @@
 """Surfaces of a mesh that is wrong by millimetres to centimetres, put where the spectra say they are, on the host.
 
-A length that is off by a tenth of a wavelength is hardly seen, one that is off by a whole one cannot be told from right. So low
-frequencies come first, and each narrows it down for the next: every mover of the facets, and the receiver, gets a small rigid
-motion whose effect on phases is first-order (propagation/motion.py), found by least squares (`adjustment.py`) or, where there
-are no snapshots, by descent (`descent.py`); now and then things are moved and paths traced again. Materials are named as far as
-places are known by then, since powers tell where phases cannot, and by phases once places are found; then all is gone through
-once more, or twice where thicknesses are unknown. A prior keeps what no path sees where it was. What comes out is kept if it
-predicts training spectra surely better than the mesh as it was, each with the position uncertainty that suits it best.
+A length that is off by a tenth of a wavelength is hardly seen, one that is off by a whole one cannot be told from right. So
+low frequencies come first, and each narrows it down for the next: every mover of the facets, and the receiver, gets a small
+rigid motion whose effect on phases is first-order (propagation/motion.py), found by least squares (`adjustment.py`) or, where
+there are no snapshots, by descent (`descent.py`); now and then things are moved and paths traced again. Materials are named
+as far as places are known by then, since powers tell where phases cannot, and by phases once places are found; then all is
+gone through once more, or twice where thicknesses are unknown, and more often where a free receiver still moves. A prior
+keeps what no path sees where it was. What comes out is kept if it predicts training spectra surely better than the mesh as it
+was, each with the position uncertainty that suits it best.
 """
 
 import dataclasses
@@ -54,7 +55,7 @@ MORE = 2
 and places on thicknesses. Where they are known, once is enough."""
 MOST = 5
 """Times at most where the receiver is free: it can be far from where it was said to be, and walls that stand right take long to
-give back what they took on for it. Places are found again until it goes no further than a held one may."""
+give back what they took on for it. Places are found again until it goes no further than a standard deviation of a held one."""
 SURE = 2.0
 """As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
 

@@ -67,8 +67,8 @@ class Search:
     def apply(
         self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field without
-        bodies that are not there, its surfaces moved if the mesh is doubtful."""
+        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
+        bodies that are not there and with its surfaces moved if the mesh is doubtful."""
         config, data, cache, say = self.config, context.data, context.cache, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
@@ -89,10 +89,12 @@ class Search:
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             if config.absent_spectra:
-                say("search: bodies that are not there")
-                params, told, absent = search_absent(params, told, config)
+                params, told, absent = search_absent(params, told, config, say)
                 report["absent"] = dataclasses.asdict(absent)
-                field, cache = told.field, told.cache
+                if absent.centres:
+                    field, cache = told.field, told.cache
+                    params, named, _ = search_slabs(params, told, config, config.spectra)
+                    report["search"] = dataclasses.asdict(named)
             say("search: idealisations")
             for _ in range(SWEEPS):
                 params = self._idealisations(params, told, report)
