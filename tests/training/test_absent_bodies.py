@@ -90,7 +90,7 @@ def test_what_is_there_stays(metres, truth, tmp_path, rng):
 
 @pytest.mark.heavy
 def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
-    """At high frequencies alone, where places are not believed; and bodies that have lost all of their facets change nothing."""
+    """At high frequencies alone, where places are not believed; and bodies without facets change nothing."""
     run, told = told_of([*PARTS, anything(rng)], truth, tmp_path)
     params = of_concrete(run)
     high = dataclasses.replace(told, spectra=told.spectra[told.frequency_hz() > 2e9])
