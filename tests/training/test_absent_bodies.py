@@ -56,6 +56,7 @@ def corners(field):
     return np.unique(np.round(np.sort(np.asarray(field.facets.corners).reshape(-1, 12), 1), 5), axis=0)
 
 
+@pytest.mark.heavy
 def test_a_field_without_a_mover_is_that_of_the_mesh_without_it(truth, tmp_path, rng):
     extra = anything(rng)
     more, _ = told_of([*PARTS, extra], truth, tmp_path / "more")
