@@ -36,7 +36,7 @@ from wbgs_jax.fields.wave_channel import (
 )
 from wbgs_jax.fields.wave_settings import MAX_FACETS, PRESETS, WaveConfig
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
-from wbgs_jax.propagation.facets import Facets
+from wbgs_jax.propagation.facets import Facets, remaining
 from wbgs_jax.propagation.facets import moved as move_facets
 from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.propagation.motion import Motion, still
@@ -212,21 +212,18 @@ class WaveField(Field):
     def moved(self, motion: Motion) -> "WaveField":
         """Returns the field of a scene in which things stand elsewhere (host)."""
         facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
-        total = jax.tree.map(lambda a, b: a + b, self.motion, motion)
-        places = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": total}
-        return dataclasses.replace(self, **{name: to_device(place) for name, place in places.items()})
+        return self._of(facets, jax.tree.map(lambda a, b: a + b, self.motion, motion))
 
     def without(self, movers: Int[np.ndarray, " k"]) -> "WaveField":
         """Returns the field of a scene in which some movers are not there (host)."""
         stays = np.setdiff1d(np.arange(len(self.motion.shift)), movers)
-        own = np.isin(np.asarray(self.facets.mover), stays)
-        left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], self.facets)
-        facets = dataclasses.replace(left, mover=np.searchsorted(stays, left.mover).astype(np.int32))
         motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
         placement = self.first_placement[np.append(stays, -1)]
+        return dataclasses.replace(self._of(remaining(self.facets, stays), motion), first_placement=placement)
+
+    def _of(self, facets: Facets, motion: Motion) -> "WaveField":
         parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
-        moved = {name: to_device(part) for name, part in parts.items()}
-        return dataclasses.replace(self, **moved, first_placement=placement)
+        return dataclasses.replace(self, **{name: to_device(part) for name, part in parts.items()})
 
     def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
@@ -235,19 +232,16 @@ class WaveField(Field):
 
     def electrical(self, params: WaveParams) -> Electrical:
         """Returns the properties of the materials, as far as they were learned."""
-        m = jax.tree.map(np.asarray, params.materials)
-        known = np.asarray(self.known_thickness)
+        m, known = jax.tree.map(np.asarray, (params.materials, self.known_thickness))
         thickness = np.where(known > 0, known, np.exp(m.log_thickness))
         return Electrical(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
 
     def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
         """Returns parameters in which one material has another permittivity (above 1) and conductivity."""
         m = params.materials
-        changed = dataclasses.replace(
-            m,
-            log_susceptibility=m.log_susceptibility.at[material].set(np.log(permittivity - 1)),
-            log_conductivity=m.log_conductivity.at[material].set(np.log(conductivity)),
-        )
+        polarised = m.log_susceptibility.at[material].set(np.log(permittivity - 1))
+        conducting = m.log_conductivity.at[material].set(np.log(conductivity))
+        changed = dataclasses.replace(m, log_susceptibility=polarised, log_conductivity=conducting)
         return dataclasses.replace(params, materials=changed)
 
     def with_thickness(self, plan: WavePlan, material: int, metres: float) -> tuple["WaveField", WavePlan]:
@@ -277,8 +271,7 @@ class WaveField(Field):
     def sizes(self, params: WaveParams) -> dict[str, int]:
         """Returns the numbers of materials, facets and edges."""
         edges = int(np.count_nonzero(np.asarray(self.edges.length)))
-        counts = self.known_thickness.shape[0], self.facets.offset.shape[0], edges
-        return dict(zip(("materials", "facets", "edges"), counts, strict=True))
+        return {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:

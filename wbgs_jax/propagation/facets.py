@@ -7,6 +7,7 @@ material that meet, such as the walls of a room. Objects that are closed stay ap
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -100,6 +101,13 @@ def moved(facets: Facets, shift: Float[np.ndarray, "m 3"], turn: Float[np.ndarra
     corners = centre[:, None] + turned + np.asarray(shift, np.float64)[mover][:, None]
     normal = rotation.apply(np.asarray(facets.normal, np.float64))
     return dataclasses.replace(facets, corners=corners, normal=normal, offset=np.sum(normal * corners.mean(1), -1))
+
+
+def remaining(facets: Facets, movers: Int[np.ndarray, " k"]) -> Facets:
+    """Returns the facets of some movers (ascending), which are numbered anew in their order."""
+    own = np.isin(np.asarray(facets.mover), movers)
+    left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], facets)
+    return dataclasses.replace(left, mover=np.searchsorted(movers, left.mover).astype(np.int32))
 
 
 def outline_of(facets: Facets) -> Outline:
