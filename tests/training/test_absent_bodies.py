@@ -80,10 +80,9 @@ def test_a_field_without_a_mover_is_that_of_the_mesh_without_it(truth, tmp_path,
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("metres", [0.0, 0.02])
-def test_what_is_there_stays(metres, truth, tmp_path, rng):
-    """Also where all of it stands two centimetres off."""
-    wrong = [part.copy().apply_translation(rng.normal(0, metres, 3)) for part in PARTS]
+def test_what_is_there_stays(truth, tmp_path, rng):
+    """Though all of it stands two centimetres off."""
+    wrong = [part.copy().apply_translation(rng.normal(0, 0.02, 3)) for part in PARTS]
     run, told = told_of(wrong, truth, tmp_path)
     _, same, report = search_absent(of_concrete(run), told, SETTINGS.search)
     assert same is told and not report.centres and report.after == report.before
