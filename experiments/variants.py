@@ -175,7 +175,7 @@ def at_its_word(fault: str) -> str:
     return f"at_its_word_{fault}".rstrip("_")
 
 
-_AT_ITS_WORD: Changes = {"search": {"geometry": False, "absent_spectra": 0, "tuning_spectra": 0}}
+_AT_ITS_WORD: Changes = {"search": {**_AS_IT_IS["search"], "tuning_spectra": 0}}
 AT_ITS_WORD = {
     at_its_word(name): dataclasses.replace(variant, changes=_AT_ITS_WORD) for name, variant in {"": Variant(), **FAULTS}.items()
 }

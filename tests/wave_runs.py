@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rooms import box, mesh_of, room
 from synthetic import tiny_scene
@@ -10,6 +11,7 @@ from synthetic import tiny_scene
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import wave
 from wbgs_jax.training.loop import Run
+from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.types import make_query
 
 RX = (1.0, 1.0, 1.2)
@@ -39,6 +41,15 @@ def run_in(parts, settings, folder, tx_positions, frequencies_hz, snapshots=None
         meta={"parts": [{"name": f"{i}", "material": f"{i}", "thickness": THICKNESS} for i in range(len(parts))]},
     )
     return Run(scene_dataset(scene), "wave", settings, 0, folder)
+
+
+def of_concrete(run):
+    """The run's parameters with everything made of concrete."""
+    permittivity, c, d = ITU_MATERIALS["concrete"]
+    materials = run.state.params.materials
+    values = {"log_susceptibility": np.log(permittivity - 1), "log_conductivity": np.log(c), "slope": d}
+    leaves = {name: jnp.full_like(materials.slope, value) for name, value in values.items()}
+    return dataclasses.replace(run.state.params, materials=dataclasses.replace(materials, **leaves))
 
 
 def heard_in(run, params, tx_positions, frequencies_hz):

@@ -9,14 +9,13 @@ import numpy as np
 import optax
 import pytest
 from synthetic import tiny_settings
-from wave_runs import PARTS, RX, heard_in, places, run_in
+from wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
 
 from wbgs_jax.fields import wave
 from wbgs_jax.training import geometry, search
 from wbgs_jax.training.antennas import AntennaReport, antenna_candidates
 from wbgs_jax.training.controls import silent
 from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
-from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.training.placement import SPREADS_M, search_placement
 from wbgs_jax.training.scores import make_scores
 from wbgs_jax.training.thicknesses import Slab
@@ -35,14 +34,7 @@ SETTINGS = tiny_settings(
 def truth(tmp_path_factory):
     """Snapshots of a room of concrete, in all places."""
     run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("true"), PLACES, FREQUENCIES)
-    permittivity, c, d = ITU_MATERIALS["concrete"]
-    materials = dataclasses.replace(
-        run.state.params.materials,
-        log_susceptibility=jnp.full(len(PARTS), np.log(permittivity - 1)),
-        log_conductivity=jnp.full(len(PARTS), np.log(c)),
-        slope=jnp.full(len(PARTS), d),
-    )
-    params = dataclasses.replace(run.state.params, materials=materials)
+    params = of_concrete(run)
     return heard_in(run, params, PLACES, FREQUENCIES), params
 
 
