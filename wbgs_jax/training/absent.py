@@ -3,8 +3,8 @@
 What is not there neither reflects nor shades, as if it were made of air, and that is how it is tried: every mover of the facets
 gets a material of its own, and a mover is left out if low frequencies are explained surely better without it. (Its edges still
 diffract in that trial, so some go unnoticed.) Then paths are traced and materials named again. That counts if it explains other
-spectra, of all frequencies, surely better; it lets others be seen, and the movers are gone through again. High frequencies are
-not asked: there a body that stands a little elsewhere is worse than none.
+snapshots, of all frequencies, surely better, as far as places are known; it lets others be seen, and the movers are gone
+through again. High frequencies are not asked: there a body that stands a little elsewhere is worse than none.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax.config import SearchConfig
@@ -23,6 +23,7 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.antennas import ENDS
 from wbgs_jax.training.controls import Say, silent
 from wbgs_jax.training.materials import search_materials, with_properties
+from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Told, surely_better
 
 AIR = (1.0001, 1e-9, 0.0, 1e-4)
@@ -47,7 +48,7 @@ class AbsentReport:
     """What was left out."""
 
     before: float
-    """Mean score of training spectra with the mesh as it was ..."""
+    """How badly training snapshots are explained on average (`losses.surprise`), with the mesh as it was ..."""
     after: float
     """... and without the bodies."""
     centres: list[list[float]]
@@ -59,15 +60,15 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
 
     Args:
         params: with materials that have been named, by the first of the spectra.
-        told: what training spectra say; without snapshots nothing is left out, for spectra cost ten times as much.
+        told: what training spectra say, with snapshots: spectra alone would cost ten times as much.
         config: `absent_spectra` are looked at, up to the highest frequency at which places are believed.
         say: is told of every pass.
     """
     judged = dataclasses.replace(told, spectra=told.spectra[::-1])  # by other spectra than those that name materials
     tx, where = judged.tx_index(config.spectra), list[list[float]]()
-    before = now = judged.scores(config.spectra)([params])[0]
+    before = now = _explained(params, judged, config)
     once = dataclasses.replace(config, rounds=1)
-    for _ in range(ROUNDS if told.data.snapshots is not None else 0):
+    for _ in range(ROUNDS):
         say("search: bodies that are not there")
         movers = absent_movers(params, told, config)
         if not len(movers):
@@ -75,13 +76,20 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
         field = told.field.without(movers)
         fewer = dataclasses.replace(told, field=field, cache=field.prepare(told.data.links, told.data.receivers))
         others, _ = search_materials(_carried(params, field), fewer.scores(config.spectra), once)
-        after = dataclasses.replace(fewer, spectra=judged.spectra).scores(config.spectra)([others])[0]
+        after = _explained(others, dataclasses.replace(fewer, spectra=judged.spectra), config)
         if not surely_better(now - after, tx, SURE):
             break
         middles = np.asarray(centres(told.field.facets, len(told.field.motion.shift)))[movers]
         where += np.round(middles.astype(float), 3).tolist()
         params, told, now = others, fewer, after
     return params, told, AbsentReport(float(before.mean()), float(now.mean()), where)
+
+
+def _explained(params: Any, told: Told, config: SearchConfig) -> Float[np.ndarray, " n"]:
+    """Returns how badly snapshots are explained, with as much doubt of all places as suits them: phases of what stands a little
+    elsewhere are then believed no more, and it is better than nothing."""
+    doubted, _ = search_placement(params, told.scores(config.placement_spectra, "covariances"))
+    return told.scores(config.spectra, "covariances")([doubted])[0]
 
 
 def absent_movers(params: Any, told: Told, config: SearchConfig) -> Int[np.ndarray, " k"]:
@@ -115,10 +123,10 @@ def _each_by_itself(params: Any, told: Told) -> tuple[Told, Any]:
     facets = told.field.facets
     source = np.zeros(len(told.field.motion.shift), int)  # of a large mesh, some have lost all of their facets
     source[np.asarray(facets.mover)] = np.asarray(facets.material)
-    known = told.field.known_thickness[source]
+    thickness = jnp.log(told.field.electrical(params).thickness[source])
     own: Any = jax.tree.map(lambda leaf: leaf[source], params.materials)
-    own = dataclasses.replace(own, log_thickness=jnp.where(known > 0, jnp.log(jnp.maximum(known, 1e-9)), own.log_thickness))
-    field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(known))
+    own = dataclasses.replace(own, log_thickness=thickness)
+    field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
     surfaces = told.cache.surfaces
     surfaces = replaced(surfaces, facets=replaced(surfaces.facets, material=facets.mover))
     cache = replaced(told.cache, surfaces=surfaces)

@@ -88,7 +88,7 @@ class Search:
             say("search: materials")
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
-            if config.absent_spectra:
+            if config.absent_spectra and data.snapshots is not None:
                 params, told, absent = search_absent(params, told, config, say)
                 report["absent"] = dataclasses.asdict(absent)
                 if absent.centres:
