@@ -119,7 +119,7 @@ _NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
 _NO_SEARCH: Changes = {"search": {"rounds": 0}}
-_AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0}}
+_AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0, "clutter_spectra": 0}}
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),

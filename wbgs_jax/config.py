@@ -104,6 +104,10 @@ class SearchConfig:
     """Training spectra that are looked at to name materials on the way."""
     placement_spectra: int = 96
     """Training spectra that are looked at for how far they may still be off."""
+    clutter_spectra: int = 1024
+    """Training spectra that say whether clutter which the others show is there; 0: no clutter is looked for."""
+    clutter_steps: int = 800
+    """Steps in which it is fitted to the others."""
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def pytree(cls: type[T]) -> type[T]:
 def from_leaves(cls: type[T], leaves: Mapping[str, Any], constants: Mapping[str, Any] | None = None, prefix: str = "") -> T:
     """Returns a `pytree` from its leaves by `jax.tree_util.keystr`, such as {".frame.centre": array}.
 
-    Its fields are arrays or other `pytree` classes. Static fields come from `constants`, else from their defaults. What has
+    Its fields are arrays or other `pytree` classes, or None. Static fields come from `constants`, else from their defaults. What has
     no leaf is None.
     """
     hints, values = typing.get_type_hints(cls), {}
@@ -60,11 +60,16 @@ def from_leaves(cls: type[T], leaves: Mapping[str, Any], constants: Mapping[str,
         path = f"{prefix}.{f.name}"
         if f.metadata.get("static"):
             values[f.name] = (constants or {}).get(f.name, f.default)
-        elif dataclasses.is_dataclass(hints[f.name]) and any(key.startswith(f"{path}.") for key in leaves):
-            values[f.name] = from_leaves(hints[f.name], leaves, None, path)
+        elif (inner := _class_in(hints[f.name])) and any(key.startswith(f"{path}.") for key in leaves):
+            values[f.name] = from_leaves(inner, leaves, None, path)
         else:
             values[f.name] = leaves.get(path)
     return cls(**values)
+
+
+def _class_in(hint: Any) -> Any:
+    """Returns the `pytree` class in a type hint, as in `Grid | None`; None if there is none."""
+    return next((one for one in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(one)), None)
 
 
 def with_leaves(tree: T, *leaves: Any) -> T:

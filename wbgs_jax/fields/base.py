@@ -238,6 +238,14 @@ class Field(ABC):
         return jax.tree.map(lambda _: "all", params)
 
 
+def heard_alone(batch: Batch, seen: Observation) -> Batch:
+    """Returns a batch whose black spectra are what was predicted."""
+    if batch.pas is None:
+        return batch
+    black = jnp.max(batch.pas, (1, 2), keepdims=True) == 0
+    return dataclasses.replace(batch, pas=jnp.where(black, jax.lax.stop_gradient(seen.pas), batch.pas))
+
+
 def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stride: int = 1) -> tuple[Float[Array, ""], Aux]:
     """Returns the image loss (paper, equation 5) of observed spectra, or the mean squared error in dB of received power."""
     if batch.pas is not None:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
-from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, register
+from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, heard_alone, register
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.fields.prepared_paths import PreparedPaths, prepare_paths, trace
 from wbgs_jax.fields.wave_channel import (
@@ -27,6 +27,9 @@ from wbgs_jax.fields.wave_channel import (
     WaveParams,
     WavePlan,
     arrivals_at,
+    densities,
+    first_params,
+    no_clutter,
     observe,
     path_arrivals,
     path_covariances,
@@ -35,6 +38,7 @@ from wbgs_jax.fields.wave_channel import (
     slabs_at,
 )
 from wbgs_jax.fields.wave_settings import MAX_FACETS, PRESETS, WaveConfig
+from wbgs_jax.propagation.clutter import Grid, grid_around
 from wbgs_jax.propagation.edges import Edges, edges_of_facets
 from wbgs_jax.propagation.facets import Facets, remaining
 from wbgs_jax.propagation.facets import moved as move_facets
@@ -45,7 +49,6 @@ from wbgs_jax.propagation.simplify import facets_that_fit
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import turned
-from wbgs_jax.radio.patterns import upright
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
 
 __all__ = [
@@ -91,6 +94,10 @@ class WaveField(Field):
     tuning: Float[Array, "r elements 2"] | None
     """Logarithm of amplitude, and phase (radians), by which elements of those receivers differ from what their positions say,
     as far as that has been found out; None: they are in tune."""
+    grid: Grid | None
+    """Of clutter; None: there is none."""
+    first_clutter: Float[Array, "x y z 2"] | None
+    """`WaveParams.clutter` before training."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -113,26 +120,16 @@ class WaveField(Field):
 
     def init(self, key: Key[Array, ""]) -> WaveParams:
         """Returns parameters in which all materials are alike; nothing is random."""
-        config, m = self.config, self.known_thickness.shape[0]
-        materials = Materials(
-            log_susceptibility=jnp.full(m, np.log(config.permittivity - 1), jnp.float32),
-            log_conductivity=jnp.full(m, np.log(config.conductivity), jnp.float32),
-            slope=jnp.full(m, config.slope, jnp.float32),
-            log_thickness=jnp.full(m, np.log(config.thickness), jnp.float32),
-        )
-        amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
-        corrections = jnp.zeros((self.facets.offset.shape[0], 2)), -jnp.log(amplitude), jnp.zeros(())
-        transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
-        return WaveParams(
-            materials, *corrections, transmitter, element, jnp.array(self.first_placement), jnp.zeros(()), jnp.zeros(())
-        )
+        facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
+        clutter = None if self.first_clutter is None else jnp.array(self.first_clutter)
+        return first_params(self.config, facets, materials, self.first_placement, clutter)
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
         check_receiver(receiver)
         receiver, tuning = self._as_found(receiver)
         surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
-        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.config)
+        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
         """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
@@ -192,22 +189,26 @@ class WaveField(Field):
         self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
-        facet corrections. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum of 1."""
+        facet corrections and clutter. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum
+        of 1."""
         plan = self.plan(params, batch.receiver, cache=cache)
         return self.compared(params, self.render_links(params, plan, cache, batch.links), batch)
 
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of what it says of a batch."""
         config = self.config
-        loss, aux = compare(seen, _heard_alone(batch, seen), config.ssim_weight)
+        loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
         return loss + self.penalty(params), aux
 
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
-        """Returns what corrections of facets cost."""
-        return self.config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0))
+        """Returns what corrections of facets and clutter cost."""
+        corrections = self.config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0))
+        if params.clutter is None:
+            return corrections
+        return corrections + self.config.clutter_weight * jnp.mean(densities(params.clutter))
 
     def moved(self, motion: Motion) -> "WaveField":
         """Returns the field of a scene in which things stand elsewhere (host)."""
@@ -229,6 +230,12 @@ class WaveField(Field):
         """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
         further = jnp.asarray(np.stack([np.log(np.abs(gains)), np.angle(gains)], -1), jnp.float32)
         return dataclasses.replace(self, tuning=further if self.tuning is None else self.tuning + further)
+
+    def cluttered(self) -> "WaveField":
+        """Returns the field that knows of clutter: none of it yet, anywhere around its surfaces and receivers (host)."""
+        around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
+        grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
+        return dataclasses.replace(self, grid=to_device(grid), first_clutter=no_clutter(shape))
 
     def electrical(self, params: WaveParams) -> Electrical:
         """Returns the properties of the materials, as far as they were learned."""
@@ -275,8 +282,8 @@ class WaveField(Field):
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns groups for materials, thicknesses, corrections, antennas and placement; idealisations are searched, and
-        not trained."""
+        """Returns groups for materials, thicknesses, corrections, antennas, placement and clutter; idealisations are searched,
+        and not trained."""
         return {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
@@ -284,14 +291,15 @@ class WaveField(Field):
             "antennas": Group(config.antennas_lr),
             "placement": Group(config.placement_lr),
             "ideal": Group(0.0),
+            "clutter": Group(config.clutter_lr),
         }
 
     @classmethod
     def labels(cls, params: WaveParams) -> Any:
         """Returns the group of every parameter."""
-        return with_leaves(
-            params, *["materials"] * 3, "thickness", *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
-        )
+        clutter = [] if params.clutter is None else ["clutter"]
+        found = *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
+        return with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
@@ -309,7 +317,7 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
     motion = to_device(still(movers, len(known)))
-    return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, config)
+    return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, None, None, config)
 
 
 def _beams(receiver: Receiver) -> Beams | None:
@@ -318,14 +326,6 @@ def _beams(receiver: Receiver) -> Beams | None:
     if receiver.unit != "wavelengths" or _traced(positions):
         return None
     return beams_of(np.asarray(positions))
-
-
-def _heard_alone(batch: Batch, seen: Observation) -> Batch:
-    """Returns a batch whose black spectra are what was predicted."""
-    if batch.pas is None:
-        return batch
-    black = jnp.max(batch.pas, (1, 2), keepdims=True) == 0
-    return dataclasses.replace(batch, pas=jnp.where(black, jax.lax.stop_gradient(seen.pas), batch.pas))
 
 
 def _traced(*trees: Any) -> bool:

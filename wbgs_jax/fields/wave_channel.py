@@ -19,6 +19,7 @@ from wbgs_jax._util.complex_numbers import phasor
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.wave_settings import WaveConfig
+from wbgs_jax.propagation.clutter import Grid, attenuation, smoothed
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.motion import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
@@ -32,11 +33,15 @@ from wbgs_jax.radio.array import (
     wide_covariance_to_pas,
 )
 from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
-from wbgs_jax.radio.patterns import Antenna
+from wbgs_jax.radio.patterns import Antenna, upright
 from wbgs_jax.types import Receiver
 
 FAINTEST_SUM = 1e-12
 """Of the power of several paths, relative to the strongest: what cancels further, or is nothing, has no spectrum."""
+CLUTTER_HZ = 1e9, 1e11
+"""Frequencies at which clutter has a density of its own; in between it follows the logarithm of the frequency."""
+THIN = 1e-3
+"""Density of clutter before training, nepers per metre: a tenth of a decibel in a room."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Beyond it (S/m) every material is a mirror, and single precision ends."""
 
@@ -79,6 +84,9 @@ class WaveParams:
     (`slab.slab_coefficients`)."""
     curved: Float[Array, ""]
     """1 where waves reach the array as spheres, as in nature, 0 where they are plane (`transport.element_voltages`)."""
+    clutter: Float[Array, "x y z 2"] | None
+    """Stored (unconstrained) density of what stands in the way and is not in the mesh, at both of `CLUTTER_HZ`; `densities`
+    gives nepers per metre. None: nothing does."""
 
 
 @pytree
@@ -95,7 +103,23 @@ class WavePlan:
     """How far things, and this receiver, stand from where paths were found, while that is being learned."""
     beams: Beams | None
     """Of the array; None where they differ from frequency to frequency, or are traced."""
+    grid: Grid | None
+    """Of clutter, if there is any."""
     config: WaveConfig = static()
+
+
+def first_params(config: WaveConfig, facets: int, materials: int, placement: Any, clutter: Any) -> WaveParams:
+    """Returns parameters before training, in which all materials are alike; nothing is random."""
+    m = Materials(
+        log_susceptibility=jnp.full(materials, np.log(config.permittivity - 1), jnp.float32),
+        log_conductivity=jnp.full(materials, np.log(config.conductivity), jnp.float32),
+        slope=jnp.full(materials, config.slope, jnp.float32),
+        log_thickness=jnp.full(materials, np.log(config.thickness), jnp.float32),
+    )
+    amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
+    corrections = jnp.zeros((facets, 2)), -jnp.log(amplitude), jnp.zeros(())
+    transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
+    return WaveParams(m, *corrections, transmitter, element, jnp.array(placement), jnp.zeros(()), jnp.zeros(()), clutter)
 
 
 @jax.jit
@@ -186,10 +210,14 @@ def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""])
 def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
     """Returns what one transmitter sends over all of its paths."""
     slabs, found = slabs_at(params, plan, frequency_hz), []
+    clutter = None if params.clutter is None else _clutter_at(params.clutter, frequency_hz)
     for row, some in enumerate((paths.specular, paths.diffracted)):
         antennas = params.transmitter, params.element
         one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
+        if clutter is not None:
+            assert plan.grid is not None, "the field has both"
+            gain = gain * jnp.exp(-attenuation(one.points, clutter, plan.grid))
         if plan.motion is not None:
             turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
             gain = gain * phasor(-turns)
@@ -197,6 +225,24 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
     joined: Any = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     return joined._replace(curved=params.curved)
+
+
+def no_clutter(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
+    """Returns `WaveParams.clutter` of an empty room."""
+    return jnp.full((*shape, len(CLUTTER_HZ)), np.log(np.expm1(THIN)), jnp.float32)
+
+
+def densities(clutter: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
+    """Returns nepers per metre."""
+    return jax.nn.softplus(clutter)
+
+
+def _clutter_at(clutter: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]) -> Float[Array, "x y z"]:
+    """Returns the density at one frequency."""
+    low, high = CLUTTER_HZ
+    share = jnp.clip(jnp.log(frequency_hz / low) / np.log(high / low), 0, 1)
+    at_low, at_high = jnp.moveaxis(densities(clutter), -1, 0)
+    return smoothed((1 - share) * at_low + share * at_high)
 
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:

@@ -43,6 +43,10 @@ class WaveConfig:
     """Amplitude that diffracted waves keep at every further interaction, beyond its slab, at the start."""
     placement: float = 1e-6
     """Metres: how far surfaces and transmitters may stand from where they are said to be, before the search for that."""
+    clutter_cells: int = 32_768
+    """Cells of the grid of what stands in the way and is not in the mesh, at most (`search.clutter_spectra`)."""
+    clutter_cell: float = 0.25
+    """Metres: the side of a cell, at least."""
     coherent: bool = True
     """False: the powers of the paths are added instead of their amplitudes, as phase-blind models do (an ablation)."""
     ssim_weight: float = 0.2
@@ -61,6 +65,10 @@ class WaveConfig:
     """Learning rate of facet corrections, excess losses and the gain."""
     antennas_lr: float = 3e-4
     """Learning rate of the antennas' orientations and exponents."""
+    clutter_weight: float = 0.1
+    """Weight of the mean density of clutter (nepers per metre)."""
+    clutter_lr: float = 0.2
+    """Learning rate of the logarithm (where it is small) of that density."""
     placement_lr: float = 2e-2
     """Learning rate of the logarithm of `placement`."""
 
@@ -68,7 +76,9 @@ class WaveConfig:
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """There are a few numbers a material to learn, no networks."""
 SEARCH = {
-    "smoke": SearchConfig(rounds=1, spectra=32, antenna_rounds=0, absent_spectra=0, tuning_spectra=0, geometry=False),
+    "smoke": SearchConfig(
+        rounds=1, spectra=32, antenna_rounds=0, absent_spectra=0, tuning_spectra=0, geometry=False, clutter_spectra=0
+    ),
     "cpu": SearchConfig(),
     "gpu": SearchConfig(),
 }

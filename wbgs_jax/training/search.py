@@ -1,5 +1,5 @@
 """Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, bodies that are not
-there, idealisations, tuning, places.
+there, idealisations, tuning, places, clutter.
 
 The first two are a choice among known ones by how well they explain some training spectra; bodies without which spectra are
 explained better are left out of the mesh; surfaces are moved where it is doubtful, and how far they may still be off is
@@ -18,7 +18,8 @@ from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.training.absent import search_absent
 from wbgs_jax.training.antennas import search_antennas
-from wbgs_jax.training.controls import Context, Edit
+from wbgs_jax.training.clutter import search_clutter
+from wbgs_jax.training.controls import Context, Edit, Say
 from wbgs_jax.training.geometry import Place, learn_geometry
 from wbgs_jax.training.idealisations import search_idealisations
 from wbgs_jax.training.materials import search_materials
@@ -120,6 +121,7 @@ class Search:
                 told = dataclasses.replace(told, field=field)
             params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
             report["placement"] = dataclasses.asdict(guessed)
+            params, field = self._clutter(params, told, report, rng, say)
         return Edit(params, (), None, report, field, cache)
 
     def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
@@ -138,6 +140,16 @@ class Search:
         field, found = search_tuning(params, told, count)
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
+
+    def _clutter(self, params: Any, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say) -> tuple[Any, Any]:
+        """Returns parameters and field with what stands in the way and is not in the mesh."""
+        if not self.config.clutter_spectra:
+            return params, told.field
+        say("search: what the mesh lacks")
+        params, told, found = search_clutter(params, told, self.config, rng)
+        if found:
+            report["clutter"] = dataclasses.asdict(found)
+        return params, told.field
 
     def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
         """Returns parameters without the idealisations that spectra contradict."""

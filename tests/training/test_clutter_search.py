@@ -1,0 +1,109 @@
+"""Clutter is found where the room has something that the mesh lacks, and nowhere else."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import tiny_settings
+from wave_runs import PARTS, heard_in, of_concrete, places, run_in
+
+from wbgs_jax.fields.wave_channel import densities
+from wbgs_jax.training.clutter import search_clutter
+from wbgs_jax.training.loop import train
+from wbgs_jax.training.scores import Told
+
+N_TX, FREQUENCIES = 80, np.array([2e9, 10e9])
+PLACES = places(N_TX, 0.4)
+SETTINGS = tiny_settings(
+    "wave",
+    field={
+        "specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,),
+        "clutter_cell": 0.3,
+    },
+    optim={"steps": 4, "min_steps": 4},
+    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "clutter_spectra": 160, "clutter_steps": 400},
+)  # fmt: skip
+
+
+def hedge(field, rng):
+    """Clutter across the room, between the receiver and most of the transmitters, and which cells it fills."""
+    density, grid = np.asarray(densities(field.first_clutter)).copy(), field.grid
+    middles = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in density.shape[:3]), indexing="ij"), -1)
+    low = rng.uniform((1.8, 0.2, 0.0), (2.4, 0.8, 0.1))
+    inside = np.asarray(grid.low) + np.asarray(grid.cell) * middles - low
+    filled = np.all((inside > 0) & (inside < (0.8, 2.5, 2.2)), -1)
+    density[filled] = 1.5
+    return jnp.asarray(np.log(np.expm1(density)), jnp.float32), filled
+
+
+def told_of(parts, truth, folder, n_tx=N_TX):
+    run = run_in(parts, SETTINGS, folder, PLACES[:n_tx], FREQUENCIES, truth[:n_tx])
+    return of_concrete(run), Told(run.field, run.cache, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+
+
+@pytest.mark.heavy
+def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands(tmp_path, rng):
+    run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
+    run.field = run.field.cluttered()
+    clutter, filled = hedge(run.field, rng)
+    truth = heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES)
+    params, told = told_of(PARTS, truth, tmp_path / "less")
+    found, fuller, report = search_clutter(params, told, SETTINGS.search, rng)
+    assert report.taken
+    assert report.after < 0.8 * report.before
+    assert fuller.field.first_clutter.shape == found.clutter.shape
+    density = np.asarray(densities(found.clutter)).mean(-1)
+    assert density[filled].mean() > 3 * density[~filled].mean()
+
+
+@pytest.mark.heavy
+def test_what_a_training_found_is_there_again_when_it_is_read(tmp_path, rng):
+    run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
+    run.field = run.field.cluttered()
+    clutter, _ = hedge(run.field, rng)
+    truth = heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES)
+    dataset = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth).dataset
+    trained = train(dataset, "wave", SETTINGS, 0, tmp_path / "run")
+    again = train(dataset, "wave", SETTINGS, 0, tmp_path / "run", resume=True)
+    query = dataset.links(dataset.train[:8]).query
+    seen = [one.field.render(one.params, one.field.plan(one.params, dataset.receiver()), query).pas for one in (trained, again)]
+    assert trained.params.clutter is not None
+    np.testing.assert_array_equal(again.params.clutter, trained.params.clutter)
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-6)
+    assert '"taken": true' in (tmp_path / "run" / "metrics.jsonl").read_text()
+
+
+@pytest.mark.heavy
+def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
+    run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
+    params, told = told_of(PARTS, heard_in(run, of_concrete(run), PLACES, FREQUENCIES), tmp_path / "same")
+    same, still, report = search_clutter(params, told, SETTINGS.search, rng)
+    assert not report.taken
+    assert same is params
+    assert still is told
+    assert same.clutter is None
+
+
+def test_few_transmitters_prove_nothing(tmp_path, rng):
+    nothing = np.ones((12, 1, len(FREQUENCIES), 16), np.complex64)
+    params, told = told_of(PARTS, nothing, tmp_path, n_tx=12)
+    assert search_clutter(params, told, SETTINGS.search, rng) == (params, told, None)
+
+
+@pytest.mark.heavy
+def test_gradients_reach_clutter_and_a_dense_one_darkens_all(tmp_path, rng):
+    """With a density d everywhere, every path loses d times its length."""
+    run = run_in(PARTS, SETTINGS, tmp_path, PLACES[:6], FREQUENCIES)
+    field, density = run.field.cluttered(), rng.uniform(0.1, 0.5)
+    empty = of_concrete(run)
+    dense = dataclasses.replace(empty, clutter=jnp.full_like(field.first_clutter, np.log(np.expm1(density))))
+    links = run.dataset.links(np.arange(6))
+    seen = {}
+    for name, one, params in (("empty", run.field, empty), ("dense", field, dense)):
+        plan = one.plan(params, run.dataset.receiver())
+        seen[name] = one.arrivals(params, plan, links.query)
+    before, after = (np.abs(np.asarray(seen[name].amplitude)) for name in ("empty", "dense"))
+    heard = before > 0
+    expected = before * np.exp(-density * np.asarray(seen["empty"].length))
+    np.testing.assert_allclose(after[heard], expected[heard], rtol=1e-3)
