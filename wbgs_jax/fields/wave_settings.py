@@ -65,7 +65,7 @@ class WaveConfig:
     """Learning rate of facet corrections, excess losses and the gain."""
     antennas_lr: float = 3e-4
     """Learning rate of the antennas' orientations and exponents."""
-    clutter_weight: float = 0.1
+    clutter_weight: float = 0.02
     """Weight of the mean density of clutter (nepers per metre)."""
     clutter_lr: float = 0.2
     """Learning rate of the logarithm (where it is small) of that density."""
