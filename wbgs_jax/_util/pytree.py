@@ -52,8 +52,8 @@ def pytree(cls: type[T]) -> type[T]:
 def from_leaves(cls: type[T], leaves: Mapping[str, Any], constants: Mapping[str, Any] | None = None, prefix: str = "") -> T:
     """Returns a `pytree` from its leaves by `jax.tree_util.keystr`, such as {".frame.centre": array}.
 
-    Its fields are arrays or other `pytree` classes, or None. Static fields come from `constants`, else from their defaults. What has
-    no leaf is None.
+    Its fields are arrays or other `pytree` classes, or None. Static fields come from `constants`, else from their defaults.
+    What has no leaf is None.
     """
     hints, values = typing.get_type_hints(cls), {}
     for f in dataclasses.fields(cls):  # type: ignore[arg-type]
