@@ -43,7 +43,7 @@ def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
         settings = (BEFORE_MUON.get(field, {}) if edition < 2 else {}) | settings
         settings = (BEFORE_NERF2_BY_MUON.get(field, {}) if edition < 3 else {}) | settings
     if edition < 3 and "mesh.displacement" in settings:  # nobody moved surfaces back, or left any out, by then
-        settings = {"search.geometry": False, "search.absent_spectra": 0} | settings
+        settings = {"search.geometry": False, "search.absent_spectra": 0, "search.clutter_spectra": 0} | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value
