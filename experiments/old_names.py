@@ -4,6 +4,7 @@ from typing import Any
 
 from experiments.profiles import BY_ADAM, NERF2_BY_ADAM, STEPS_BY_ADAM
 from experiments.settings import HOUSEKEEPING, plain
+from experiments.variants import AS_IT_IS
 
 MOVED = {
     # Until 0.2 learning rates and weights of all fields were settings of the optimiser.
@@ -42,8 +43,8 @@ def todays(result: dict[str, Any], field: str) -> dict[str, Any]:
     if result.get("preset") != "paper":
         settings = (BEFORE_MUON.get(field, {}) if edition < 2 else {}) | settings
         settings = (BEFORE_NERF2_BY_MUON.get(field, {}) if edition < 3 else {}) | settings
-    if edition < 3 and "mesh.displacement" in settings:  # nobody moved surfaces back, or left any out, by then
-        settings = {"search.geometry": False, "search.absent_spectra": 0, "search.clutter_spectra": 0} | settings
+    if edition < 3 and "mesh.displacement" in settings:  # nobody doubted a mesh by then
+        settings = {f"search.{name}": value for name, value in AS_IT_IS["search"].items()} | settings
     named = {MOVED.get(name, name).format(field=field): value for name, value in settings.items()}
     return {
         name: value

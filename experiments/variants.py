@@ -119,7 +119,8 @@ _NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
 _NO_SEARCH: Changes = {"search": {"rounds": 0}}
-_AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0, "clutter_spectra": 0}}
+AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0, "clutter_spectra": 0}}
+"""The mesh is believed: nothing in it is moved, left out or missed."""
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
     "order_0": _of_field(mirror_areas=(), **_NO_EDGES),
@@ -136,9 +137,9 @@ COHERENT = {
     "untrained": Variant({"field": _UNTRAINED, **_NO_SEARCH}),
     "no_snapshot_loss": _of_field(correlation_weight=0.0, power_weight=0.0),
     "more_candidates": _of_field(diffracted_tried=4096, diffracted_kept=512, mirror_areas=(0.0, 0.02, 0.3)),
-    "mesh_moved_3mm": Variant(_AS_IT_IS, fault=Fault(displaced_m=0.003)),
-    "mesh_moved_3cm": Variant(_AS_IT_IS, fault=Fault(displaced_m=0.03)),
-    "mesh_moved_1m": Variant(_AS_IT_IS, fault=Fault(displaced_m=1.0)),
+    "mesh_moved_3mm": Variant(AS_IT_IS, fault=Fault(displaced_m=0.003)),
+    "mesh_moved_3cm": Variant(AS_IT_IS, fault=Fault(displaced_m=0.03)),
+    "mesh_moved_1m": Variant(AS_IT_IS, fault=Fault(displaced_m=1.0)),
 }
 FAULTS = {
     name: Variant(fault=fault)
@@ -175,7 +176,7 @@ def at_its_word(fault: str) -> str:
     return f"at_its_word_{fault}".rstrip("_")
 
 
-_AT_ITS_WORD: Changes = {"search": {**_AS_IT_IS["search"], "tuning_spectra": 0}}
+_AT_ITS_WORD: Changes = {"search": {**AS_IT_IS["search"], "tuning_spectra": 0}}
 AT_ITS_WORD = {
     at_its_word(name): dataclasses.replace(variant, changes=_AT_ITS_WORD) for name, variant in {"": Variant(), **FAULTS}.items()
 }

@@ -8,7 +8,9 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
-from wbgs_jax.fields.wave_channel import densities
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.fields.wave import WaveConfig, WaveField
+from wbgs_jax.fields.wave_channel import densities, stored
 from wbgs_jax.training.clutter import search_clutter
 from wbgs_jax.training.loop import train
 from wbgs_jax.training.scores import Told
@@ -34,7 +36,15 @@ def hedge(field, rng):
     inside = np.asarray(grid.low) + np.asarray(grid.cell) * middles - low
     filled = np.all((inside > 0) & (inside < (0.8, 2.5, 2.2)), -1)
     density[filled] = 1.5
-    return jnp.asarray(np.log(np.expm1(density)), jnp.float32), filled
+    return stored(jnp.asarray(density)), filled
+
+
+def heard_behind_a_hedge(folder, rng):
+    """Snapshots of all places, and which cells the hedge fills."""
+    run = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES)
+    run.field = run.field.cluttered()
+    clutter, filled = hedge(run.field, rng)
+    return heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES), filled
 
 
 def told_of(parts, truth, folder, n_tx=N_TX):
@@ -44,10 +54,7 @@ def told_of(parts, truth, folder, n_tx=N_TX):
 
 @pytest.mark.heavy
 def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands(tmp_path, rng):
-    run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
-    run.field = run.field.cluttered()
-    clutter, filled = hedge(run.field, rng)
-    truth = heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES)
+    truth, filled = heard_behind_a_hedge(tmp_path / "true", rng)
     params, told = told_of(PARTS, truth, tmp_path / "less")
     found, fuller, report = search_clutter(params, told, SETTINGS.search, rng)
     assert report.taken
@@ -59,10 +66,7 @@ def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands(tmp_path, rng):
 
 @pytest.mark.heavy
 def test_what_a_training_found_is_there_again_when_it_is_read(tmp_path, rng):
-    run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
-    run.field = run.field.cluttered()
-    clutter, _ = hedge(run.field, rng)
-    truth = heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES)
+    truth, _ = heard_behind_a_hedge(tmp_path / "true", rng)
     dataset = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth).dataset
     trained = train(dataset, "wave", SETTINGS, 0, tmp_path / "run")
     again = train(dataset, "wave", SETTINGS, 0, tmp_path / "run", resume=True)
@@ -85,6 +89,12 @@ def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
     assert same.clutter is None
 
 
+@pytest.mark.parametrize("values", [{"clutter_cells": 0}, {"clutter_cell": 0.0}])
+def test_grids_without_cells_are_refused(values):
+    with pytest.raises(UserError, match="clutter-spectra 0 does without"):
+        WaveField.check(WaveConfig(**values))
+
+
 def test_few_transmitters_prove_nothing(tmp_path, rng):
     nothing = np.ones((12, 1, len(FREQUENCIES), 16), np.complex64)
     params, told = told_of(PARTS, nothing, tmp_path, n_tx=12)
@@ -92,12 +102,12 @@ def test_few_transmitters_prove_nothing(tmp_path, rng):
 
 
 @pytest.mark.heavy
-def test_gradients_reach_clutter_and_a_dense_one_darkens_all(tmp_path, rng):
+def test_clutter_everywhere_darkens_all(tmp_path, rng):
     """With a density d everywhere, every path loses d times its length."""
     run = run_in(PARTS, SETTINGS, tmp_path, PLACES[:6], FREQUENCIES)
     field, density = run.field.cluttered(), rng.uniform(0.1, 0.5)
     empty = of_concrete(run)
-    dense = dataclasses.replace(empty, clutter=jnp.full_like(field.first_clutter, np.log(np.expm1(density))))
+    dense = dataclasses.replace(empty, clutter=stored(jnp.full_like(field.first_clutter, density)))
     links = run.dataset.links(np.arange(6))
     seen = {}
     for name, one, params in (("empty", run.field, empty), ("dense", field, dense)):

@@ -111,6 +111,8 @@ class WaveField(Field):
         """Raises a `UserError` for settings that cannot work."""
         if config.max_facets > MAX_FACETS:
             raise UserError(f"--{cls.name}.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
+        if config.clutter_cells < 1 or config.clutter_cell <= 0:
+            raise UserError(f"--{cls.name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 does without")
 
     @classmethod
     def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
@@ -121,8 +123,7 @@ class WaveField(Field):
     def init(self, key: Key[Array, ""]) -> WaveParams:
         """Returns parameters in which all materials are alike; nothing is random."""
         facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
-        clutter = None if self.first_clutter is None else jnp.array(self.first_clutter)
-        return first_params(self.config, facets, materials, self.first_placement, clutter)
+        return first_params(self.config, facets, materials, self.first_placement, self.first_clutter)
 
     def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
@@ -282,8 +283,7 @@ class WaveField(Field):
 
     @classmethod
     def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns groups for materials, thicknesses, corrections, antennas, placement and clutter; idealisations are searched,
-        and not trained."""
+        """Returns the groups of parameters; idealisations are searched, and not trained."""
         return {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),

@@ -118,8 +118,10 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
     )
     amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
     corrections = jnp.zeros((facets, 2)), -jnp.log(amplitude), jnp.zeros(())
-    transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))  # training gives every array away once
-    return WaveParams(m, *corrections, transmitter, element, jnp.array(placement), jnp.zeros(()), jnp.zeros(()), clutter)
+    # Training gives every array away once.
+    transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))
+    placement, clutter = jax.tree.map(jnp.array, (placement, clutter))
+    return WaveParams(m, *corrections, transmitter, element, placement, jnp.zeros(()), jnp.zeros(()), clutter)
 
 
 @jax.jit
@@ -229,7 +231,7 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
 
 def no_clutter(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
     """Returns `WaveParams.clutter` of an empty room."""
-    return jnp.full((*shape, len(CLUTTER_HZ)), np.log(np.expm1(THIN)), jnp.float32)
+    return stored(jnp.full((*shape, len(CLUTTER_HZ)), THIN, jnp.float32))
 
 
 def densities(clutter: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
@@ -237,12 +239,17 @@ def densities(clutter: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
     return jax.nn.softplus(clutter)
 
 
+def stored(density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
+    """Returns the clutter that has these `densities`, all of them positive."""
+    return jnp.log(jnp.expm1(density))
+
+
 def _clutter_at(clutter: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]) -> Float[Array, "x y z"]:
     """Returns the density at one frequency."""
     low, high = CLUTTER_HZ
     share = jnp.clip(jnp.log(frequency_hz / low) / np.log(high / low), 0, 1)
-    at_low, at_high = jnp.moveaxis(densities(clutter), -1, 0)
-    return smoothed((1 - share) * at_low + share * at_high)
+    at_low, at_high = jnp.moveaxis(smoothed(densities(clutter)), -1, 0)  # once for all links of a batch
+    return (1 - share) * at_low + share * at_high
 
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:

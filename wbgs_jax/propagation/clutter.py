@@ -40,11 +40,11 @@ def grid_around(points: Float[np.ndarray, "n 3"], finest_m: float, most: int) ->
     return Grid(np.asarray(low, np.float32), np.asarray(cell, np.float32)), (x, y, z)
 
 
-def smoothed(density: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+def smoothed(density: Float[Array, "x y z *n"]) -> Float[Array, "x y z *n"]:
     """Returns it with every cell a mean of itself (a half) and its two neighbours (a quarter each), axis by axis: what cells
     say of paths does not change suddenly from one to the next. Beyond the grid all is as in its last cells."""
-    for axis, count in enumerate(density.shape):
-        padded = jnp.pad(density, [(int(axis == other),) * 2 for other in range(3)], mode="edge")
+    for axis, count in enumerate(density.shape[:3]):
+        padded = jnp.pad(density, [(int(axis == other),) * 2 for other in range(density.ndim)], mode="edge")
         before, own, after = (jax.lax.slice_in_dim(padded, start, start + count, axis=axis) for start in range(3))
         density = 0.25 * before + 0.5 * own + 0.25 * after
     return density

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.training.data import TrainingData
+from wbgs_jax.training.data import TrainingData, batches_of_one_receiver
 from wbgs_jax.training.scores import Told, surely_better
 
 JUDGES = 0.25
@@ -37,7 +36,7 @@ class ClutterReport:
     """What was found."""
 
     before: float
-    """Mean error of the judges' spectra (or of powers, dB) without clutter ..."""
+    """Mean absolute error of the judges' spectra without clutter ..."""
     after: float
     """... and with it, taken or not."""
     taken: bool
@@ -59,8 +58,9 @@ def search_clutter(
     judges = everyone[: round(JUDGES * len(everyone))]
     if len(judges) < FEWEST:
         return params, told, None
-    judged = dataclasses.replace(told, spectra=told.spectra[np.isin(tx, judges)][: config.clutter_spectra])
-    batches = _batches(told, np.setdiff1d(everyone, judges), config.clutter_steps, rng)
+    judge = np.isin(tx, judges)
+    judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.clutter_spectra])
+    batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.clutter_steps, BATCH, rng)
     field = told.field.cluttered()
     clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.cache, told.data, batches)
     others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)
@@ -75,14 +75,6 @@ def _errors(told: Told, params: Any) -> Float[np.ndarray, " n"]:
     """Returns mean absolute errors: of their logarithms, spectra that are right anyway would have most to say."""
     found: Float[np.ndarray, " n"] = np.exp(told.scores(None, "spectra")([params])[0])
     return found
-
-
-def _batches(told: Told, tx: Int[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[Array, "k b"]:
-    """Returns spectra of some transmitters, each batch of one receiver."""
-    pool = told.spectra[np.isin(told.tx_index(), tx)]
-    receiver = np.asarray(told.data.links.receiver_index)[pool]
-    owns = [pool[receiver == number] for number in rng.choice(receiver, count)]
-    return jnp.asarray([rng.choice(own, BATCH) for own in owns], jnp.int32)
 
 
 @jax.jit

@@ -54,6 +54,16 @@ class TrainingData:
         )
 
 
+def batches_of_one_receiver(
+    data: TrainingData, pool: Int[np.ndarray, " n"], count: int, size: int, rng: np.random.Generator
+) -> Int[Array, "count b"]:
+    """Returns so many batches of links of a pool, drawn with replacement, each of one receiver and of `size` links, or of as
+    many as the pool has (host)."""
+    receiver = np.asarray(data.links.receiver_index)[pool]
+    owns = [pool[receiver == number] for number in rng.choice(receiver, count)]
+    return jnp.asarray([rng.choice(own, min(size, len(pool))) for own in owns], jnp.int32)
+
+
 def training_data(dataset: Dataset) -> TrainingData:
     """Returns a dataset on the device."""
     receivers, steering = dataset.receivers, None

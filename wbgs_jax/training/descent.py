@@ -17,7 +17,7 @@ from wbgs_jax.fields.base import compare
 from wbgs_jax.propagation.facets import centres
 from wbgs_jax.propagation.motion import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.training.data import TrainingData
+from wbgs_jax.training.data import TrainingData, batches_of_one_receiver
 
 STEP = 0.012
 """Learning rate, in wavelengths of the highest frequency, at most ..."""
@@ -57,9 +57,7 @@ def descend(
         count: steps.
         rng: draws their batches.
     """
-    receiver = np.asarray(data.links.receiver_index)[pool]
-    owns = [pool[receiver == number] for number in rng.choice(receiver, count)]  # a batch is of one receiver
-    batches = jnp.asarray([rng.choice(own, min(BATCH, len(pool))) for own in owns], jnp.int32)
+    batches = batches_of_one_receiver(data, pool, count, BATCH, rng)
     wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.query.frequency_hz)[pool].max())
     rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN * 2 * np.pi / wavelength
     # The curvature of the normal prior, beside a loss that is a mean over so many numbers.
