@@ -173,7 +173,9 @@ def disagreements(rng, name):
         if has(path, INVARIANT.get(kind, ())):
             assert abs(exact) < 1e-9 and abs(slope(1e-3)) < 1e-7, where
             continue
-        assert gradient.any(), where
+        if not gradient.any():  # all ReLUs of a narrow layer may be off, once in some hundred draws
+            found[where] = "no gradient"
+            continue
         tolerance = RELATIVE * (abs(exact) + magnitude) + ROUNDING
         tried = [*((slope, s) for s in STEPS), *((slope_ahead, s * side) for s in STEPS for side in (1, -1))]
         if not any(abs(by(step) - exact) < tolerance for by, step in tried):
