@@ -12,7 +12,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
+from wbgs_jax.fields.noise import floor_of, noise_share, unexplained, with_noise
 from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import (
     Opinions,
@@ -197,7 +198,8 @@ class HybridField(Field):
 
     def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
         """Returns the parameters with the shares that explain best what neither field was trained on; of what was not observed,
-        spectra or powers, the coherent field's are taken."""
+        spectra or powers, the coherent field's are taken. Where snapshots are noisy, the coherent field's spectra are compared
+        with theirs as noise would let them appear (noise.py)."""
         if self.wave is None or not batches:
             return params, {}
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
@@ -205,13 +207,17 @@ class HybridField(Field):
         seen = [
             jax.tree.map(np.asarray, _opinions(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches
         ]
-        said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
-        tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
+        said, powers, told, pas, heard_db, noisy = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
+        tx_index, noise = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches]), 0.0
+        if noisy is not None and pas is not None:
+            left, floor = noisy
+            noise = noise_share(left, floor, said.coherent, pas, tx_index)
+            said = said._replace(coherent=np.asarray(with_noise(jnp.asarray(said.coherent), jnp.asarray(noise * floor))))
         spectra = coherent_alone() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
         known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
-        return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report}
+        return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report, "noise_share": noise}
 
     def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
         """Returns every path of B queries: amplitudes, directions, lengths."""
@@ -309,10 +315,24 @@ def _informed(batch: Batch) -> Bool[Array, "b 1 1"]:
     return jax.vmap(drawn)(batch.links.tx_index, batch.links.query.frequency_hz)[:, None, None]
 
 
+class _Seen(NamedTuple):
+    """What is said of B links, and what was observed."""
+
+    spectra: Opinions
+    power: Opinions
+    told: Float[Array, "b features"]
+    """What tells whom to trust."""
+    pas: Float[Array, "b 90 360"] | None
+    power_db: Float[Array, " b"] | None
+    noisy: tuple[Float[Array, " b"], Float[Array, " b"]] | None
+    """How much of their snapshots is `unexplained` at most, and `floor_of` them."""
+
+
 @jax.jit
-def _opinions(
-    hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch
-) -> tuple[Opinions, Opinions, Float[Array, "b features"], Float[Array, "b 90 360"] | None, Float[Array, " b"] | None]:
+def _opinions(hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch) -> _Seen:
     """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
-    coherent = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
-    return *hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db
+    coherent, noisy = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links), None
+    if batch.snapshots is not None:
+        elements = batch.receiver.element_wavelengths(batch.links.query.frequency_hz)
+        noisy = unexplained(coherent.snapshots, batch.snapshots), floor_of(batch.snapshots, elements)
+    return _Seen(*hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db, noisy)
