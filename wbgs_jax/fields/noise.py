@@ -43,9 +43,13 @@ def floor_of(
 
     Element positions are in wavelengths.
     """
-    steering = steering_vector(element_positions, jnp.asarray(pas_directions(), element_positions.dtype))
-    peak_of = jax.vmap(lambda y, a: jnp.max(cbf(y, a)) ** 2, (0, 0 if element_positions.ndim == 3 else None))
-    peak = peak_of(unit_snapshots(snapshots)[0], steering)  # at least 1
+    directions = jnp.asarray(pas_directions(), element_positions.dtype)
+
+    def peak_of(unit: Complex[Array, " elements"], positions: Float[Array, "elements 3"]) -> Float[Array, ""]:
+        return jnp.max(cbf(unit, steering_vector(positions, directions))) ** 2  # at least 1
+
+    each = (0, 0 if element_positions.ndim == 3 else None)
+    peak = jax.vmap(peak_of, each)(unit_snapshots(snapshots)[0], element_positions)
     return jnp.where(peak > 0, 1 / jnp.maximum(peak, 1), 0)
 
 
