@@ -10,10 +10,11 @@ from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.fields import get_field
+from wbgs_jax.fields import get_field, hybrid
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
 from wbgs_jax.fields.trust import Shares, constant
 from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
 
@@ -89,6 +90,29 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     assert np.abs(said - power).mean() < 0.1 * np.abs(wave.power_db - informed.power_db).mean()
     assert sum(report["shares"]["spectra"][name] for name in ("coherent", "own", "informed")) == pytest.approx(1, abs=2e-3)
     assert report["shares"]["spectra"]["by_query"] is False
+
+
+@pytest.mark.heavy
+def test_noise_on_snapshots_does_not_speak_against_the_coherent_field(run, rng, monkeypatch):
+    params, index, share = run.state.params, np.arange(len(run.dataset)), 0.1  # of a few transmitters nothing is sure
+    batch = run.data.batch(jnp.asarray(index), run.key)
+    clean = np.asarray(observe_links(run.field.wave, params.wave, run.dataset, index).snapshots)
+    level = np.sqrt(np.mean(np.abs(clean) ** 2, -1, keepdims=True) * share / (1 - share) / 2)
+    noisy = clean + level * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
+
+    def weighed(snapshots):
+        heard = jnp.asarray(snapshots, jnp.complex64)
+        observed = dataclasses.replace(batch, snapshots=heard, pas=snapshot_to_pas(heard, batch.receiver.element_positions))
+        found, report = run.field.calibrate(params, run.cache, [observed])
+        return float(jax.nn.sigmoid(found.trust.spectra.coherent.bias)), report["noise_share"]
+
+    trusted, found = weighed(clean)
+    assert trusted > 0.9
+    assert found == 0
+    allowed, found = weighed(noisy)
+    assert 0.2 * share < found < 1.2 * share
+    monkeypatch.setattr(hybrid, "noise_share", lambda *_: 0.0)
+    assert allowed > weighed(noisy)[0]
 
 
 @pytest.mark.heavy
