@@ -46,7 +46,7 @@ def floor_of(
     directions = jnp.asarray(pas_directions(), element_positions.dtype)
 
     def peak_of(unit: Complex[Array, " elements"], positions: Float[Array, "elements 3"]) -> Float[Array, ""]:
-        return jnp.max(cbf(unit, steering_vector(positions, directions))) ** 2  # at least 1
+        return jnp.max(cbf(unit, steering_vector(positions, directions))) ** 2  # 1 or more, but for noise
 
     each = (0, 0 if element_positions.ndim == 3 else None)
     peak = jax.vmap(peak_of, each)(unit_snapshots(snapshots)[0], element_positions)

@@ -30,8 +30,8 @@ FEWEST, MOST = 4, 20_000
 MOST_RESIDUALS = 1000
 """Known spectra above which residuals are not tried: they are those of spectra that the field was trained on, and of many of
 them it leaves none."""
-SCORED = 240
-"""Validation spectra that are looked at."""
+GLANCE, SCORED = 40, 240
+"""Validation spectra that are looked at: the first of them say whether anything may gain."""
 SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
 """Lengths that are tried, in median distances of a training transmitter to the next one."""
 WEIGHTS = (0.5, 1.0)
@@ -75,13 +75,20 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
     truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
     own = predict_spectra(field, params, dataset, asked)
-    of_training = _Known(field, params, dataset, dataset.train)
+    of_training, alone = _Known(field, params, dataset, dataset.train), ssim(own, truth)
 
-    def scored(choice: Choice) -> Float[np.ndarray, " n"]:
-        return ssim(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query)), truth)
+    def chosen_by(some: slice) -> tuple[Choice | None, float, bool]:
+        queried, tried = jax.tree.map(lambda leaf: leaf[some], query), {}
+        for choice in choices(dataset, dataset.train):
+            corrected = _correct(of_training.neighbours(choice), jnp.asarray(own[some]), queried)
+            tried[choice] = ssim(np.asarray(corrected), truth[some])
+        gains = [standard_error(scores - alone[some], tx[some]) for scores in tried.values()]
+        hopeful = any(gain + SURE * error > WORTH for gain, error in gains)
+        return *choose(tried, alone[some], tx[some]), hopeful
 
-    tried = {choice: scored(choice) for choice in choices(dataset, dataset.train)}
-    chosen, gain = choose(tried, ssim(own, truth), tx)
+    chosen, gain, hopeful = chosen_by(slice(GLANCE))
+    if hopeful and len(asked) > GLANCE:
+        chosen, gain, _ = chosen_by(slice(None))
     if chosen is None:
         return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
     way = f"{'smooth' if chosen.smooth else 'rough'} {chosen.kind}"
