@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import gamma, kv
 from synthetic import RX, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
@@ -31,28 +30,20 @@ def made(choice, dataset, index, predicted):
     return make_neighbours(choice, dataset, index, images_of(choice.kind, eight_bit(dataset, index), predicted))
 
 
-def matern(distance, smooth):
-    """Rasmussen and Williams (2006), equation 4.14, by the Bessel function."""
-    order = 1.5 if smooth else 0.5
-    scaled = np.maximum(np.sqrt(2 * order) * distance, 1e-9)
-    return 2 ** (1 - order) / gamma(order) * scaled**order * kv(order, scaled)
-
-
 def by_the_equations(dataset, index, choice, values, position, frequency):
     """k (K + noise)^-1 values, at one frequency."""
     same = dataset.frequencies_hz[index] == frequency
     places = dataset.tx_positions[index][same]
-    kernel = matern(np.linalg.norm(places[:, None] - places[None], axis=-1) / choice.length, choice.smooth)
-    k = matern(np.linalg.norm(places - position, axis=-1) / choice.length, choice.smooth)
+    kernel = np.exp(-np.linalg.norm(places[:, None] - places[None], axis=-1) / choice.length)
+    k = np.exp(-np.linalg.norm(places - position, axis=-1) / choice.length)
     weights = choice.weight * np.linalg.solve(kernel + NOISE * np.eye(len(places)), k)
     return np.tensordot(weights, values[same], 1), weights.sum()
 
 
-@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("kind", ["residuals", "spectra"])
-def test_it_is_simple_kriging_at_the_same_frequency(known, rng, kind, smooth):
+def test_it_is_simple_kriging_at_the_same_frequency(known, rng, kind):
     dataset, index, truth, predicted = known
-    choice = Choice(kind, rng.uniform(0.3, 3), rng.uniform(0.2, 1), smooth)
+    choice = Choice(kind, length=rng.uniform(0.3, 3), weight=rng.uniform(0.2, 1))
     neighbours = made(choice, dataset, index, predicted)
     positions, frequency = rng.uniform(-1, 1, (3, 3)) + RX, dataset.frequencies_hz[index[0]]
     own = rng.uniform(0.4, 0.6, (3, 90, 360)).astype(np.float32)
@@ -89,26 +80,6 @@ def test_the_nearest_say_what_all_of_many_say(rng):
     np.testing.assert_allclose(got, np.clip(own[0] + said - total * own[0], 0, 1), atol=0.05)
     true = 0.5 + 0.5 * np.sin(position[0] - RX[0])
     assert np.abs(got - (true * shapes[0] + (1 - true) * shapes[1])).mean() < 0.02
-
-
-def test_what_changes_slowly_is_said_better_by_the_smooth_kernel(rng):
-    """A standing wave, known at places ten to the wavelength: between them the smooth kernel errs less than half as much."""
-    places = np.stack([np.linspace(0, 2, 21), np.zeros(21), np.zeros(21)], -1)
-    shape = rng.uniform(0.2, 1, (90, 360))
-    phase = rng.uniform(0, 2 * np.pi)
-    asked = places[5:15] + np.array([0.05, 0, 0])
-    brightness, true = (0.5 + 0.4 * np.sin(2 * np.pi * x[:, 0] + phase) for x in (places, asked))
-    dataset, frequency = tiny_dataset(21), 3e8
-    first = np.array([np.flatnonzero(dataset.tx_index == tx)[0] for tx in range(21)])
-    changes = {"tx_positions": places[dataset.tx_index], "frequencies_hz": np.full(len(dataset), frequency)}
-    dataset = dataclasses.replace(dataset, **changes)
-    images = jnp.asarray(np.round(255 * brightness[:, None, None] * shape).astype(np.uint8))
-    own, query = jnp.full((10, 90, 360), 0.5 * shape.mean()), make_query(asked, np.full(10, frequency))
-    errors = []
-    for smooth in (False, True):
-        neighbours = make_neighbours(Choice("spectra", 0.4, 1.0, smooth), dataset, first, images)
-        errors.append(np.abs(np.asarray(correct(neighbours, own, query)) - true[:, None, None] * shape).mean())
-    assert errors[1] < 0.5 * errors[0], errors
 
 
 def test_a_neighbour_itself_is_nearly_given_back(known):
@@ -154,9 +125,6 @@ def test_they_belong_to_one_receiver_and_to_a_run_folder(known, tmp_path):
     found, query = read_neighbours(tmp_path), dataset.query(index[:4])
     own = jnp.asarray(predicted[:4])
     np.testing.assert_allclose(correct(found, own, query), correct(neighbours, own, query), atol=0.01)
-    older = dataclasses.replace(neighbours, smooth=None)  # as in files from before there were two kernels
-    np.savez(tmp_path / asked.FILE, **{key: value for key, value in vars(older).items() if value is not None})
-    np.testing.assert_allclose(correct(read_neighbours(tmp_path), own, query), correct(neighbours, own, query), atol=0.01)
     (tmp_path / asked.FILE).write_bytes(b"PK\x03\x04 no archive")
     with pytest.raises(UserError, match=r"neighbours\.npz is damaged"):
         read_neighbours(tmp_path)

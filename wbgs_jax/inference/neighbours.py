@@ -1,15 +1,13 @@
 """What known spectra nearby say about a spectrum, beside the field: simple kriging over the transmitter's position.
 
-    k_j = c(|x - x_j| / L) over the nearest known transmitters at the same frequency,   a = (K + noise)^-1 k
-    rough: c(d) = exp(-d),   smooth: c(d) = (1 + sqrt(3) d) exp(-sqrt(3) d)    (Matern 1/2 and 3/2)
+    k_j = exp(-|x - x_j| / L) over the nearest known transmitters at the same frequency,   a = (K + noise)^-1 k
     residuals:  f(x) + w a . (y - f)
     spectra:    f(x) + w a . (y - f(x))
 
 The first adds what the field left unexplained at its neighbours; the second moves towards their spectra themselves, which helps
-where the field has learned them by heart and their residuals are zero. Spectra that lie much closer than a wavelength or a beam
-change smoothly from one to the next, others do not. Which of these, how far (L) and how much (w) is found on the validation
-part (training/neighbours.py), nothing at all included. Only the nearest are asked: the others are behind them, and a data set
-may hold thousands.
+where the field has learned them by heart and their residuals are zero. Which, how far (L) and how much (w) is found on the
+validation part (training/neighbours.py), nothing at all included. Only the nearest are asked: the others are behind them, and
+a data set may hold thousands.
 """
 
 import dataclasses
@@ -56,8 +54,6 @@ class Neighbours:
     """Whether the field's own spectrum gives way: 1 for spectra, 0 for residuals."""
     length: Float[Array, ""]
     """L in metres."""
-    smooth: Float[Array, ""] | None = None
-    """Whether the correlation is the smooth one, 1, or the rough one, 0 (None, as in older files, is rough)."""
 
 
 def nearness(
@@ -66,17 +62,12 @@ def nearness(
     known_position: Float[Array, "m 3"],
     known_frequency: Float[Array, " m"],
     length: Any,
-    smooth: Any = None,
 ) -> Float[Array, "b m"]:
-    """Returns the kernel, the rough or the smooth one, at equal frequencies, else 0."""
+    """Returns the kernel: exp(-distance / length) at equal frequencies, else 0."""
     offset = tx_position[:, None] - known_position[None]
     distance = jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12)  # differentiable at a neighbour itself
     same = jnp.abs(jnp.log(frequency_hz[:, None] / known_frequency[None])) < SAME_FREQUENCY
-    scaled = distance / length
-    kernel = jnp.exp(-scaled)
-    if smooth is not None:
-        kernel = jnp.where(smooth > 0, (1 + 3**0.5 * scaled) * jnp.exp(-(3**0.5) * scaled), kernel)
-    return jnp.where(same, kernel, 0)
+    return jnp.where(same, jnp.exp(-distance / length), 0)
 
 
 def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
@@ -90,11 +81,11 @@ def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query:
 def _corrected(
     neighbours: Neighbours, position: Float[Array, "3"], frequency_hz: Float[Array, ""], own: Float[Array, "90 360"]
 ) -> Float[Array, "90 360"]:
-    known, form = (neighbours.tx_position, neighbours.frequency_hz), (neighbours.length, neighbours.smooth)
-    near = nearness(position[None], frequency_hz[None], *known, *form)[0]
+    known, length = (neighbours.tx_position, neighbours.frequency_hz), neighbours.length
+    near = nearness(position[None], frequency_hz[None], *known, length)[0]
     k, index = jax.lax.top_k(near, min(NEAREST, len(near)))
     places = known[0][index], known[1][index]
-    kernel = nearness(*places, *places, *form) + NOISE * jnp.eye(len(k))
+    kernel = nearness(*places, *places, length) + NOISE * jnp.eye(len(k))
     # Conjugate gradients: exported for any platform, unlike a factorisation; as many steps as there are unknowns are enough.
     shares, _ = cg(lambda v: jnp.matmul(kernel, v, precision=EXACT), k, tol=1e-7, maxiter=2 * NEAREST)
     shares = neighbours.weight * shares

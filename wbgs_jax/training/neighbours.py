@@ -1,9 +1,9 @@
 """Whether known spectra nearby are to be asked beside a trained field, and how: found on the validation part, on the host.
 
 The training part is what is asked, at transmitters of the validation part, which the field has not seen. If the best way
-surely gains something that is worth it, the most cautious one is kept that is no worse by more than a standard error (Breiman
-et al. 1984), of its own score or of its gain, whichever is known better: validation transmitters often lie closer to their
-neighbours than those that are asked for later. Afterwards both parts are asked.
+surely gains something that is worth it, the smoothest one is kept that gains no less by more than a standard error (Breiman
+et al. 1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
+parts are asked.
 """
 
 import itertools
@@ -30,8 +30,8 @@ FEWEST, MOST = 4, 20_000
 MOST_RESIDUALS = 1000
 """Known spectra above which residuals are not tried: they are those of spectra that the field was trained on, and of many of
 them it leaves none."""
-GLANCE, SCORED = 40, 240
-"""Validation spectra that are looked at: the first of them say whether anything may gain."""
+SCORED = 60
+"""Validation spectra that are looked at."""
 SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
 """Lengths that are tried, in median distances of a training transmitter to the next one."""
 WEIGHTS = (0.5, 1.0)
@@ -49,7 +49,6 @@ class Choice:
     length: float
     """Metres."""
     weight: float
-    smooth: bool = False
 
 
 class Learned(NamedTuple):
@@ -75,24 +74,15 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
     truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
     own = predict_spectra(field, params, dataset, asked)
-    of_training, alone = _Known(field, params, dataset, dataset.train), ssim(own, truth)
+    alone, of_training = ssim(own, truth), _Known(field, params, dataset, dataset.train)
 
-    def chosen_by(some: slice) -> tuple[Choice | None, float, bool]:
-        queried, tried = jax.tree.map(lambda leaf: leaf[some], query), {}
-        for choice in choices(dataset, dataset.train):
-            corrected = _correct(of_training.neighbours(choice), jnp.asarray(own[some]), queried)
-            tried[choice] = ssim(np.asarray(corrected), truth[some])
-        gains = [standard_error(scores - alone[some], tx[some]) for scores in tried.values()]
-        hopeful = any(gain + SURE * error > WORTH for gain, error in gains)
-        return *choose(tried, alone[some], tx[some]), hopeful
+    def gains(choice: Choice) -> Float[np.ndarray, " n"]:
+        return ssim(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query)), truth) - alone
 
-    chosen, gain, hopeful = chosen_by(slice(GLANCE))
-    if hopeful and len(asked) > GLANCE:
-        chosen, gain, _ = chosen_by(slice(None))
+    chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
         return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
-    way = f"{'smooth' if chosen.smooth else 'rough'} {chosen.kind}"
-    line = f"{way} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
+    line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
     return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
 
 
@@ -140,28 +130,23 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
         return []
     spacing = float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1]))
     kinds: tuple[Kind, ...] = ("residuals", "spectra") if len(known) <= MOST_RESIDUALS else ("spectra",)
-    ways = itertools.product(kinds, SPACINGS, WEIGHTS, (False, True))
-    return [Choice(kind, scale * spacing, weight, smooth) for kind, scale, weight, smooth in ways]
+    return [Choice(kind, scale * spacing, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
 
 
-def choose(
-    tried: dict[Choice, Float[np.ndarray, " n"]], alone: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]
-) -> tuple[Choice | None, float]:
-    """Returns the choice by its scores beside those of the field alone (None: nothing sure), and its mean gain.
+def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarray, " n"]) -> tuple[Choice | None, float]:
+    """Returns the choice by its gains over the field alone (None: nothing sure), and its mean gain.
 
-    Of two, the one with the full weight is more cautious, then the one of spectra, then the rough one, then the longer one.
+    Of two, the one with the full weight is smoother, then the one of spectra, then the longer one.
     """
     if not tried:
         return None, 0.0
-    gains = {choice: standard_error(scores - alone, tx_index) for choice, scores in tried.items()}
-    best = max(gains, key=lambda choice: gains[choice][0])
-    gain, error = gains[best]
+    best = max(tried, key=lambda choice: float(tried[choice].mean()))
+    gain, error = standard_error(tried[best], tx_index)
     if gain <= max(SURE * error, WORTH):
         return None, gain
-    error = min(error, standard_error(tried[best], tx_index)[1])
-    enough = [choice for choice, (own, _) in gains.items() if own >= gain - error]
-    chosen = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", not choice.smooth, choice.length))
-    return chosen, gains[chosen][0]
+    enough = [choice for choice, gains in tried.items() if standard_error(gains, tx_index)[0] >= gain - error]
+    smoothest = max(enough, key=lambda choice: (choice.weight, choice.kind == "spectra", choice.length))
+    return smoothest, standard_error(tried[smoothest], tx_index)[0]
 
 
 def make_neighbours(
@@ -178,5 +163,4 @@ def make_neighbours(
         weight=jnp.float32(choice.weight),
         own=jnp.float32(spectra),
         length=jnp.float32(choice.length),
-        smooth=jnp.float32(choice.smooth),
     )
