@@ -63,13 +63,12 @@ def test_what_is_unexplained_is_the_part_across(rng):
     np.testing.assert_allclose(unexplained(jnp.asarray(predicted), jnp.asarray(heard)), share, atol=1e-5)
 
 
-def known(rng, share, wrong=0.0, n_tx=30, per_tx=4):
-    """Arguments of `noise_share` where snapshots are noisy, and what predicts them is wrong in places."""
+def known(rng, share, n_tx=30, per_tx=4):
+    """Arguments of `noise_share` where snapshots are noisy, and predicted without the noise."""
     clean = waves(rng, n_tx * per_tx)
     heard = clean + noise(rng, clean, share)[0]
-    said = clean + noise(rng, clean, rng.uniform(0, wrong))[0]
-    predicted, observed = (np.asarray(snapshot_to_pas(jnp.asarray(y), ARRAY)) for y in (said, heard))
-    left, floor = (np.asarray(f) for f in (unexplained(jnp.asarray(said), jnp.asarray(heard)), floor_of(heard, ARRAY)))
+    predicted, observed = (np.asarray(snapshot_to_pas(jnp.asarray(y), ARRAY)) for y in (clean, heard))
+    left, floor = (np.asarray(f) for f in (unexplained(jnp.asarray(clean), jnp.asarray(heard)), floor_of(heard, ARRAY)))
     return left, floor, predicted, observed, np.repeat(np.arange(n_tx), per_tx)
 
 

@@ -208,8 +208,9 @@ class HybridField(Field):
             jax.tree.map(np.asarray, _opinions(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches
         ]
         said, powers, told, pas, heard_db, noisy = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
-        tx_index, noise = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches]), 0.0
-        if noisy is not None and pas is not None:
+        tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
+        noise = 0.0
+        if noisy is not None:
             left, floor = noisy
             noise = noise_share(left, floor, said.coherent, pas, tx_index)
             said = said._replace(coherent=np.asarray(with_noise(jnp.asarray(said.coherent), jnp.asarray(noise * floor))))

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation, ssim
+from wbgs_jax._util.statistics import standard_error
+from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
-from wbgs_jax.radio.channel import unit_snapshots
+from wbgs_jax.radio.channel import correlation, unit_snapshots
 
 BEST = 0.02
 """Share of the snapshots: those that are explained best. All of what is left of these is taken for noise."""
@@ -32,7 +33,7 @@ BLOCK = 64
 @jax.jit
 def unexplained(predicted: Complex[Array, "b elements"], observed: Complex[Array, "b elements"]) -> Float[Array, " b"]:
     """Returns the share of the power of B observed snapshots that is no multiple of the predicted ones, 0 to 1."""
-    return jnp.exp(log_decorrelation(predicted, observed)) - GOOD_MATCH
+    return 1 - correlation(predicted, observed) ** 2
 
 
 @jax.jit
@@ -77,9 +78,8 @@ def noise_share(
         tx_index: their transmitters, which are what was drawn.
     """
     heard = floor > 0
-    if not heard.any():
-        return 0.0
-    if (share := float(np.quantile(left[heard], BEST))) < LEAST:
+    share = float(np.quantile(left[heard], BEST)) if heard.any() else 0.0
+    if share < LEAST:
         return 0.0
     gains = np.concatenate(
         [
@@ -87,9 +87,8 @@ def noise_share(
             for own in (slice(start, start + BLOCK) for start in range(0, len(left), BLOCK))
         ]
     )
-    by_tx = np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])
-    sure = len(by_tx) > 1 and by_tx.mean() > SURE * by_tx.std(ddof=1) / np.sqrt(len(by_tx))
-    return share if sure else 0.0
+    gain, error = standard_error(gains, tx_index)
+    return share if gain > SURE * error else 0.0
 
 
 @jax.jit

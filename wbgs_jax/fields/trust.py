@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
@@ -180,9 +181,8 @@ def learn_share(known: Scored) -> Share:
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
         by_features, by_all = _fit(rest), constant(_best(rest.scores))
         gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
-    by_tx = np.array([gains[known.tx_index == tx].mean() for tx in np.unique(known.tx_index)])
-    sure = by_tx.mean() > by_tx.std(ddof=1) / np.sqrt(len(by_tx))
-    return _fit(known) if sure else common
+    gain, error = standard_error(gains, known.tx_index)
+    return _fit(known) if gain > error else common
 
 
 def _best(scores: Float[np.ndarray, "n shares"]) -> float:

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num, UInt8
 from scipy.spatial import cKDTree
 
+from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
 from wbgs_jax.inference.neighbours import Neighbours, correct
 from wbgs_jax.inference.predictor import predict_spectra
-from wbgs_jax.training.scores import standard_error
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 20_000

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
+from wbgs_jax._util.statistics import by_transmitter
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.data import TrainingData
@@ -132,13 +133,6 @@ def _score(
     return jax.vmap(one)(batches).T
 
 
-def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[float, float]:
-    """Returns the mean gain and its standard error, transmitters being what was drawn."""
-    by_tx = _by_transmitter(gains, tx_index)
-    error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
-    return float(by_tx.mean()), float(error)
-
-
 def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:
     """Returns whether the mean gain over transmitters is positive, as surely as so many standard errors of a normal mean say.
 
@@ -146,12 +140,8 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
     t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
     three errors.
     """
-    by_tx = _by_transmitter(gains, tx_index)
+    by_tx = by_transmitter(gains, tx_index)
     if len(by_tx) < 2:  # signs of one are flipped with even odds
         return False
     chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue
     return bool(chance <= norm.sf(errors))
-
-
-def _by_transmitter(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
-    return np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])

@@ -1,0 +1,16 @@
+"""Gains of one way over another: links of one transmitter say nearly the same, and transmitters are what was drawn."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[float, float]:
+    """Returns the mean gain and its standard error, transmitters being what was drawn."""
+    by_tx = by_transmitter(gains, tx_index)
+    error = by_tx.std(ddof=1) / np.sqrt(len(by_tx)) if len(by_tx) > 1 else np.inf
+    return float(by_tx.mean()), float(error)
+
+
+def by_transmitter(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
+    """Returns the mean gain of every transmitter."""
+    return np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])
