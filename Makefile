@@ -13,6 +13,7 @@ PYTHON ?= python3
 
 VENV   := .venv
 PY     := $(VENV)/bin/python
+PIP    := $(PY) -m pip install --quiet --disable-pip-version-check --no-compile
 READY  := $(VENV)/.ready
 CUDA   := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo cuda)
 SOURCE := $(if $(DATA),--data $(DATA),--scene $(SCENE))
@@ -36,8 +37,8 @@ $(READY): uv.lock requirements.lock pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
 		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev $(if $(CUDA),--extra cuda); \
 	else \
-		$(PYTHON) -m venv $(VENV) && $(PY) -m pip install --quiet --disable-pip-version-check --no-deps -r requirements.lock && \
-		$(PY) -m pip install --quiet --disable-pip-version-check --no-deps -e . $(if $(CUDA),&& $(PY) -m pip install --quiet "jax[cuda12]"); \
+		$(PYTHON) -m venv $(VENV) && $(PIP) --no-deps -r requirements.lock && \
+		$(PIP) --no-deps -e . $(if $(CUDA),&& $(PIP) "jax[cuda12]"); \
 	fi
 	@touch $@
 
@@ -96,7 +97,7 @@ coverage: setup  ## run the tests and report which lines of the library they rea
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \
 		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev --extra data $(if $(CUDA),--extra cuda); \
-	else $(PY) -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-data.lock; fi
+	else $(PIP) --no-deps -r requirements-data.lock; fi
 
 data: simulator  ## trace a scene with Sionna RT, or go on with it: make data SCENE=1 [ARGS="--frequency-set 21"]
 	$(PY) -m data_gen.generate --scene $(SCENE) $(ARGS)

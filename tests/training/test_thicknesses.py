@@ -134,6 +134,22 @@ def test_of_what_no_path_meets_no_slab_is_ruled_out(room):
     assert float(found.materials.log_susceptibility[1]) == pytest.approx(np.log(ITU_MATERIALS["glass"][0] - 1))
 
 
+@pytest.mark.parametrize("silent", [0, 16])
+def test_what_the_first_spectra_say_nothing_of_is_not_ruled_out(room, silent):
+    """All slabs get a glance where a third of its spectra cannot tell them apart, and the best third where it can."""
+    params, slabs, asked = room.field.init(jax.random.key(0)), _all_slabs(2.4e9), []
+
+    def score(candidates, first=60):
+        off = [abs(float(one.materials.log_thickness[0]) - np.log(0.07)) for one in candidates]
+        asked.append((len(candidates), first))
+        return np.array(off)[:, None] * (np.arange(first) >= silent)
+
+    found, _ = _best(params, 0, slabs, score, 48)
+    assert asked == [(len(slabs), 16), (len(slabs) if silent else len(slabs) // 3, 48), (5, 60)]
+    nearest = min(abs(np.log(slab.metres / 0.07)) for slab in slabs)
+    assert abs(float(found.materials.log_thickness[0]) - np.log(0.07)) == pytest.approx(nearest, abs=1e-6)
+
+
 def test_frequencies_stand_apart_and_are_believed():
     of_data = np.repeat([1.0, 2.4, 2.5, 5.0, 5.2, 28.0, 60.0, 61.0], 3) * 1e9
     np.testing.assert_allclose(frequencies_to_look_at(of_data, np.inf), np.array([2.5, 5.2, 28.0, 61.0]) * 1e9)

@@ -31,8 +31,10 @@ APART = 1.25
 """Ratio of two frequencies that are looked at one after the other, at least."""
 BELIEVED = 0.1
 """Wavelengths: where surfaces may stand further off (standard deviation), phases tell nothing of thicknesses."""
-SHORTLIST = 8
-"""Slabs that are looked at closely: the best at a first glance."""
+FEWER = 3
+"""A third of the spectra of a glance tell which third of many slabs deserve the whole of it."""
+SHORTLIST = 4
+"""Slabs that are looked at closely: the best at a glance."""
 ONCE_MORE = 60
 """Slabs that are tried again when all materials have been looked at once, or surfaces have moved: the best at a glance ..."""
 ENTRIES = 6
@@ -151,14 +153,20 @@ def _wavelength(entry: str, frequency_hz: float) -> float:
 def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[Any, list[Slab]]:
     """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
     better; and the likely ones of them, the best first."""
-    candidates = [_made_of(params, material, slab) for slab in slabs]
-    first = score(candidates, glance).mean(1)
-    order = np.argsort(first)
-    if np.ptp(first) < UNSEEN:
+    few, left = len(slabs) // FEWER, slabs
+    if few > ONCE_MORE:
+        left = _ranked(params, material, slabs, score, glance // FEWER)[:few] or slabs
+    likely = _ranked(params, material, left, score, glance)[:ONCE_MORE]
+    if not likely:
         return params, slabs
-    likely = [slabs[i] for i in order[:ONCE_MORE]]
-    close = [params, *(candidates[i] for i in order[:SHORTLIST])]
+    close = [params, *(_made_of(params, material, slab) for slab in likely[:SHORTLIST])]
     return close[int(np.argmin(score(close).mean(1)))], likely
+
+
+def _ranked(params: Any, material: int, slabs: list[Slab], score: Scores, spectra: int) -> list[Slab]:
+    """Returns slabs, the best first by so many spectra; none, where the material makes no difference to these."""
+    scores = score([_made_of(params, material, slab) for slab in slabs], spectra).mean(1)
+    return [] if np.ptp(scores) < UNSEEN else [slabs[i] for i in np.argsort(scores)]
 
 
 def _made_of(params: Any, material: int, slab: Slab) -> Any:
