@@ -48,7 +48,7 @@ def estimate(scores: Float[np.ndarray, "seeds tx ghz"]) -> Estimate:
     """
     rng = np.random.default_rng(SEED)
     k, n, _ = scores.shape
-    drawn = [np.ix_(rng.integers(0, k, k), rng.integers(0, n, n)) for _ in range(DRAWS)]
+    drawn = [np.ix_(rng.integers(0, k, (k,)), rng.integers(0, n, (n,))) for _ in range(DRAWS)]
     blocks = (drawn[start : start + AT_ONCE] for start in range(0, DRAWS, AT_ONCE))
     levels = np.concatenate([np.median(typical(np.stack([scores[i] for i in block])), -1) for block in blocks])
     low, high = np.quantile(levels, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
