@@ -11,7 +11,7 @@ from wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.training.materials import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
 from wbgs_jax.training.scores import Told
-from wbgs_jax.training.thicknesses import Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
+from wbgs_jax.training.thicknesses import ONCE_MORE, Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
 SETTINGS = tiny_settings(
@@ -148,6 +148,18 @@ def test_what_the_first_spectra_say_nothing_of_is_not_ruled_out(room, silent):
     assert asked == [(len(slabs), 16), (len(slabs) if silent else len(slabs) // 3, 48), (5, 60)]
     nearest = min(abs(np.log(slab.metres / 0.07)) for slab in slabs)
     assert abs(float(found.materials.log_thickness[0]) - np.log(0.07)) == pytest.approx(nearest, abs=1e-6)
+
+
+def test_a_glance_at_a_single_spectrum_is_one(room):
+    """A third of it is not none."""
+
+    def score(candidates, first=60):
+        off = [abs(float(one.materials.log_thickness[0]) - np.log(0.07)) for one in candidates]
+        assert first > 0
+        return np.array(off)[:, None] + np.zeros(first)
+
+    _, likely = _best(room.field.init(jax.random.key(0)), 0, _all_slabs(2.4e9), score, 1)
+    assert len(likely) == ONCE_MORE
 
 
 def test_frequencies_stand_apart_and_are_believed():

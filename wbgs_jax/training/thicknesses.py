@@ -155,7 +155,7 @@ def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: 
     better; and the likely ones of them, the best first."""
     few, left = len(slabs) // FEWER, slabs
     if few > ONCE_MORE:
-        left = _ranked(params, material, slabs, score, glance // FEWER)[:few] or slabs
+        left = _ranked(params, material, slabs, score, -(-glance // FEWER))[:few] or slabs
     likely = _ranked(params, material, left, score, glance)[:ONCE_MORE]
     if not likely:
         return params, slabs
