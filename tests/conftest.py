@@ -44,6 +44,7 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = tempfile.TemporaryDirectory(prefix="wbgs-test-cache-", ignore_cleanup_errors=True)
         config.add_cleanup(folder.cleanup)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder.name)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # most of the time goes into small programs
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns about tuning flags of cached programs
     # In the environment, so that the workers of pytest-xdist draw the same.
     os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)
