@@ -103,7 +103,8 @@ def absent_movers(params: Any, told: Told, config: SearchConfig) -> Int[np.ndarr
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
-    gains = score([params], config.absent_glance) - score([_of_air(params, one) for one in tried], config.absent_glance)
+    without_one = score([_of_air(params, one) for one in tried], config.absent_glance)
+    gains = score([params], config.absent_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
     now, gone = score([params])[0], list[int]()
     closely = (now - score([_of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)

@@ -67,17 +67,17 @@ def search_antennas(
 ) -> tuple[Any, AntennaReport]:
     """Returns parameters with the antennas whose scores are best, in turn for transmitters and elements, where they are surely
     better than what is there; elements whose pattern the data say are left alone."""
-    before = after = score([params])[0]
-    taken, settled = dict[str, str](), 0
+    taken, settled, before, after = dict[str, str](), 0, np.zeros(1), np.zeros(1)
     ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
         end, candidates = ends[turn % len(ends)], antenna_candidates()  # anew: training gives every array away once
-        tried = [dataclasses.replace(params, **{end: antenna}) for antenna in candidates.values()]
+        tried = [params, *(dataclasses.replace(params, **{end: antenna}) for antenna in candidates.values())]
         scores = score(tried)
-        best = int(np.argmin(scores.mean(1)))
+        best = 1 + int(np.argmin(scores[1:].mean(1)))
+        before, after = before if turn else scores[0], scores[0]
         settled += 1
-        if surely_better(after - scores[best], tx_index, config.antenna_sure):
-            taken[end], params, after, settled = list(candidates)[best], tried[best], scores[best], 1
+        if surely_better(scores[0] - scores[best], tx_index, config.antenna_sure):
+            taken[end], params, after, settled = list(candidates)[best - 1], tried[best], scores[best], 1
         if settled == len(ends):  # the other end is what it was when this one was looked at
             break
     return params, AntennaReport(float(before.mean()), float(after.mean()), taken)

@@ -4,9 +4,8 @@ The phase behind a slab turns by many radians at high frequencies. Its permittiv
 turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
 data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
 apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
-spectra best is taken, unless what is there fits better by more than chance. Most entries are out of the question after a few
-spectra, and only what is left is looked at closely (a race: Maron and Moore, Hoeffding races, NIPS 1993). Training goes on from
-there.
+spectra best is taken, unless what is there fits better by more than chance; a few spectra say which entries are worth a closer
+look. Training goes on from there.
 """
 
 import dataclasses
@@ -52,12 +51,10 @@ USUAL_M: dict[str, float] = {
 """Metres: how thick walls, boards and panes of each are sold or built; where to begin when a scene does not say."""
 UNSEEN = 1e-6
 """A material that changes the scores by less is in no path of the spectra, and stays what it is."""
+
+
 SHORTLIST = 4
-"""Entries that are left after a first glance: the best ones."""
-GLANCES = 3
-"""Times as many spectra tell what else is out of the question ..."""
-CERTAIN = 4.0
-"""... by being worse than the best by so many standard errors."""
+"""Entries that are looked at closely: the best at a first glance."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ class SearchReport:
     """What a search did."""
 
     before: float
-    """Mean log decorrelation of the spectra by which all candidates were compared."""
+    """Mean log decorrelation of the spectra that were looked at."""
     after: float
     """The same with the materials that were taken."""
     taken: dict[int, str]
@@ -77,7 +74,7 @@ class SearchReport:
 def search_materials(params: Any, score: Scores, config: SearchConfig, usual: bool = False) -> tuple[Any, SearchReport]:
     """Returns parameters with the materials whose scores are best; with `usual`, those that change become as thick as is usual
     (where the scene says how thick they are, that counts for nothing)."""
-    before, after, taken, settled = np.zeros(1), np.zeros(1), dict[int, str](), 0
+    before, taken, settled = np.zeros(0), dict[int, str](), 0
     count = len(params.materials.slope)
     for turn in range(config.rounds * count):
         material = turn % count
@@ -89,43 +86,17 @@ def search_materials(params: Any, score: Scores, config: SearchConfig, usual: bo
         ]
         likely = np.argsort(score(entries, config.glance).mean(1))[:SHORTLIST]
         candidates = [params, *(entries[i] for i in likely)]
-        few = score(candidates, GLANCES * config.glance)
-        best = _best(candidates, few, score, config)
-        before, after = before if turn else few[0], few[best]
+        scores = score(candidates)
+        best = 1 + int(np.argmin(scores[1:].mean(1)))
+        before = before if turn else scores[0]
         settled += 1
-        if best:
+        if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
             taken[material] = list(ITU_MATERIALS)[likely[best - 1]]
             settled = settled if same(params.materials, candidates[best].materials) else 1
-            params = candidates[best]
+            params, scores = candidates[best], scores[best:]
         if settled == count:  # all others are what they were when each was looked at
             break
-    return params, SearchReport(float(before.mean()), float(after.mean()), taken)
-
-
-def _best(candidates: list[Any], few: Float[np.ndarray, "k n"], score: Scores, config: SearchConfig) -> int:
-    """Returns which candidate to take: the best but the first, or that, where it makes no difference or surely fits better.
-
-    Args:
-        candidates: the first is what is there.
-        few: their scores on a few spectra.
-        score: of all spectra.
-        config: how sure it has to be.
-    """
-    left = list(range(len(candidates)))
-    if np.ptp(few.mean(1)) >= UNSEEN:
-        leader = few[np.argmin(few.mean(1))]
-        left = [i for i in left if not _surely_better(leader, few[i], CERTAIN)]
-    if len(left) == 1:
-        return left[0]
-    if len(left) == 2 and same(*(candidates[i].materials for i in left)):  # an entry of the list is there already
-        return left[1]
-    there_are_more = few.shape[1] == GLANCES * config.glance
-    scores = score([candidates[i] for i in left]) if there_are_more else few[left]
-    own = scores[1:] if left[0] == 0 else scores
-    best = len(scores) - len(own) + int(np.argmin(own.mean(1)))
-    if left[0] == 0 and (np.ptp(scores.mean(1)) < UNSEEN or _surely_better(scores[0], scores[best], config.sure)):
-        return 0
-    return left[best]
+    return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
 def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], errors: float) -> bool:
@@ -142,13 +113,19 @@ def with_entry(materials: Any, material: int, name: str, metres: float | None = 
 def with_properties(materials: Any, material: int, permittivity: float, c: float, d: float, metres: float | None = None) -> Any:
     """Returns a copy in which one material has another relative permittivity (above 1), the conductivity c f^d (S/m, f in GHz),
     and is so many metres thick, or as thick as before."""
-    new = {"log_susceptibility": np.log(permittivity - 1), "log_conductivity": np.log(c), "slope": d}
-    new |= {} if metres is None else {"log_thickness": np.log(metres)}
+    new = {
+        "log_susceptibility": np.log(permittivity - 1),
+        "log_conductivity": np.log(c),
+        "slope": d,
+        "log_thickness": None if metres is None else np.log(metres),
+    }
     return dataclasses.replace(materials, **{leaf: _with(getattr(materials, leaf), material, new[leaf]) for leaf in new})
 
 
-def _with(leaf: Float[Array, " m"], index: int, value: float) -> Float[Array, " m"]:
-    """Returns what `leaf.at[index].set(value)` does, in an eighth of the time: there are thousands of candidates."""
+def _with(leaf: Float[Array, " m"], index: int, value: float | None) -> Float[Array, " m"]:
+    """Returns what `leaf.at[index].set(value)` does, in an eighth of the time: there are thousands of candidates. Without a
+    value it is a copy, so that candidates of all kinds differ in the same leaves and have one program (scores.py)."""
     copy = np.array(leaf)
-    copy[index] = value
+    if value is not None:
+        copy[index] = value
     return jnp.asarray(copy)

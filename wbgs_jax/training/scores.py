@@ -2,7 +2,7 @@
 searches before a training, and the choices after it, compare."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -20,9 +20,8 @@ from wbgs_jax.types import Batch, Links
 
 AT_ONCE = 8
 """Spectra."""
-ROOMS = (1, 2, 5, 12, 32)
-"""Numbers of candidates for which there are programs: compiling one for every number takes longer than the few candidates that
-are scored in vain. More than the largest are scored one block after the other."""
+SIDE_BY_SIDE = 6
+"""Candidates. Compiling a program takes as long as scoring ten thousand, so that there is one for all numbers of them."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 Compared = Literal["snapshots", "covariances", "spectra"]
@@ -53,15 +52,16 @@ def make_scores(
         return _looked_at(field, cache, data, own)
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
-        if len(candidates) > ROOMS[-1]:
-            return np.concatenate([score(candidates[i : i + ROOMS[-1]], first) for i in range(0, len(candidates), ROOMS[-1])])
-        structure = jax.tree.structure(candidates[0])
+        if len(candidates) > SIDE_BY_SIDE:
+            some = [candidates[i : i + SIDE_BY_SIDE] for i in range(0, len(candidates), SIDE_BY_SIDE)]
+            return np.concatenate([score(own, first) for own in some])
+        structure, asked = jax.tree.structure(candidates[0]), len(spectra[:first])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
-        vain = next(room for room in ROOMS if room >= len(candidates)) - len(candidates)
+        differ = _as_compiled(differ, compared, candidates[0], field, block(0))
+        vain = SIDE_BY_SIDE - len(candidates)
         padded = [column + column[-1:] * vain for column in columns]
         leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
-        asked = len(spectra[:first])
         found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, asked, AT_ONCE)]
         together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :asked]
         return together if any(differ) else np.repeat(together, len(candidates), 0)
@@ -91,6 +91,20 @@ class Told:
     def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
         """Returns the transmitters of the first of them."""
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
+
+
+_programs: dict[Hashable, list[tuple[bool, ...]]] = {}
+"""Which leaves differ between the candidates that programs score, by all else that these depend on."""
+
+
+def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> tuple[bool, ...]:
+    """Returns which leaves to take for different: those that are, or more of them, where there is a program for these."""
+    shapes = ((jax.tree.structure(tree), *map(np.shape, jax.tree.leaves(tree))) for tree in trees)
+    known = _programs.setdefault((compared, *shapes), [])
+    wider = [one for one in known if all(own or not needed for own, needed in zip(one, differ, strict=True))]
+    if not wider:
+        known.append(differ)
+    return min(wider, key=sum, default=differ)
 
 
 @jax.jit
