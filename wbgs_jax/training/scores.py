@@ -20,8 +20,8 @@ from wbgs_jax.types import Batch, Links
 
 AT_ONCE = 8
 """Spectra."""
-SIDE_BY_SIDE = 6
-"""Candidates. Compiling a program takes as long as scoring ten thousand, so that there is one for all numbers of them."""
+SIDE_BY_SIDE = 32, 6
+"""Candidates. Compiling a program takes as long as scoring ten thousand, so that there are two for all numbers of them."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 Compared = Literal["snapshots", "covariances", "spectra"]
@@ -52,15 +52,14 @@ def make_scores(
         return _looked_at(field, cache, data, own)
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
-        if len(candidates) > SIDE_BY_SIDE:
-            some = [candidates[i : i + SIDE_BY_SIDE] for i in range(0, len(candidates), SIDE_BY_SIDE)]
-            return np.concatenate([score(own, first) for own in some])
+        room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
+        if len(candidates) > room:
+            return np.concatenate([score(candidates[:room], first), score(candidates[room:], first)])
         structure, asked = jax.tree.structure(candidates[0]), len(spectra[:first])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
         differ = _as_compiled(differ, compared, candidates[0], field, block(0))
-        vain = SIDE_BY_SIDE - len(candidates)
-        padded = [column + column[-1:] * vain for column in columns]
+        padded = [column + column[-1:] * (room - len(candidates)) for column in columns]
         leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
         found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, asked, AT_ONCE)]
         together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :asked]
