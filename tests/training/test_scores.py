@@ -10,6 +10,7 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
 
 from wbgs_jax.training import scores
+from wbgs_jax.training.materials import with_entry
 from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
@@ -63,6 +64,15 @@ def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
         make_scores(run.field, few, run.data, jnp.asarray(one_tx))(candidates[:9]), found[:9, np.isin(train, one_tx)], atol=1e-4
     )
     assert scores._score._cache_size() == programs
+    score = make_scores(run.field, run.cache, run.data, jnp.asarray(train))
+    np.testing.assert_allclose(score(candidates[:1]), found[:1], atol=1e-4)  # one differs from nothing
+    named = [dataclasses.replace(params, materials=with_entry(params.materials, 0, "wood", metres)) for metres in (None, 0.1)]
+    score(named)
+    programs = scores._score._cache_size()
+    assert (score(named[:1]).shape, score(named[1:]).shape) == ((1, len(train)), (1, len(train)))
+    assert scores._score._cache_size() == programs
+    np.testing.assert_allclose(score(candidates * 4), np.tile(found, (4, 1)), atol=1e-4)  # 32, 6 and 6
+    assert scores._score._cache_size() == programs + 1
 
 
 def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
