@@ -10,6 +10,7 @@ from pathlib import Path
 
 # Before anything imports jax.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns about tuning flags of cached programs; JAX sets "1" otherwise
 os.environ.setdefault("WBGS_CACHE", "")  # command lines under test leave nothing in the home folder
 # Workers have a core each: on one that is shared, the threads of a small solve mostly wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -45,7 +46,6 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(folder.cleanup)
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder.name)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # most of the time goes into small programs
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns about tuning flags of cached programs
     # In the environment, so that the workers of pytest-xdist draw the same.
     os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)
 
