@@ -78,7 +78,9 @@ def _read(file: Path, reader: Callable[[Path], list[FileObject]]) -> list[FileOb
 
 def _clean(found: FileObject, turn: Float[np.ndarray, "4 4"], file: Path) -> trimesh.Trimesh:
     faces = found.mesh.faces
-    if len(faces) and not (faces.min() >= 0 and faces.max() < len(found.mesh.vertices)):
+    if not len(faces):  # trimesh trips over some of them
+        return trimesh.Trimesh()
+    if not (faces.min() >= 0 and faces.max() < len(found.mesh.vertices)):
         raise UserError(f"object {found.name!r} of {file} has faces that point at vertices that do not exist; export it again")
     vertices = trimesh.transform_points(found.mesh.vertices, turn)
     if not np.isfinite(vertices).all():

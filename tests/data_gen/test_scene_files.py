@@ -76,6 +76,15 @@ def test_degenerate_and_repeated_triangles_are_dropped(tmp_path):
     assert len(found.mesh.faces) == 2 and len(found.mesh.vertices) == 4
 
 
+@pytest.mark.parametrize("faces", ["f 1 2\n", "f 1\n", "f\n", "l 1 2\n", ""])
+def test_objects_without_triangles_are_dropped(faces, tmp_path):
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 4 0 0\nv 4 4 0\no floor\nf 1 2 3\no empty\n{faces}")
+    (found,) = read_objects(tmp_path / "a.obj")
+    assert (found.name, len(found.mesh.faces)) == ("floor", 1)
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 4 0 0\no empty\n{faces}")
+    refused("a.obj.*(holds no triangles|export it again)", tmp_path / "a.obj")
+
+
 def test_a_scene_xml_brings_its_materials(tmp_path):
     spec = load(write_xml(tmp_path), None)
     found = {p.name: (p.material, p.thickness) for p in spec.parts}
