@@ -71,6 +71,7 @@ def search_antennas(
     ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
         end, candidates = ends[turn % len(ends)], antenna_candidates()  # anew: training gives every array away once
+        # What is there is scored among the others: by itself it would need a program of its own.
         tried = [params, *(dataclasses.replace(params, **{end: antenna}) for antenna in candidates.values())]
         scores = score(tried)
         best = 1 + int(np.argmin(scores[1:].mean(1)))
