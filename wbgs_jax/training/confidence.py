@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.stats import t as student_t
 
+from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field, Observation
@@ -111,9 +112,8 @@ def fit(
     rests = {size: left_out(scaled[:, :size], error, tx_index) for size in sets}
     chosen = sets[0]
     for size in sets[1:]:
-        gain = rests[chosen] ** 2 - rests[size] ** 2
-        by_tx = np.array([gain[tx_index == tx].mean() for tx in np.unique(tx_index)])
-        if by_tx.mean() > by_tx.std() / np.sqrt(len(by_tx)):
+        gain, noise = standard_error(rests[chosen] ** 2 - rests[size] ** 2, tx_index)
+        if gain > noise:
             chosen = size
     weights = np.zeros(known.shape[1] + 1)
     weights[[*range(chosen), -1]] = regress(scaled[:, :chosen], error)
