@@ -171,14 +171,14 @@ FAULTS = {
 """What can be wrong, one thing at a time, and the middle ones together."""
 
 
-def at_its_word(fault: str) -> str:
-    """Returns the variant with a fault (or none) in which mesh and arrays are taken to be where the data say."""
-    return f"at_its_word_{fault}".rstrip("_")
+def uncorrected(fault: str) -> str:
+    """Returns the variant with a fault (or none) in which neither mesh nor arrays are corrected."""
+    return f"uncorrected_{fault}".rstrip("_")
 
 
-_AT_ITS_WORD: Changes = {"search": {**AS_IT_IS["search"], "tuning_spectra": 0}}
-AT_ITS_WORD = {
-    at_its_word(name): dataclasses.replace(variant, changes=_AT_ITS_WORD) for name, variant in {"": Variant(), **FAULTS}.items()
+_UNCORRECTED: Changes = {"search": {**AS_IT_IS["search"], "tuning_spectra": 0}}
+UNCORRECTED = {
+    uncorrected(name): dataclasses.replace(variant, changes=_UNCORRECTED) for name, variant in {"": Variant(), **FAULTS}.items()
 }
 _STEPS_TO_OURS: dict[str, Changes] = {
     "batch_of_8": {"optim": {"batch": 8}, "field": {"network_lr": 4e-3}},
@@ -221,6 +221,6 @@ VARIANTS: dict[str, Variant] = {
     **VOLUME,
     **COHERENT,
     **FAULTS,
-    **AT_ITS_WORD,
+    **UNCORRECTED,
     **TO_OURS,
 }

@@ -119,7 +119,7 @@ class LoopConfig:
     evaluate_every: int = 1000
     """Steps between two evaluations on `evaluate_spectra` held-out spectra, for the curves only."""
     evaluate_spectra: int = 60
-    """How many spectra are looked at for the curves: of the validation part where there is one, else of the test part."""
+    """How many spectra are looked at for the curves: of the validation part; none where there is none."""
     checkpoint_every: int = 1000
     """Steps between two checkpoints."""
     keep_checkpoints: int = 2

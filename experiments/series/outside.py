@@ -10,7 +10,11 @@ from experiments.series.series import NOT_RUN, Series, jobs_of_all
 TITLE = "Truths from outside"
 SERIES = tuple(
     Series(title, field, ("",), "robustness", OUTSIDE_SCENES)
-    for title, field in (("one command", "hybrid"), ("coherent field alone", "wave"), ("splatting field alone", "wideband"))
+    for title, field in (("hybrid", "hybrid"), ("coherent alone", "wave"), ("wideband alone", "wideband"))
+)
+NOTE = (
+    "Median / mean SSIM of test transmitters, profile `{profile}`, one seed; for the two baselines (nearest TX, 1/d² weighting)"
+    " the mean over frequencies of the median SSIM:"
 )
 LEARN_NOTHING = {"nearest_tx": "nearest TX", "inverse_distance": "1/d² weighting"}
 
@@ -29,8 +33,7 @@ def render(results: Results) -> str:
         nothing = [f"{statistics.fmean(found.values['baselines'][key].values()):.3f}" for key in LEARN_NOTHING] if found else []
         rows.append([f"`{scene}`", *trained, *(nothing or [NOT_RUN] * len(LEARN_NOTHING))])
     head = ["data", *(one.title for one in SERIES), *LEARN_NOTHING.values()]
-    where = f"profile `{SERIES[0].profile}`, one seed; of what learns nothing the mean of the medians by frequency"
-    return f"Median / mean SSIM of test transmitters, {where}:\n\n{markdown(head, rows)}"
+    return f"{NOTE.format(profile=SERIES[0].profile)}\n\n{markdown(head, rows)}"
 
 
 def _baselines(scene: str) -> Job:

@@ -117,4 +117,4 @@ def test_faults_show_the_range_of_seeds_and_how_far_one_command_is_ahead(tmp_pat
     lines = robustness.render(results).splitlines()
     assert "| all together | 0.890 (0.875 to 0.905, 2 seeds) | not run |  |  |  | +0.070 |" in lines
     assert "| snr 20 | not run | not run | 0.800 | 0.700 | 0.820 |  |" in lines
-    assert sum("least ahead at *all together*, by +0.070" in line for line in lines) == 1
+    assert sum("least ahead with *all together*, by +0.070" in line for line in lines) == 1
