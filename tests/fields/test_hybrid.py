@@ -128,14 +128,17 @@ def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
 
 
 @pytest.mark.heavy
-def test_where_no_path_arrives_the_coherent_field_has_no_opinion_of_powers(run):
+def test_where_no_path_arrives_the_coherent_field_has_no_opinion(run):
     params, index = run.state.params, run.dataset.validation
     plan, query = run.field.plan(params, run.dataset.receiver()), run.dataset.query(index)
     coherent = run.field.wave.render(params.wave, plan.wave, query)
-    silent = coherent.power_db.at[0].set(-300.0)
-    powers = run.field._said(params, plan, query, coherent._replace(power_db=silent))[1]
+    silent = coherent._replace(power_db=coherent.power_db.at[0].set(-300.0), pas=coherent.pas.at[0].set(0))
+    spectra, powers, _ = run.field._said(params, plan, query, silent)
     np.testing.assert_array_equal(powers.coherent[0], powers.own[0])
     np.testing.assert_array_equal(powers.coherent[1:], coherent.power_db[1:])
+    np.testing.assert_array_equal(spectra.coherent[0], spectra.own[0])
+    np.testing.assert_allclose(spectra.informed[0], spectra.own[0], atol=1e-6)
+    np.testing.assert_array_equal(spectra.coherent[1:], coherent.pas[1:])
 
 
 @pytest.mark.heavy

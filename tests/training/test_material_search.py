@@ -15,7 +15,8 @@ from wbgs_jax.fields import wave
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training import search as search_module
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.materials import ITU_MATERIALS
+from wbgs_jax.training.materials import ITU_MATERIALS, search_materials, with_entry
+from wbgs_jax.training.scores import Told
 
 FREQUENCIES = np.array([1e9, 94e9])
 N_TX = 40
@@ -89,6 +90,32 @@ def test_what_fits_better_than_the_list_is_kept(run_on):
     np.testing.assert_allclose(1 + np.exp(before), 9.3, rtol=1e-5)
     run.control()
     np.testing.assert_array_equal(before, np.asarray(run.state.params.materials.log_susceptibility))
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(0.005, "concrete"), (-0.005, "brick")])
+def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_on, monkeypatch, rng, gain, expected):
+    """The first spectra speak for four other entries than what is there, which all of them together prefer, or do not."""
+    run = run_on([ITU_MATERIALS["wood"]] * len(PARTS))
+    favourites = [np.log(ITU_MATERIALS[name][0] - 1) for name in ("brick", "wood", "glass", "marble")]
+
+    def scores(*_):
+        def score(candidates, first=None):
+            found = np.array([params.materials.log_susceptibility[0] for params in candidates])
+            listed = np.isclose(found[:, None], favourites, atol=1e-5)
+            others = 0.3 if first else 0
+            means = np.where(listed.any(1), gain + 0.1 * listed[:, 1:].any(1), others)
+            return means[:, None] + listed.any(1)[:, None] * noise[: first or 48]
+
+        return score
+
+    noise = rng.normal(0, 0.1, 48)  # much more than the gain
+    noise -= noise.mean()
+    monkeypatch.setattr("wbgs_jax.training.scores.make_scores", scores)
+    materials = with_entry(run.state.params.materials, 0, "concrete")
+    params = dataclasses.replace(run.state.params, materials=materials)
+    told = Told(run.field, run.cache, run.data, np.asarray(run.dataset.train))
+    found, _ = search_materials(params, told, 48, dataclasses.replace(SETTINGS.search, rounds=1))
+    np.testing.assert_allclose(found.materials.log_susceptibility[0], np.log(ITU_MATERIALS[expected][0] - 1), rtol=1e-5)
 
 
 def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):

@@ -83,7 +83,28 @@ def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
     assert len(taken.tx_index) == 8
 
 
+@pytest.mark.heavy
+@pytest.mark.parametrize("compared", ["snapshots", "covariances", "spectra"])
+def test_a_link_on_which_nothing_was_heard_speaks_for_no_candidate(run, rng, compared):
+    train, params = np.asarray(run.dataset.train), run.state.params
+    silent = dataclasses.replace(run.data, snapshots=run.data.snapshots.at[train[1]].set(0))
+    candidates = [params, other_materials(params, rng), other_materials(params, rng)]
+    score, heard = (make_scores(run.field, run.cache, data, jnp.asarray(train), compared) for data in (silent, run.data))
+    found = score(candidates)
+    assert np.isfinite(found).all()
+    assert np.ptp(found[:, 1]) == 0
+    np.testing.assert_array_equal(np.delete(found, 1, 1), np.delete(heard(candidates), 1, 1))
+
+
 def test_one_transmitter_is_never_sure(rng):
     gains = rng.uniform(1, 2, 6)
     assert not surely_better(gains, np.zeros(6, int), 3.0)
     assert surely_better(np.tile(gains, 4), np.repeat(np.arange(12), 2), 3.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_gains_that_are_not_finite_are_not_sure(rng, wrong):
+    gains = rng.uniform(1, 2, 40)
+    assert surely_better(gains, np.arange(40), 3.0)
+    gains[7] = wrong
+    assert not surely_better(gains, np.arange(40), 3.0)

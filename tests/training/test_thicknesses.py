@@ -71,7 +71,7 @@ def off_in_a_room(room, rng):
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, names, metres))
     found, report, likely = search_slabs(start, heard, SETTINGS.search, 60)
-    alone, _ = search_materials(start, heard.scores(60), SETTINGS.search)
+    alone, _ = search_materials(start, heard, 60, SETTINGS.search)
     left, without = heard.scores()([found, alone]).mean(1)
     assert left < without - 0.5
     assert set(report.thickness_mm) == set(likely) == set(range(len(PARTS)))

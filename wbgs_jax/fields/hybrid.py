@@ -175,9 +175,10 @@ class HybridField(Field):
         )
         told = features(query, plan.wave.receiver.position, coherent, own)
         assert own.power_db is not None, "as the coherent field does"
-        met = coherent.power_db > NOT_HEARD_DB  # without any path that has no opinion
+        met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field has no opinion
         powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
-        return Opinions(coherent.pas, own.pas, informed.pas), powers, told
+        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, own.pas), own.pas, informed.pas)
+        return spectra, powers, told
 
     def probe(self, params: HybridParams) -> Any:
         """Returns that of the splatting field."""

@@ -75,7 +75,7 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
             break
         field = told.field.without(movers)
         fewer = dataclasses.replace(told, field=field, cache=field.prepare(told.data.links, told.data.receivers))
-        others, _ = search_materials(_carried(params, field), fewer.scores(config.spectra), once)
+        others, _ = search_materials(_carried(params, field), fewer, config.spectra, once)
         after = _explained(others, dataclasses.replace(fewer, spectra=judged.spectra), config)
         if not surely_better(now - after, tx, SURE):
             break

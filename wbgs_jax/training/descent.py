@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax.fields.base import compare
+from wbgs_jax.fields.base import compare, heard_alone
 from wbgs_jax.propagation.facets import centres
 from wbgs_jax.propagation.motion import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
@@ -90,7 +90,7 @@ def _steps(
         seen_from = motion.of_receiver(batch.links.receiver_index[0])
         plan = field.displaced(field.plan(params, batch.receiver, cache=cache), seen_from)
         seen = field.render_links(params, plan, cache, batch.links)
-        loss, _ = compare(seen, batch)
+        loss, _ = compare(seen, heard_alone(batch, seen))
         total = jax.tree.map(jnp.add, field.motion, motion)
         pulled = jax.tree.map(lambda stiffness, far: 0.5 * jnp.sum(stiffness * far**2), prior, total)
         return loss + field.penalty(params) + sum(jax.tree.leaves(pulled))

@@ -124,7 +124,7 @@ class _Heard:
         if sized:
             params, _, likely = search_slabs(now.params, told, once, count, compared, now.likely)
             return dataclasses.replace(now, params=params, likely=likely)
-        params, _ = search_materials(now.params, told.scores(count, compared), once)
+        params, _ = search_materials(now.params, told, count, once, compared)
         return dataclasses.replace(now, params=params)
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:

@@ -39,7 +39,7 @@ def search_idealisations(params: Any, told: Told, config: SearchConfig) -> tuple
             continue
         natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # training gives every array away once
         if name == "thick":
-            natural, _ = search_materials(natural, score, once)
+            natural, _ = search_materials(natural, told, count, once)
         before, after = score([params, natural])
         dropped = surely_better(before - after, tx_index, SURE)
         found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)

@@ -4,8 +4,8 @@ The phase behind a slab turns by many radians at high frequencies. Its permittiv
 turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
 data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
 apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
-spectra best is taken, unless what is there fits better by more than chance; a few spectra say which entries are worth a closer
-look. Training goes on from there.
+spectra best is taken, unless what is there fits better, and by more than chance where that is no entry; a few spectra say which
+entries are worth a closer look. Training goes on from there.
 """
 
 import dataclasses
@@ -14,11 +14,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import same
+from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.training.scores import Scores
+from wbgs_jax.training.scores import Compared, Told
 
 ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
@@ -71,13 +72,25 @@ class SearchReport:
     """Thicknesses that were found for materials whose thickness the scene does not say."""
 
 
-def search_materials(params: Any, score: Scores, config: SearchConfig, usual: bool = False) -> tuple[Any, SearchReport]:
-    """Returns parameters with the materials whose scores are best; with `usual`, those that change become as thick as is usual
-    (where the scene says how thick they are, that counts for nothing)."""
+def search_materials(
+    params: Any, told: Told, count: int, config: SearchConfig, compared: Compared = "snapshots", usual: bool = False
+) -> tuple[Any, SearchReport]:
+    """Returns parameters with the materials by which spectra are explained best.
+
+    Args:
+        params: with `materials`.
+        told: what training spectra say.
+        count: spectra that are looked at.
+        config: of the search.
+        compared: of these spectra.
+        usual: whether those that change become as thick as is usual (where the scene says how thick they are, that counts for
+            nothing).
+    """
+    score, tx_index = told.scores(count, compared), told.tx_index(count)
     before, taken, settled = np.zeros(0), dict[int, str](), 0
-    count = len(params.materials.slope)
-    for turn in range(config.rounds * count):
-        material = turn % count
+    materials = len(params.materials.slope)
+    for turn in range(config.rounds * materials):
+        material = turn % materials
         entries = [
             dataclasses.replace(
                 params, materials=with_entry(params.materials, material, name, USUAL_M[name] if usual else None)
@@ -90,19 +103,23 @@ def search_materials(params: Any, score: Scores, config: SearchConfig, usual: bo
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before = before if turn else scores[0]
         settled += 1
-        if np.ptp(scores.mean(1)) >= UNSEEN and not _surely_better(scores[0], scores[best], config.sure):
+        listed = any(same(params.materials, entry.materials) for entry in entries)
+        kept = _better(scores[0], scores[best], tx_index, 0.0 if listed else config.sure)
+        if np.ptp(scores.mean(1)) >= UNSEEN and not kept:
             taken[material] = list(ITU_MATERIALS)[likely[best - 1]]
             settled = settled if same(params.materials, candidates[best].materials) else 1
             params, scores = candidates[best], scores[best:]
-        if settled == count:  # all others are what they were when each was looked at
+        if settled == materials:  # all others are what they were when each was looked at
             break
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
-def _surely_better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], errors: float) -> bool:
+def _better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:
     """Returns whether scores are lower by more than so many standard errors of the mean difference."""
-    gain = old - new
-    return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
+    if not errors:
+        return bool(new.mean() < old.mean())
+    gain, error = standard_error(old - new, tx_index)
+    return gain > errors * error
 
 
 def with_entry(materials: Any, material: int, name: str, metres: float | None = None) -> Any:

@@ -24,10 +24,13 @@ SIDE_BY_SIDE = 32, 6
 """Candidates. Compiling a program takes as long as scoring ten thousand, so that there are two for all numbers of them."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
+ALIKE = 1e-6
+"""Mean absolute error of spectra below which none is better than another."""
 Compared = Literal["snapshots", "covariances", "spectra"]
 """What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
 (`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known. Of received powers alone it is
-the log absolute error in dB."""
+the log absolute error in dB. Of a link on which nothing was heard,
+snapshots and spectra score the same whatever the candidate."""
 
 
 @runtime_checkable
@@ -135,7 +138,8 @@ def _score(
         if batch.pas is None:
             assert batch.power_db is not None and seen.power_db is not None, "one of the three is known"
             return jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - batch.power_db)[0])
-        return jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas)))
+        unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(seen.pas - batch.pas)), ALIKE))
+        return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
 
     def one(batch: Batch) -> Float[Array, " k"]:
         if not any(differ):
@@ -151,10 +155,10 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
 
     Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
     t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
-    three errors.
+    three errors. Gains that are not finite are not sure.
     """
     by_tx = by_transmitter(gains, tx_index)
-    if len(by_tx) < 2:  # signs of one are flipped with even odds
+    if len(by_tx) < 2 or not np.isfinite(by_tx).all():  # signs of one are flipped with even odds
         return False
     chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue
     return bool(chance <= norm.sf(errors))

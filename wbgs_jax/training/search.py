@@ -78,7 +78,7 @@ class Search:
             say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
             if config.rounds:
-                params, named = search_materials(params, told.scores(config.spectra), config, usual=True)
+                params, named = search_materials(params, told, config.spectra, config, usual=True)
                 params, gain = search_gain(params, told.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, cache)
@@ -102,7 +102,7 @@ class Search:
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
-                params, _ = search_materials(params, told.scores(config.ideal_spectra), config)
+                params, _ = search_materials(params, told, config.ideal_spectra, config)
             say("search: how far surfaces may be off")
             _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)

@@ -72,12 +72,12 @@ def search_slabs(
         likely: slabs, where those that are not likely have been ruled out before.
     """
     score, unknown = told.scores(count, compared), np.asarray(told.field.known_thickness) == 0
-    named, report = search_materials(params, score, config, usual=bool(unknown.any()))
+    named, report = search_materials(params, told, count, config, compared, usual=bool(unknown.any()))
     if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
         return named, report, likely
     once = dataclasses.replace(config, rounds=1)
     params, likely = _sized(named, unknown, told, config, compared, likely)
-    sized, anew = search_materials(params, score, once)
+    sized, anew = search_materials(params, told, count, once, compared)
     before, after = score([named, sized])
     if not surely_better(before - after, told.tx_index(count), SURE):
         return named, report, likely
