@@ -15,6 +15,7 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.settings import settings
 from wbgs_jax._util.archives import read_arrays
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.config import Settings
 from wbgs_jax.data import Dataset
@@ -93,17 +94,27 @@ def part(job: Job, dataset: Dataset, chosen: Settings, folder: Path, may_go_on: 
 
 
 def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[str, np.ndarray]:
-    """Returns SSIM and PSNR of the test spectra, by transmitter and frequency."""
-    test = dataset.test
-    ghz = np.unique(dataset.frequencies_hz[test]) / 1e9
-    tx = dataset.tx_index[test].reshape(-1, len(ghz))[:, 0]
+    """Returns SSIM and PSNR of the test spectra, by transmitter (and receiver) and frequency.
+
+    Raises:
+        UserError: a transmitter was not heard at every frequency, or twice at one.
+    """
+    test, ghz = dataset.test, np.unique(dataset.frequencies_hz[dataset.test]) / 1e9
+    order = np.lexsort((dataset.frequencies_hz[test], dataset.receiver_index[test], dataset.tx_index[test]))
+    in_turn = np.resize(ghz, len(test))
+    if len(test) % len(ghz) or not np.array_equal(dataset.frequencies_hz[test[order]] / 1e9, in_turn):
+        raise UserError(
+            f"{dataset.name}: not every test transmitter has one spectrum at every frequency, which tables by frequency need; "
+            "leave the others out of test_index.txt"
+        )
+    tx = dataset.tx_index[test[order]][:: len(ghz)]
     ssim, psnr = np.zeros(len(test)), np.zeros(len(test))
     for start in range(0, len(test), BLOCK):  # the truth of a whole scene is hundreds of megabytes
         block = slice(start, start + BLOCK)
         truth = np.asarray(dataset.pas(test[block]))
         ssim[block], psnr[block] = metrics.ssim(predicted[block], truth), metrics.psnr_db(predicted[block], truth)
     shape = (len(tx), len(ghz))
-    return {"tx": tx, "ghz": ghz, "ssim": ssim.reshape(shape), "psnr_db": psnr.reshape(shape)}
+    return {"tx": tx, "ghz": ghz, "ssim": ssim[order].reshape(shape), "psnr_db": psnr[order].reshape(shape)}
 
 
 def pictured(dataset: Dataset) -> Int[np.ndarray, " k"]:

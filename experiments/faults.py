@@ -12,6 +12,7 @@ import trimesh
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.spatial.transform import Rotation
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import Dataset
 from wbgs_jax.data.dataset import Materials
 
@@ -54,7 +55,12 @@ class Fault:
 
 
 def faulty(dataset: Dataset, fault: Fault, seed: int) -> Dataset:
-    """Returns the data set with a fault; equal seeds draw equal faults."""
+    """Returns the data set with a fault; equal seeds draw equal faults.
+
+    Raises:
+        UserError: the data do not have what is to be wrong.
+    """
+    _check(dataset, fault)
     dataset = with_wrong_mesh(dataset, fault, np.random.default_rng([seed, 7]))
     dataset = with_wrong_materials(dataset, fault, np.random.default_rng([seed, 8]))
     dataset = with_wrong_receiver(dataset, fault, np.random.default_rng([seed, 9]))
@@ -65,8 +71,25 @@ def faulty(dataset: Dataset, fault: Fault, seed: int) -> Dataset:
     return as_images(dataset) if fault.images_only else dataset
 
 
+def _check(dataset: Dataset, fault: Fault) -> None:
+    lacks = {
+        "mesh": _of_mesh(fault) and not len(dataset.faces),
+        "materials": (fault.one_material or fault.wrong_materials or fault.thickness_unknown) and dataset.materials is None,
+        "snapshots": (fault.snr_db is not None or fault.array_deg) and dataset.snapshots is None,
+    }
+    for what, lacking in lacks.items():
+        if lacking:
+            raise UserError(f"{dataset.name} has no {what} that could be wrong; choose another variant")
+
+
+def _of_mesh(fault: Fault) -> bool:
+    return bool(fault.displaced_m or fault.tilted_deg or fault.missing or fault.added)
+
+
 def with_wrong_mesh(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
     """Returns it with parts that stand elsewhere, are turned, are missing or stand there twice."""
+    if not _of_mesh(fault):
+        return dataset
     part, vertices = parts_of(dataset), dataset.vertices.astype(np.float64)
     shift = rng.normal(0, fault.displaced_m, (part.max() + 1, 3))
     turn = np.deg2rad(rng.normal(0, fault.tilted_deg, (part.max() + 1, 3)))

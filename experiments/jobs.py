@@ -69,7 +69,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Readable and unique within a profile: scene4_wideband_C4_alltx_seed0."""
+        """Readable, and unique among the jobs on released scenes of a profile: scene4_wideband_C4_alltx_seed0."""
         place = f"scene{self.scene}" if self.scene[0].isdigit() and self.is_released else Path(self.scene).stem
         words = [place, self.field, self.variant, self.combination, "alltx" if self.all_tx else ""]
         return "_".join([word for word in words if word] + [f"seed{self.seed}"])

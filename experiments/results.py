@@ -54,7 +54,10 @@ class Result:
         return self.ssim[np.ix_([known.index(i) for i in tx], [self.ghz.index(float(f)) for f in ghz])]
 
     def belongs_to(self, job: Job) -> bool:
-        """Whether it was made with the settings that the job has today."""
+        """Whether it was made on the same data, with the settings that the job has today."""
+        scene = self.values["job"]["scene"]
+        if not job.is_released and Path(scene).resolve() != Path(job.scene).resolve():
+            return False
         return unlike_preset(job, todays(self.values, job.field)) == differences(job)
 
 

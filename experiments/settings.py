@@ -21,7 +21,7 @@ def settings(job: Job) -> Settings:
     profile, variant, preset = PROFILES[job.profile], VARIANTS[job.variant], preset_of(job)
     base = changed(preset, {**profile.changes, "field": profile.fields.get(job.field, {})})
     block = base.loop.epoch_steps
-    steps = variant.steps or whole(wanted_steps(job), block)
+    steps = (variant.steps if job.profile != "smoke" else None) or whole(wanted_steps(job), block)
     rates = {name: variant.rates * value for name, value in vars(base.field).items() if name.endswith("_lr")}
     changes: dict[str, dict[str, Any]] = {
         "field": rates,

@@ -10,12 +10,14 @@ from unittest import mock
 import numpy as np
 import pytest
 import synthetic
+from synthetic import tiny_dataset
 from toys import RippleField, registered
 
 from experiments import execute, profiles, runner
 from experiments.jobs import Job
 from experiments.paper import GHZ_10
 from experiments.results import Results
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.training.loop import Run
 
@@ -167,3 +169,24 @@ def test_a_change_is_trained_by_the_same_runner(command, models, monkeypatch):
     assert plain.search.rounds > without.search.rounds == 0
     settings = [result_of(command, job).values["settings"] for job in wanted]
     assert settings[1] == settings[0] | {"mesh.displacement": 0.03} and settings[2] == settings[0] | {"search.rounds": 0}
+
+
+def test_scores_find_their_transmitters_and_frequencies_in_any_order(rng):
+    """Folders of spectra have an order of their own."""
+    dataset = tiny_dataset(8)
+    wrong = {
+        (int(tx), float(f)): bool(rng.random() < 0.5) for tx in np.unique(dataset.tx_index) for f in dataset.frequencies_hz
+    }
+
+    def scored(test):
+        shuffled = dataclasses.replace(dataset, test=test)
+        told = zip(dataset.tx_index[test], dataset.frequencies_hz[test], strict=True)
+        bad = np.array([wrong[int(tx), float(f)] for tx, f in told])
+        return execute.score(shuffled, np.where(bad[:, None, None], 0, np.asarray(dataset.pas(test))))
+
+    found, again = scored(dataset.test), scored(rng.permutation(dataset.test))
+    for key, values in found.items():
+        np.testing.assert_allclose(again[key], values, atol=1e-6)
+    np.testing.assert_array_equal(found["ssim"] < 0.999, [[wrong[tx, ghz * 1e9] for ghz in found["ghz"]] for tx in found["tx"]])
+    with pytest.raises(UserError, match="at every frequency"):
+        scored(dataset.test[1:])

@@ -9,6 +9,7 @@ from synthetic import tiny_scene
 
 from experiments.faults import Fault, faulty, parts_of
 from experiments.variants import FAULTS
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
 
 PARTS = [*room(), *(box((x, 1, 0.5), (x + 0.5, 1.5, 1.2)) for x in (0.5, 1.5, 2.5, 3.5, 4.5))]
@@ -98,3 +99,23 @@ def test_equal_seeds_draw_equal_faults(dataset):
     np.testing.assert_array_equal(first.vertices, second.vertices)
     np.testing.assert_array_equal(first.snapshots, second.snapshots)
     assert (first.vertices.shape != other.vertices.shape) or (first.vertices != other.vertices).any()
+
+
+@pytest.mark.parametrize(
+    ("fault", "lacking"),
+    [
+        (Fault(displaced_m=0.01), "mesh"),
+        (Fault(missing=0.1), "mesh"),
+        (Fault(one_material=True), "materials"),
+        (Fault(snr_db=10.0), "snapshots"),
+    ],
+)
+def test_what_data_do_not_have_cannot_be_wrong(fault, lacking):
+    scene = scene_dataset(tiny_scene(6))
+    nothing = {"vertices": scene.vertices[:0], "faces": scene.faces[:0], "face_part": None, "materials": None}
+    powers = {"snapshots": None, "power_db": np.zeros(len(scene), np.float32)}
+    without = dataclasses.replace(scene, **(powers if lacking == "snapshots" else nothing))
+    with pytest.raises(UserError, match=f"no {lacking}"):
+        faulty(without, fault, 0)
+    if lacking != "snapshots":  # and what they have can
+        assert not np.array_equal(faulty(without, Fault(snr_db=10.0), 0).snapshots, without.snapshots)

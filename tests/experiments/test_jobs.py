@@ -138,6 +138,8 @@ def test_series_keep_their_size_but_are_small_too():
     job = Job("1", "wideband", profile="choices")
     assert job.sized("paper") == job and job.sized("smoke").profile == "smoke"
     assert Job("1", "wideband").sized("paper").profile == "paper"
+    for variant in ("steps_6000", "batch_16"):  # which have steps of their own
+        assert settings(Job("1", "wideband", variant=variant, profile="smoke")).optim.steps < 20
 
 
 @pytest.mark.parametrize("variant", ["", "long"])

@@ -86,6 +86,14 @@ def test_a_setting_that_matters_makes_a_result_another_one(tmp_path):
         assert (results.get(JOB) is not None) == counts, name
 
 
+def test_data_of_the_same_name_elsewhere_are_other_data(tmp_path, monkeypatch):
+    results, job = Results("quick", tmp_path), Job("here/room.npz", "wideband")
+    monkeypatch.chdir(tmp_path)
+    results.write(job, VALUES)
+    assert results.get(dataclasses.replace(job, scene=str(tmp_path / "here" / "room.npz"))) is not None
+    assert results.get(dataclasses.replace(job, scene="there/room.npz")) is None
+
+
 def test_a_result_read_twice_is_read_again_where_it_has_changed(tmp_path):
     results = Results("quick", tmp_path)
     for seconds in (1.0, 2.0):

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from rooms import box, edges_of, facets_of, mesh_of, rectangle, room
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.propagation.edges import edges_of_facets
 from wbgs_jax.propagation.facets import areas, facets_from_mesh, outline_of
 
@@ -29,6 +30,12 @@ def test_a_box_has_six_facets_and_twelve_edges():
     for start, direction, length, normal in zip(edges.start, edges.direction, edges.length, edges.normal_0, strict=True):
         tangent = np.cross(normal, direction)
         assert tangent @ (centre - start - direction * length / 2) > 0  # into the 0-face
+
+
+def test_a_mesh_without_any_area_is_refused():
+    line = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(UserError, match="no triangle with an area"):
+        facets_of(line)
 
 
 def test_a_fine_mesh_is_merged_and_its_area_kept(rng):

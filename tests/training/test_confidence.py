@@ -48,7 +48,7 @@ def test_intervals_hold_nine_of_ten_new_scores(rng):
     inside, ratios = [], []
     for _ in range(10):  # one draw of the 300 that are learned from moves the share by 0.02
         mean, scale, weights, rest = fit(*drawn(rng, 60), SETS)
-        quantiles, surplus = interval(rest), np.exp(rest).mean()
+        quantiles, surplus = interval(rest, np.arange(len(rest))), np.exp(rest).mean()
         again, truth, _ = drawn(rng, 400)
         predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
         inside.append(np.mean((predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])))
@@ -85,16 +85,36 @@ def test_a_transmitter_is_not_judged_by_itself(rng):
 
 def test_few_scores_give_a_wide_interval(rng):
     """And no narrower one than what was seen, or than Student's t says: nine of ten further ones lie in it."""
-    low, high = interval(np.array([0.3, -1.0, 2.0]))
+    low, high = interval(np.array([0.3, -1.0, 2.0]), np.arange(3))
     assert low < -1 and high > 2
     held = []
     for _ in range(2000):
         *rest, new = rng.normal(size=9)
-        low, high = interval(np.array(rest))
+        low, high = interval(np.array(rest), np.arange(8))
         held.append(low <= new <= high)
     assert 0.85 < np.mean(held) < 0.96
     many = np.arange(199.0)
-    np.testing.assert_array_equal(interval(many), [9, 189])
+    np.testing.assert_array_equal(interval(many, np.arange(199)), [9, 189])
+
+
+@pytest.mark.parametrize("n_tx", [2, 3, 5, 7])
+def test_intervals_of_few_transmitters_hold_for_another_one(n_tx, rng):
+    """Whose spectra are alike: twenty of each say no more than how much transmitters differ."""
+    held = []
+    for _ in range(1000):
+        tx = np.repeat(np.arange(n_tx), 20)
+        error = rng.normal(size=n_tx)[tx] + 0.3 * rng.normal(size=len(tx))
+        low, high = interval(left_out(np.zeros((len(tx), 0)), error, tx), tx)
+        new = rng.normal() + 0.3 * rng.normal() - error.mean()
+        held.append(low <= new <= high)
+    assert np.mean(held) > 0.86
+
+
+def test_of_one_validation_transmitter_nothing_is_said():
+    dataset = tiny_dataset(9)
+    one = dataset.train[dataset.tx_index[dataset.train] == dataset.tx_index[dataset.train[0]]]
+    alone = dataclasses.replace(dataset, validation=np.tile(one, 8), train=np.setdiff1d(dataset.train, one))
+    assert learn_confidence(make_field(), make_params(), alone, None) == (None, None)
 
 
 def test_calibration_reports_what_it_says(rng):
@@ -211,11 +231,12 @@ def test_powers_stay_as_near_as_they_should_nine_times_of_ten(rng):
         mean, scale, weights, rest = fit(*drawn(rng, 60), POWER_SETS)
         again, truth, _ = drawn(rng, 400)
         predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
-        held.append(np.mean(truth <= predicted + upper_end(rest)))
+        held.append(np.mean(truth <= predicted + upper_end(rest, np.arange(len(rest)))))
         ratios.append(np.mean(np.exp(predicted)) * np.exp(rest).mean() / np.exp(truth).mean())
     assert 0.85 < np.mean(held) < 0.95
     assert np.mean(ratios) == pytest.approx(1, rel=0.1)
-    assert upper_end(np.array([0.3, -1.0, 2.0])) > 2 and upper_end(np.arange(199.0)) == 179
+    assert upper_end(np.array([0.3, -1.0, 2.0]), np.arange(3)) > 2
+    assert upper_end(np.arange(199.0), np.arange(199)) == 179
 
 
 def test_expected_errors_of_powers_follow_their_formula(rng):

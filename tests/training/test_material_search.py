@@ -61,7 +61,7 @@ def run_on(untrained, tmp_path):
         truth = dataclasses.replace(params, materials=made_of, **{name: jnp.asarray(1.0) for name in natural})
         y = snapshots(truth, plan, run.cache, run.data.links)
         run.data = dataclasses.replace(run.data, snapshots=y)
-        run.state = dataclasses.replace(run.state, params=params)
+        run.state = jax.tree.map(jnp.copy, dataclasses.replace(run.state, params=params))  # an epoch gives its own away
         return run
 
     return make

@@ -108,3 +108,10 @@ def test_gains_that_are_not_finite_are_not_sure(rng, wrong):
     assert surely_better(gains, np.arange(40), 3.0)
     gains[7] = wrong
     assert not surely_better(gains, np.arange(40), 3.0)
+
+
+def test_more_errors_than_random_flips_can_tell_are_counted(rng):
+    gains = rng.normal(1, 0.1, 200)
+    assert surely_better(gains, np.arange(200), 6.0)
+    assert not surely_better(rng.normal(0.3, 1, 200), np.arange(200), 6.0)
+    assert not surely_better(-gains, np.arange(200), 6.0)

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.types import Mesh
 
@@ -60,13 +61,16 @@ class Outline:
 
 
 def facets_from_mesh(mesh: Mesh) -> Facets:
-    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first."""
+    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first; a mesh without any surface is a
+    `UserError`."""
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
     triangles, material = index[np.asarray(mesh.faces)], np.asarray(mesh.material)
     body = _bodies(triangles, np.asarray(mesh.part), material)
     mover = _movers(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
+    if not keep.any():
+        raise UserError("the mesh has no triangle with an area; leave the mesh out, or give one with surfaces")
     triangles, normal, body, material, mover = (a[keep] for a in (triangles, normal, body, material, mover))
     polygons: list[Polygon] = []
     first = []  # triangle of every polygon's plane

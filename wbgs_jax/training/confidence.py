@@ -34,8 +34,8 @@ from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 FEWEST, MOST = 8, 1000
 """Validation spectra below which nothing is said; those that are looked at, at most."""
-FEW = 20
-"""Rests below which their own quantiles do not reach `LEVEL`."""
+FEW, FEW_TX = 20, 8
+"""Rests, and transmitters, below which their own quantiles do not reach `LEVEL`."""
 SETS = (0, 1, 3, 5, FEATURES)
 """Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
 POWER_SETS = (0, 1, 2, POWER_FEATURES)
@@ -55,7 +55,7 @@ def learn_confidence(
 
     `neighbours` are those of the training part alone, if neighbours are asked.
     """
-    if len(dataset.validation) < FEWEST:
+    if len(dataset.validation) < FEWEST or len(np.unique(dataset.tx_index[dataset.validation])) < 2:
         return None, None
     index = np.random.default_rng(1).permutation(dataset.validation)[:MOST]
     seen = observe_links(field, params, dataset, index)
@@ -74,7 +74,7 @@ def _of_spectra(
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
     error = np.log(1 + MARGIN - np.minimum(ssim(pas, np.asarray(dataset.pas(index))), 1))
     *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
-    arrays = *learned, interval(rest), np.exp(rest).mean()
+    arrays = *learned, interval(rest, dataset.tx_index[index]), np.exp(rest).mean()
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
     return Confidence(places, trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
@@ -92,7 +92,7 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     known = np.asarray(_power_features(jnp.asarray(said), dataset.query(index), receivers, trained), np.float64)
     error = np.log(POWER_MARGIN_DB + np.abs(said.astype(np.float64) - truth[heard]))
     *learned, rest = fit(known, error, dataset.tx_index[index], POWER_SETS)
-    arrays = *learned, upper_end(rest), np.exp(rest).mean()
+    arrays = *learned, upper_end(rest, dataset.tx_index[index]), np.exp(rest).mean()
     return PowerConfidence(trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
@@ -140,18 +140,21 @@ def left_out(
     return rest
 
 
-def interval(rest: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
+def interval(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
     """Returns the ends between which `LEVEL` of further rests lie."""
     tail = (1 - LEVEL) / 2
-    return np.array([-upper_end(-rest, tail), upper_end(rest, tail)])
+    return np.array([-upper_end(-rest, tx_index, tail), upper_end(rest, tx_index, tail)])
 
 
-def upper_end(rest: Float[np.ndarray, " n"], tail: float = 1 - LEVEL) -> float:
+def upper_end(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], tail: float = 1 - LEVEL) -> float:
     """Returns what all but a share `tail` of further rests lie below, with the correction for the number of those seen.
 
-    A few cannot have such a quantile: there it is that of Student's t, no lower than what was seen.
+    A few, or those of a few transmitters, cannot have such a quantile: there it is that of Student's t, no lower than what was
+    seen. It counts transmitters where they are few, because rests of one are alike.
     """
-    n, tail = len(rest), round(tail, 9)  # binary fractions would lose a place
-    if n >= FEW:
+    n, n_tx, tail = len(rest), len(np.unique(tx_index)), round(tail, 9)  # binary fractions would lose a place
+    if n_tx < FEW_TX:
+        n = n_tx
+    elif n >= FEW:
         return float(np.sort(rest)[min(n - int(np.floor(tail * (n + 1))), n - 1)])
     return float(max(rest.max(), rest.mean() + rest.std(ddof=1) * np.sqrt(1 + 1 / n) * student_t.ppf(1 - tail, n - 1)))

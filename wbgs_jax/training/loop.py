@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -89,13 +90,17 @@ class Run:
         self.state = init_state(self.field.init(self.key), self.optimizer, self.controls)
         self.limits = self.field.limits(self.state.params, dataset.receivers)
         self.data: TrainingData = training_data(dataset)
-        self.cache = self.field.prepare(self.data.links, self.data.receivers)
         rng = np.random.default_rng([seed, 1])
         watched = min(settings.loop.evaluate_spectra, len(dataset.validation))
         self.watched = np.sort(rng.choice(dataset.validation, watched, replace=False))
         self.devices, idle = devices_for(self.batch, devices)
         if idle and is_first():
             warnings.warn(idle, stacklevel=2)
+
+    @cached_property
+    def cache(self) -> Any:
+        """What the field has prepared of all links: when it is first asked for, since a checkpoint may bring another field."""
+        return self.field.prepare(self.data.links, self.data.receivers)
 
     @property
     def batch(self) -> int:
@@ -249,7 +254,7 @@ class Run:
         self.seconds = float(saved.metadata["seconds"])
         if saved.metadata["limits"]:
             self.limits = type(self.limits)(**saved.metadata["limits"])
-        self.cache = self.field.prepare(self.data.links, self.data.receivers)
+        self.__dict__.pop("cache", None)
         return True
 
 

@@ -122,6 +122,14 @@ def _better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], tx_index
     return gain > errors * error
 
 
+def entries_of(materials: Any) -> dict[int, str]:
+    """Returns which materials are entries of ITU-R P.2040, and which."""
+    own = np.exp(np.stack([materials.log_susceptibility, materials.log_conductivity, materials.slope]))
+    listed = {name: np.exp([np.log(permittivity - 1), np.log(c), d]) for name, (permittivity, c, d) in ITU_MATERIALS.items()}
+    alike = ((i, name) for i, one in enumerate(own.T) for name, entry in listed.items() if np.allclose(one, entry, rtol=1e-4))
+    return dict(alike)
+
+
 def with_entry(materials: Any, material: int, name: str, metres: float | None = None) -> Any:
     """Returns a copy in which one material is an entry of ITU-R P.2040, so many metres thick, or as thick as before."""
     return with_properties(materials, material, *ITU_MATERIALS[name], metres)

@@ -25,7 +25,7 @@ class PlacementReport:
     spread_mm: float
     """Standard deviation along each axis."""
     certain: float
-    """Mean score of spectra if every place were known ..."""
+    """Mean score of spectra if every place were known (to the least of `SPREADS_M`) ..."""
     uncertain: float
     """... and with the standard deviation that was taken."""
 
@@ -35,6 +35,6 @@ def search_placement(params: Any, score: Scores) -> tuple[Any, PlacementReport]:
     candidates = [
         dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(spread))) for spread in SPREADS_M
     ]
-    scores = score([params, *candidates]).mean(1)
-    best = int(np.argmin(scores[1:]))
-    return candidates[best], PlacementReport(1e3 * SPREADS_M[best], float(scores[0]), float(scores[1 + best]))
+    scores = score(candidates).mean(1)
+    best = int(np.argmin(scores))
+    return candidates[best], PlacementReport(1e3 * SPREADS_M[best], float(scores[0]), float(scores[best]))

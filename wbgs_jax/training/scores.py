@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
-from wbgs_jax._util.statistics import by_transmitter
+from wbgs_jax._util.statistics import by_transmitter, standard_error
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.data import TrainingData
@@ -24,6 +24,8 @@ SIDE_BY_SIDE = 32, 6
 """Candidates. Compiling a program takes as long as scoring ten thousand, so that there are two for all numbers of them."""
 POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
+RAREST = 1e-4
+"""Chance that SciPy's 9,999 random flips can tell from none."""
 ALIKE = 1e-6
 """Mean absolute error of spectra below which none is better than another."""
 Compared = Literal["snapshots", "covariances", "spectra"]
@@ -155,10 +157,14 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
 
     Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
     t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
-    three errors. Gains that are not finite are not sure.
+    three errors. Gains that are not finite are not sure. Where so many errors mean less than one chance in ten thousand, which
+    is as few as random flips can tell, the errors themselves are counted.
     """
     by_tx = by_transmitter(gains, tx_index)
     if len(by_tx) < 2 or not np.isfinite(by_tx).all():  # signs of one are flipped with even odds
         return False
+    if norm.sf(errors) < RAREST:
+        gain, error = standard_error(gains, tx_index)
+        return gain > errors * error
     chance = permutation_test((by_tx,), np.mean, permutation_type="samples", alternative="greater", random_state=0).pvalue
     return bool(chance <= norm.sf(errors))
