@@ -64,13 +64,14 @@ def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedP
     """
     numbers = np.stack([np.asarray(links.receiver_index), np.asarray(links.tx_index)], -1)
     pairs, first = np.unique(numbers, axis=0, return_index=True)
-    positions, found, plans = np.asarray(links.query.tx_position)[first], [], []
+    positions, found, beams = np.asarray(links.query.tx_position)[first], [], []
     for receiver in np.unique(pairs[:, 0]):
-        plans.append(plan_of(int(receiver)))
-        found.append(_traced_in_blocks(plans[-1], positions[pairs[:, 0] == receiver]))
+        plan = plan_of(int(receiver))  # one at a time: mirror images of many receivers are many
+        found.append(_traced_in_blocks(plan, positions[pairs[:, 0] == receiver]))
+        beams.append(plan.beams)
     paths = TracedPaths(_stacked([one.specular for one in found]), _stacked([one.diffracted for one in found]))
-    surfaces = Surfaces(plans[0].surfaces.facets, plans[0].surfaces.edges)
-    return PreparedPaths(surfaces, _shared_beams(plans), paths, *jnp.asarray(pairs.T, jnp.int32))
+    surfaces = Surfaces(plan.surfaces.facets, plan.surfaces.edges)
+    return PreparedPaths(surfaces, _shared(beams), paths, *jnp.asarray(pairs.T, jnp.int32))
 
 
 @jax.jit
@@ -106,8 +107,7 @@ def _stacked(some: list[Paths]) -> Paths:
     return dataclasses.replace(together, alive=jnp.asarray(alive))
 
 
-def _shared_beams(plans: list[WavePlan]) -> Beams | None:
+def _shared(beams: list[Beams | None]) -> Beams | None:
     """Returns the beams of all receivers, if they are the same."""
-    first, *others = (plan.beams for plan in plans)
-    alike = all(same(first, other) for other in others)
-    return first if alike else None
+    first, *others = beams
+    return first if all(same(first, other) for other in others) else None
