@@ -24,8 +24,8 @@ NOTE = (
     "`wbgs-jax train` and `eval`, the `cpu` preset, nothing else said; one seed. SSIM of all held-out transmitters: median,"
     " mean, 5th and 10th percentile, medians in and out of sight of the receiver, and the truth's own repeatability. Angle:"
     " median error of the strongest direction; beams: mean loss of received power when the predicted best beam of a codebook is"
-    " used, or the best of the three predicted best; power: mean absolute error of the received power. Scenes 1 and 3 to 6"
-    " and the samples were trained before the field knew how far surfaces may be off and whom to trust query by query."
+    " used, or the best of the three predicted best; power: mean absolute error of the received power."
+    " All but scene 2 were trained before the search for clutter."
 )
 POWER_NOTE = (
     "Mean absolute error of the received power (dB) by frequency (GHz); below, the power of the nearest training transmitter:"

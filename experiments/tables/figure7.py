@@ -45,8 +45,8 @@ def render(results: Results, images: Path) -> str:
     }
     summary += [[name, cell(value), "", "", "", "", ""] for name, value in simple.items()]
     note = (
-        "A model of WRF-GS has a 21st part of the steps, with the profile `quick` 50 of 8 spectra each: fewer than it has for"
-        " training. With 5x samples it has enough to be compared."
+        "Each WRF-GS model gets one 21st of the steps, in the profile `quick` 50 of 8 spectra: it does not even see every"
+        " training spectrum once. With 5x samples the comparison is meaningful."
     )
     head = ["model", "average (paper)", "95 %", "seeds", "ours above it (paper)", "better at", "p"]
     parts = [note, markdown(head, summary), by_frequency(values)]

@@ -53,9 +53,9 @@ def render(results: Results, images: Path) -> str:
         ["coherent, held-out transmitters", *(median_cell(scores(results, [wave(letter, False)])) for letter in "DG")],
     ]
     note = (
-        "All transmitters train, as in the paper, and the scores are at frequencies that have not trained. Over frequencies:"
-        " lowest and highest median. Then what a new frequency costs beside what a new place costs: this field, and one that"
-        " trained on all 21 frequencies but with other transmitters, at the transmitters that both are scored at."
+        "All transmitters train, as in the paper, and scores are at frequencies not used in training. Over frequencies: lowest"
+        " and highest median. The next two columns compare the cost of a new frequency with that of a new place: this field,"
+        " and a field trained on all 21 frequencies but other transmitters, scored at the same transmitters."
     )
     parts = [note, markdown(head, rows), "The same unseen frequencies otherwise:", markdown(["field", "D", "G"], others)]
     if any(v is not None for v in values.values()):

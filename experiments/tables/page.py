@@ -47,14 +47,16 @@ published and the data here are others: compare orders and ratios, not single va
   ([baselines](baselines.md)).
 * **WRF-GS, pooled**: one model for all frequencies that is not told which one it is asked for: our field without its frequency
   inputs.
-* **5x samples**: trained on so many times the usual number of spectra.
+* **5x samples**: trained on five times the usual number of spectra.
 * **coherent (ours)**: the [coherent field](wave.md); one model for all frequencies. It is told more than the others: complex
   snapshots in training, the exact mesh and the walls' thickness, the list that the materials come from, and the physics that
-  made the data. Its rows in tables 1 and 2 and figures 7 and 8 are of before it learned how far surfaces may stand elsewhere.
+  made the data. Its rows in tables 1 and 2 and figures 7 and 8 predate its learning of how far surfaces
+  may be off.
 * **NeRF2-style**: a volume marched along rays, with the frequency as an input; rebuilt here too.
 * **Predictors that learn nothing**, and the **phase-blind ceiling**: the mean spectrum over random phases of all true paths,
   about the best that can be said without phases; measured on 50 transmitters of each scene ([dataset card](dataset.md)).
-* **Truth against itself**: 40 transmitters of each scene, traced again with three times the rays. No score says more than that.
+* **Truth against itself**: 40 transmitters of each scene, traced again with three times the rays. Scores above this level
+  cannot be told apart.
 
 Effort (profile `{name}`): {effort}.
 Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over

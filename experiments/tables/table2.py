@@ -29,8 +29,8 @@ def render(results: Results, images: Path) -> str:
     """The paper's table, and the harder one."""
     notes = {
         True: "**All transmitters train**, as in the paper (its values in parentheses, where the text at hand is legible);"
-        f" {SCORED_TRAINED} of them are scored at the unseen frequencies. What costs nothing then is the spectrum of the same"
-        " transmitter at the nearest trained frequency.",
+        f" {SCORED_TRAINED} of them are scored at the unseen frequencies. The predictor that needs no training is then the"
+        " spectrum of the same transmitter at the nearest trained frequency.",
         False: "**Held-out transmitters**: place and frequency are both new.",
     }
     seeds = "One seed; in table 1 seeds differ by up to 0.02, so that neighbouring cells can hardly be told apart."
