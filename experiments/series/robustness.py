@@ -42,9 +42,9 @@ def render(results: Results) -> str:
     the wideband field alone, what learns nothing, and how far the hybrid field is ahead of the best of the latter."""
     parts = []
     for scene in sorted(SCENES):
-        found = {variant: _scores(results, scene, variant) for variant in HYBRID.variants}
+        found = {variant: scores(results, scene, variant) for variant in HYBRID.variants}
         head = ["fault", "hybrid", "coherent, no corrections", "wideband alone", *LEARN_NOTHING.values(), "ahead by"]
-        alone = {variant: _averages(results, UNCORRECTED_WAVE, scene, uncorrected(variant)) for variant in found}
+        alone = {variant: uncorrected_scores(results, scene, variant) for variant in found}
         rows = [_row(variant, alone[variant], scores) for variant, scores in found.items()]
         parts += [NOTE.format(scene=scene, profile=HYBRID.profile), markdown(head, rows)]
         if ahead := {variant: _ahead(scores) for variant, scores in found.items() if all(scores)}:
@@ -53,23 +53,29 @@ def render(results: Results) -> str:
     return "\n\n".join(parts)
 
 
-_Scores = list[list[float]]
+Scores = list[list[float]]
 """Of the hybrid field, of the splatting field and of what learns nothing: those of the seeds that were run."""
 
 
-def _scores(results: Results, scene: str, variant: str) -> _Scores:
+def scores(results: Results, scene: str, variant: str) -> Scores:
+    """Returns what was scored with a fault; of models that do not notice it, without it."""
     same = SAME.get(variant, "")
     nothing = [found.values["baselines"] for found in _known(results, NOTHING, scene, same)]
     learn_nothing = [[statistics.fmean(scores[name].values()) for scores in nothing] for name in LEARN_NOTHING]
     return [_averages(results, HYBRID, scene, variant), _averages(results, SPLATTING, scene, same), *learn_nothing]
 
 
-def _ahead(scores: _Scores) -> float:
+def uncorrected_scores(results: Results, scene: str, variant: str) -> list[float]:
+    """Returns those of the coherent field without corrections."""
+    return _averages(results, UNCORRECTED_WAVE, scene, uncorrected(variant))
+
+
+def _ahead(scores: Scores) -> float:
     ours, *others = map(statistics.median, scores)
     return ours - max(others)
 
 
-def _row(variant: str, alone: list[float], scores: _Scores) -> list[str]:
+def _row(variant: str, alone: list[float], scores: Scores) -> list[str]:
     ours, *others = map(_cell, scores)
     of_others = others if variant in OF_DATA else [""] * len(others)
     return [_words(variant), ours, _cell(alone), *of_others, f"{_ahead(scores):+.3f}" if all(scores) else ""]

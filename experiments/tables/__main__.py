@@ -1,7 +1,8 @@
 """Write the page of results and the table of all results: `python -m experiments.tables [--profile quick]`.
 
-docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick),
-experiments/results/results.csv and headline.json, and the marked numbers of README.md and all pages (`evidence.py`).
+docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick), the curves that
+docs/wave.md shows, experiments/results/results.csv and headline.json, and the marked numbers of README.md and all pages
+(`evidence.py`).
 """
 
 from dataclasses import dataclass
@@ -12,8 +13,9 @@ import tyro
 
 from experiments import evidence, result_table
 from experiments.results import FOLDER, Results
-from experiments.tables import summary
+from experiments.tables import faults, summary
 from experiments.tables.page import page
+from experiments.tables.plots import save
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.files import atomic_write
 
@@ -41,6 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(result_table.write(command.results))
     if not suffix:
         print(summary.write(Results(command.profile, command.results)))
+        save(faults.draw(Results(command.profile, command.results)), command.docs / "images", "faults", "")
     if command.docs == DOCS:
         for changed in evidence.fill_pages(folder=command.results):
             print(changed)

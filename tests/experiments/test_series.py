@@ -11,6 +11,7 @@ from experiments.jobs import BASELINES, Job
 from experiments.results import FOLDER, Results
 from experiments.series import choices, robustness, tuning, wave_choices
 from experiments.settings import settings
+from experiments.tables import faults
 from experiments.variants import OPTIMIZERS, VARIANTS
 from wbgs_jax.config import check
 from wbgs_jax.fields import get_field
@@ -118,3 +119,20 @@ def test_faults_show_the_range_of_seeds_and_how_far_one_command_is_ahead(tmp_pat
     assert "| all together | 0.890 (0.875 to 0.905, 2 seeds) | not run |  |  |  | +0.070 |" in lines
     assert "| snr 20 | not run | not run | 0.800 | 0.700 | 0.820 |  |" in lines
     assert sum("least ahead with *all together*, by +0.070" in line for line in lines) == 1
+
+
+def test_curves_of_faults_are_medians_over_seeds_with_gaps(tmp_path):
+    results = Results("quick", tmp_path)
+    for seed, score in ((0, 0.7), (1, 0.9), (2, 0.75)):
+        results.write(robustness.HYBRID.jobs_of("4", "snr_20")[seed], {"average_of_medians": score, "median_ssim": score})
+    results.write(robustness.SPLATTING.jobs_of("4", "")[0], {"average_of_medians": 0.6, "median_ssim": 0.6})
+    axes = dict(zip(faults.PANELS, faults.draw(results).axes, strict=True))
+
+    def drawn(title):
+        return {(line.get_color(), line.get_linestyle()): line.get_ydata() for line in axes[title].lines}
+
+    by_noise = drawn("snapshot SNR (dB)")
+    np.testing.assert_array_equal(by_noise["C2", "-"], [np.nan, np.nan, 0.75, np.nan])
+    np.testing.assert_array_equal(by_noise["C2", "--"], [0.6, np.nan, np.nan, np.nan])
+    assert np.isnan(by_noise["C0", "-"]).all()
+    np.testing.assert_array_equal(drawn("mesh position error (mm)")["C2", "--"], 0.6)
