@@ -31,8 +31,8 @@ ALIKE = 1e-6
 Compared = Literal["snapshots", "covariances", "spectra"]
 """What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
 (`losses.surprise`), or spectra (log mean absolute error), as also where nothing else is known. Of received powers alone it is
-the log absolute error in dB. Of a link on which nothing was heard,
-snapshots and spectra score the same whatever the candidate."""
+the log absolute error in dB. Snapshots and spectra of a link on which nothing was heard score the same, whatever the
+candidate."""
 
 
 @runtime_checkable
