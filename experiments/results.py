@@ -55,8 +55,8 @@ class Result:
 
     def belongs_to(self, job: Job) -> bool:
         """Whether it was made on the same data, with the settings that the job has today."""
-        scene = self.values["job"]["scene"]
-        if not job.is_released and Path(scene).resolve() != Path(job.scene).resolve():
+        scene = self.values.get("job", {}).get("scene", "")
+        if not job.is_released and Path(scene).absolute() != Path(job.scene).absolute():
             return False
         return unlike_preset(job, todays(self.values, job.field)) == differences(job)
 
@@ -120,8 +120,10 @@ def _read(path: Path, modified_ns: int) -> Result:
 def _is_result(values: Any) -> bool:
     if not isinstance(values, dict) or not (BASELINES in values or "median_ssim" in values or {"ssim", "tx"} <= set(values)):
         return False
-    kinds = {"settings": dict, "presets": int, "tx": list, "ssim": dict, "training_seconds": float | int}
+    kinds = {"job": dict, "settings": dict, "presets": int, "tx": list, "ssim": dict, "training_seconds": float | int}
     if any(name in values and not isinstance(values[name], kind) for name, kind in kinds.items()):
+        return False
+    if not isinstance(values.get("job", {}).get("scene", ""), str):
         return False
     scores = values.get("ssim", {})
     try:
