@@ -112,7 +112,8 @@ def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_h
 def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path, monkeypatch):
     run, likely, traced = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), {0: [Slab("wood", 0.02)]}, []
     monkeypatch.setattr(geometry, "adjust", lambda field, params, cache, motion, covariance, *_: (motion, covariance))
-    monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or run.cache)
+    cache = run.cache  # which is prepared when it is first asked for
+    monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or cache)
     heard = geometry._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
     now = Place(run.field, run.state.params, run.cache, likely=likely)
     assert geometry._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
