@@ -99,10 +99,11 @@ def score(dataset: Dataset, predicted: Float[np.ndarray, "n 90 360"]) -> dict[st
     Raises:
         UserError: a transmitter was not heard at every frequency, or twice at one.
     """
-    test, ghz = dataset.test, np.unique(dataset.frequencies_hz[dataset.test]) / 1e9
-    order = np.lexsort((dataset.frequencies_hz[test], dataset.receiver_index[test], dataset.tx_index[test]))
-    in_turn = np.resize(ghz, len(test))
-    if len(test) % len(ghz) or not np.array_equal(dataset.frequencies_hz[test[order]] / 1e9, in_turn):
+    test = dataset.test
+    asked_ghz = dataset.frequencies_hz[test] / 1e9
+    ghz = np.unique(asked_ghz)
+    order = np.lexsort((asked_ghz, dataset.receiver_index[test], dataset.tx_index[test]))
+    if len(test) % len(ghz) or not np.array_equal(asked_ghz[order], np.resize(ghz, len(test))):
         raise UserError(
             f"{dataset.name}: not every test transmitter has one spectrum at every frequency, which tables by frequency need; "
             "leave the others out of test_index.txt"

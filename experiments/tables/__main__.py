@@ -35,15 +35,16 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.tables", args=arguments)
     suffix = "" if command.profile == "quick" else f"_{command.profile}"
-    text = page(Results(command.profile, command.results), command.docs / f"images{suffix}")
+    results = Results(command.profile, command.results)
+    text = page(results, command.docs / f"images{suffix}")
     path = command.docs / f"results{suffix}.md"
     with atomic_write(path) as stream:
         stream.write(text.encode())
     print(path)
     print(result_table.write(command.results))
     if not suffix:
-        print(summary.write(Results(command.profile, command.results)))
-        save(faults.draw(Results(command.profile, command.results)), command.docs / "images", "faults", "")
+        print(summary.write(results))
+        save(faults.draw(results), command.docs / "images", "faults", "")
     if command.docs == DOCS:
         for changed in evidence.fill_pages(folder=command.results):
             print(changed)

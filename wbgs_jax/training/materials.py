@@ -14,7 +14,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax._util.statistics import standard_error
@@ -104,7 +104,8 @@ def search_materials(
         before = before if turn else scores[0]
         settled += 1
         listed = any(same(params.materials, entry.materials) for entry in entries)
-        kept = _better(scores[0], scores[best], tx_index, 0.0 if listed else config.sure)
+        gain, error = standard_error(scores[best] - scores[0], tx_index)  # of what is there
+        kept = scores[0].mean() < scores[best].mean() if listed else gain > config.sure * error
         if np.ptp(scores.mean(1)) >= UNSEEN and not kept:
             taken[material] = list(ITU_MATERIALS)[likely[best - 1]]
             settled = settled if same(params.materials, candidates[best].materials) else 1
@@ -114,12 +115,10 @@ def search_materials(
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
-def _better(new: Float[np.ndarray, " n"], old: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:
-    """Returns whether scores are lower by more than so many standard errors of the mean difference."""
-    if not errors:
-        return bool(new.mean() < old.mean())
-    gain, error = standard_error(old - new, tx_index)
-    return gain > errors * error
+def unknown_mm(materials: Any, known_thickness: Float[np.ndarray, " m"]) -> dict[int, float]:
+    """Returns how thick (mm) those materials are whose thickness the scene does not say (0)."""
+    metres = np.exp(np.asarray(materials.log_thickness))
+    return {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(known_thickness == 0)}
 
 
 def entries_of(materials: Any) -> dict[int, str]:

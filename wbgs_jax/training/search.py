@@ -22,7 +22,7 @@ from wbgs_jax.training.clutter import search_clutter
 from wbgs_jax.training.controls import Context, Edit, Say
 from wbgs_jax.training.geometry import Place, learn_geometry
 from wbgs_jax.training.idealisations import search_idealisations
-from wbgs_jax.training.materials import entries_of, search_materials
+from wbgs_jax.training.materials import entries_of, search_materials, unknown_mm
 from wbgs_jax.training.placement import search_placement
 from wbgs_jax.training.scores import Scores, Told
 from wbgs_jax.training.thicknesses import search_slabs
@@ -44,13 +44,6 @@ def search_gain(params: Any, score: Scores) -> tuple[Any, float]:
         best = int(np.argmin(score(candidates).mean(1)))
         params, gain = candidates[best], float(tried[best])
     return params, gain
-
-
-def _made_of(params: Any, field: Any) -> dict[str, Any]:
-    """Returns what materials are in the end, and how thick those are whose thickness the scene does not say (mm)."""
-    metres, unknown = np.exp(np.asarray(params.materials.log_thickness)), np.asarray(field.known_thickness) == 0
-    thick = {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(unknown)}
-    return {"taken": entries_of(params.materials), "thickness_mm": thick}
 
 
 @dataclass(frozen=True)
@@ -129,7 +122,8 @@ class Search:
             params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
             report["placement"] = dataclasses.asdict(guessed)
             params, field = self._clutter(params, told, report, rng, say)
-            report["search"] |= _made_of(params, field)
+            thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
+            report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # named again since then
         return Edit(params, (), None, report, field, cache)
 
     def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:

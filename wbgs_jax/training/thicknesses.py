@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.training.materials import ITU_MATERIALS, UNSEEN, SearchReport, search_materials, with_entry
+from wbgs_jax.training.materials import ITU_MATERIALS, UNSEEN, SearchReport, search_materials, unknown_mm, with_entry
 from wbgs_jax.training.scores import Compared, Scores, Told, surely_better
 
 SHEETS = (0.002, 0.004, 0.006, 0.01, 0.015)
@@ -71,7 +71,8 @@ def search_slabs(
         compared: of those.
         likely: slabs, where those that are not likely have been ruled out before.
     """
-    score, unknown = told.scores(count, compared), np.asarray(told.field.known_thickness) == 0
+    score, known = told.scores(count, compared), np.asarray(told.field.known_thickness)
+    unknown = known == 0
     named, report = search_materials(params, told, count, config, compared, usual=bool(unknown.any()))
     if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
         return named, report, likely
@@ -81,8 +82,7 @@ def search_slabs(
     before, after = score([named, sized])
     if not surely_better(before - after, told.tx_index(count), SURE):
         return named, report, likely
-    metres = np.exp(np.asarray(sized.materials.log_thickness))
-    thick = {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(unknown)}
+    thick = unknown_mm(sized.materials, known)
     return sized, dataclasses.replace(anew, before=report.before, thickness_mm=thick), likely
 
 
