@@ -11,6 +11,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,16 +77,16 @@ def hand_on(command: Command) -> str:
     """Writes what a field knows, and returns a line about it."""
     from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at
     from wbgs_jax.inference.predictor import at_receiver
-    from wbgs_jax.training.run_folder import load_trained
+    from wbgs_jax.training.run_folder import open_run
 
     assert command.run is not None and command.ghz is not None, "checked"
     positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
     hertz = frequencies((command.ghz,))
-    trained = load_trained(command.run)
+    trained = open_run(command.run)
     dataset = trained.dataset()
     receiver = receiver_at(command.rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, float(hertz[0]))
+    check_frequencies(trained, dataset, float(hertz[0]))
     for line in doubts(dataset, np.asarray(receiver.position), positions, hertz)[:3]:
         say(f"warning: {line}")
     write = _write_gaussians if command.out.suffix == ".ply" else _write_paths
@@ -154,7 +155,7 @@ def take_in(command: Command) -> str:
     save_scene(command.out, scene)
     heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
     count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
-    return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {command.out}"
+    return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {shlex.quote(str(command.out))}"
 
 
 def main(arguments: list[str] | None = None) -> None:

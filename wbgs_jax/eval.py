@@ -9,7 +9,9 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 # isort: split
 
 import json
+import shlex
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,16 +20,16 @@ from rich.console import Console
 
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable, write_json
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.load import load_dataset
 from wbgs_jax.evaluation import pictures
 from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
-from wbgs_jax.inference.predictor import BLOCK
+from wbgs_jax.inference.predictor import BLOCK, at_receivers
 from wbgs_jax.training import curves
 from wbgs_jax.training.manifest import write_manifest
-from wbgs_jax.training.run_folder import TrainedField, load_trained
+from wbgs_jax.training.run_folder import MANIFEST, TrainedField, open_run
 
 
 @dataclass(frozen=True)
@@ -52,16 +54,18 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax eval")
-    trained = load_trained(command.run)
+    trained = open_run(command.run)
     check_writable(command.run / "eval.json")
-    dataset = trained.dataset() if command.data is None else load_dataset(command.data, seed=trained.config.seed)
+    dataset = trained.dataset() if command.data is None else trained.config.other_data(command.data)
+    if command.data is not None:
+        trained = for_receivers(trained, dataset)
     console = Console(file=sys.stderr, markup=False, soft_wrap=True)
     index = held_out(dataset, command.part)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
     report, predicted = evaluate(trained, dataset, command.part)
     beside = "" if command.data is None else f"-{dataset.name}"  # scores on other data never replace the run's own
     write_json(command.run / f"{with_part('eval', command.part)}{beside}.json", report)
-    if command.data is None:
+    if command.data is None and (command.run / MANIFEST).exists():
         write_manifest(command.run, trained, report)
     if command.results:
         path = result_path(command.results, report, trained.config.preset)
@@ -83,16 +87,26 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(line)
 
 
+def for_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
+    """Returns what answers at the receivers of other data; where nothing does, the field as it is, with a note."""
+    try:
+        return at_receivers(trained, dataset)
+    except UserError as error:
+        warnings.warn(f"scored as if {dataset.name} had the receivers of the training: {error}", stacklevel=2)
+        return trained
+
+
 def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
     """Returns what to look at next."""
+    folder = shlex.quote(str(run))
     place = ",".join(f"{x:.3g}" for x in dataset.tx_positions[dataset.test[0] if len(dataset.test) else 0])
     ghz = f"{dataset.frequencies_hz.max() / 1e9:g}"
     lines = []
     if dataset.kind != "power":
-        lines.append(f"next: wbgs-jax predict --run {run} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
+        lines.append(f"next: wbgs-jax predict --run {folder} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
     if "power" in trained.field.known() and dataset.kind != "pas":
-        lines.append(f"      wbgs-jax map --run {run} --ghz {ghz} --picture map.png")
-    return [*lines, f"      wbgs-jax view --run {run}"]
+        lines.append(f"      wbgs-jax map --run {folder} --ghz {ghz} --picture map.png")
+    return [*lines, f"      wbgs-jax view --run {folder}"]
 
 
 if __name__ == "__main__":

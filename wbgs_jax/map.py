@@ -92,14 +92,14 @@ def make_maps(command: Command) -> None:
     from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at, source_of, write_answer
     from wbgs_jax.inference.floor import ask_plane, cut_at, pieces
     from wbgs_jax.inference.predictor import at_receiver
-    from wbgs_jax.training.run_folder import load_trained
+    from wbgs_jax.training.run_folder import open_run
 
     frequencies_hz = frequencies(command.ghz)
-    trained = load_trained(command.run)
+    trained = open_run(command.run)
     dataset = trained.dataset()
     plane, receiver = plane_of(command, dataset), receiver_at(command.rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, float(frequencies_hz.min()))
+    check_frequencies(trained, dataset, float(frequencies_hz.min()))
     rx = np.asarray(receiver.position)
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
     for line in doubts(dataset, rx, corners, frequencies_hz):

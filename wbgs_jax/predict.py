@@ -157,17 +157,20 @@ def _velocities(command: Command) -> dict[str, str]:
 
 
 def _load(run: Path) -> tuple[Any, list[Path]]:
-    from wbgs_jax.training.run_folder import load_trained, sources_of
+    from wbgs_jax.training.run_folder import open_run, sources_of
 
-    trained = load_trained(run)
+    trained = open_run(run)
     return trained, sources_of(run, trained.config)
 
 
 def _export(command: Command) -> None:
     from wbgs_jax.inference.export import export_field
+    from wbgs_jax.inference.quantities import SPECTRA, check_known
 
     assert command.export is not None
-    export_field(_load(command.run)[0], command.export)
+    trained = _load(command.run)[0]
+    check_known(SPECTRA, trained, trained.dataset())
+    export_field(trained, command.export)
     say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
 
 

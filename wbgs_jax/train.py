@@ -6,6 +6,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 import contextlib
 import dataclasses
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,9 @@ from wbgs_jax._util.command import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.processes import by_first, connect, is_first
-from wbgs_jax.config import Settings, check, from_sections, sections
+from wbgs_jax.config import Settings, check, from_sections, limit_steps, sections
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.load import source_names
+from wbgs_jax.data.load import released_scenes, source_names
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.inference.confidence import write_confidence
@@ -28,6 +29,7 @@ from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.confidence import learn_confidence
 from wbgs_jax.training.estimate import duration_words, expected_seconds
+from wbgs_jax.training.interrupts import Interrupted
 from wbgs_jax.training.lock import locked
 from wbgs_jax.training.loop import TrainResult, check_data, train
 from wbgs_jax.training.manifest import write_manifest
@@ -128,7 +130,10 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
     check(settings)
     get_field(command.field).check(settings.field)
     source = command.scene if command.data is None else command.data
-    names = [str(Path(name).resolve()) if Path(name).exists() else name for name in source_names(str(source))]
+    words, released = source_names(str(source)), released_scenes() if command.data is None else {}
+    names = [str(Path(word).resolve()) if word not in released and Path(word).exists() else word for word in words]
+    if command.frequency_ghz is not None and not any(Path(name).is_dir() for name in names):
+        raise UserError(f"--frequency-ghz is for folders that do not say; {source} does, or does not exist")
     return RunConfig(
         source=",".join(names),
         field=command.field,
@@ -170,28 +175,31 @@ def main(arguments: list[str] | None = None) -> None:
         steps = checkpoint_steps(folder / "checkpoints")
         if steps:
             tell(f"going on from the checkpoint of step {steps[-1]}")
-        for line in opening_lines(folder, config, steps[-1] if steps else 0):
+        total = limit_steps(config.settings, len(dataset.train)).optim.steps
+        for line in opening_lines(folder, config, total, steps[-1] if steps else 0):
             tell(line)
-        result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
-        by_first(lambda: learn_beside(result, dataset, config, folder))
+        try:
+            result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
+            by_first(lambda: learn_beside(result, dataset, config, folder))
+        except KeyboardInterrupt:  # in the last epoch or behind it, or a second time
+            raise Interrupted("stopped; run the same command with --resume to go on") from None
         by_first(lambda: write_manifest(folder, load_trained(folder)))
     tell(summary(result, folder))
-    tell(f"next: wbgs-jax eval --run {folder}   (scores on held-out transmitters, and pictures)")
+    tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and pictures)")
 
 
 def _nothing(line: str) -> None:
     """Keeps a line to itself."""
 
 
-def opening_lines(folder: Path, config: RunConfig, done: int) -> list[str]:
-    """Returns how long it will take, and where the results go."""
-    steps = config.settings.optim.steps
+def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> list[str]:
+    """Returns how long it will take if so many of the steps are done, and where the results go."""
     field = get_field(config.field)
     share = max(steps - done, 0) / field.presets[config.preset].optim.steps
     seconds = expected_seconds(field, config.preset, share)
     lasts = "how long it takes stands in the lines below" if seconds is None else f"{duration_words(seconds)} on this machine"
     return [
-        f"{steps - done} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",
+        f"{max(steps - done, 0)} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",
         f"results: {folder} (checkpoints, curves in metrics.jsonl)",
     ]
 

@@ -21,7 +21,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
 from wbgs_jax.inference.answers import check_frequencies, frequencies, receiver_at
 from wbgs_jax.inference.predictor import at_receiver
-from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.run_folder import open_run
 
 if TYPE_CHECKING:
     from wbgs_jax.viewer.app import Viewer
@@ -69,12 +69,12 @@ def start(command: Command) -> "Viewer":
     from wbgs_jax.viewer.app import Viewer
     from wbgs_jax.viewer.asking import Asker
 
-    trained = load_trained(command.run)
+    trained = open_run(command.run)
     dataset = trained.dataset()
     receiver = receiver_at(command.rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
     if command.ghz is not None:
-        check_frequencies(trained, float(frequencies((command.ghz,))[0]))
+        check_frequencies(trained, dataset, float(frequencies((command.ghz,))[0]))
     page = command.html or Path(f"{dataset.name}.html")
     viewer = Viewer(Asker(trained, dataset, receiver), command.host, command.port, page, command.up)
     if command.ghz is not None:

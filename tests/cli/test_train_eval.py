@@ -219,6 +219,7 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--preset", "smoke", "--optim.batch", "0"], ["optim.batch"]),
         (["--scene", "SCENE", "--preset", "smoke", "--wideband.radiance-widths"], ["radiance-widths", "at least 1"]),
         (["--data", "LAYOUT", "--frequency-ghz", "5"], ["freq.txt"]),
+        (["--scene", "SCENE", "--frequency-ghz", "5"], ["--frequency-ghz is for folders"]),
         (["--scene", "SCENE", "--validation", "1"], ["--validation", "share"]),
         (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "share"]),
         (["--scene", "SCENE", "--receiver", "1"], ["receivers 0 to 0"]),
@@ -234,6 +235,33 @@ def test_what_cannot_be_trained(tmp_path, scene, layout, arguments, words):
     result = call(train_command.main, "--out", tmp_path / "run", *(places.get(word, word) for word in arguments))
     assert_error_for_people(result, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_released_scene_is_not_hidden_by_a_folder_of_its_name(tmp_path, monkeypatch):
+    (tmp_path / "cabin").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert train_command.run_config(*train_command.parse(["--scene", "cabin"])).source == "cabin"
+    assert train_command.run_config(*train_command.parse(["--data", "cabin"])).source == str(tmp_path / "cabin")
+
+
+def test_a_stop_behind_the_last_step_says_how_to_go_on(run, scene, monkeypatch):
+    """Nobody takes what is not finished for finished."""
+    arguments = ["--scene", scene, "--out", run, *TINY, "--resume"]
+    (run / "manifest.json").unlink()
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train_command, "learn_neighbours", stopped)
+        result = call(train_command.main, *arguments)
+    assert "0 steps, " in result.err
+    assert result.code == 2 and result.err.endswith("\nerror: stopped; run the same command with --resume to go on\n")
+    with pytest.warns(UserWarning, match=r"the training of .*run is not finished \(step 4 is saved\)"):
+        assert call(eval_command.main, "--run", run, "--no-pictures").code == 0
+    assert not (run / "manifest.json").exists()
+    assert call(train_command.main, *arguments).code == 0
+    assert (run / "manifest.json").exists()
 
 
 def test_run_folders_that_cannot_be_used(tmp_path, scene):

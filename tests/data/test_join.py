@@ -53,6 +53,14 @@ def test_a_transmitter_that_one_of_them_tests_is_trained_by_none(parts, rng):
     assert len(joined.train) + len(joined.validation) + len(joined.test) == len(joined)
 
 
+def test_links_of_no_part_stay_in_none(parts):
+    _, first, second = parts
+    kept = first.train[2:]
+    joined = join([dataclasses.replace(first, train=kept), second])
+    assert not {int(link) for link in first.train[:2]} & {int(link) for link in joined.train}
+    assert len(joined.train) + len(joined.validation) + len(joined.test) == len(joined) - 2
+
+
 @pytest.mark.parametrize(
     "change, said",
     [

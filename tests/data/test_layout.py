@@ -127,7 +127,7 @@ def test_one_frequency_from_the_gateway_or_the_caller(folder, where):
     (folder / "gateway_info.yml").write_text(GATEWAY + where)
     assert set(load_layout(folder).frequencies_hz) == {915e6}
     assert set(load_layout(folder, frequency_hz=868e6).frequencies_hz) == {868e6}
-    with pytest.raises(UserError, match="positive"):
+    with pytest.raises(UserError, match=r"must be 0\.001 to 1000 GHz"):
         load_layout(folder, frequency_hz=0.0)
 
 

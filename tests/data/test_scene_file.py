@@ -139,6 +139,22 @@ def test_what_a_receiver_does_not_hear_is_no_link(tmp_path):
     assert dataset.receiver_index[dataset.tx_index == 0].tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
 
 
+def test_what_nobody_measured_is_no_link(tmp_path):
+    scene = tiny_scene(4, n_rx=3)
+    scene.snapshots[1], scene.snapshots[0, 2, 1] = np.nan, np.nan
+    save_scene(tmp_path / "s.npz", scene)
+    dataset = load_dataset(tmp_path / "s.npz")
+    assert len(dataset) == 3 * 3 * 3 - 1 and np.isfinite(dataset.snapshots).all() and set(dataset.tx_index) == {0, 1, 2}
+
+
+def test_a_place_on_both_sides_of_the_split_is_noted(tmp_path):
+    scene = tiny_scene(4)
+    scene.tx_positions[3], scene.split[:] = scene.tx_positions[0], [0, 0, 2, 1]
+    save_scene(tmp_path / "s.npz", scene)
+    with pytest.warns(UserWarning, match="box: 1 TX positions are both in train and in test; scores will flatter"):
+        load_dataset(tmp_path / "s.npz")
+
+
 def test_scenes_are_found_by_number_and_by_path(tmp_path, scene, monkeypatch):
     monkeypatch.setenv("WBGS_DATA", str(tmp_path))
     for number in (1, 2, 10):
@@ -165,8 +181,9 @@ def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains NaN"),
-        ("snapshots", np.full((5, 1, 3, 16), 1e300), "snapshots contains NaN or infinity"),
+        ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains NaN alone"),
+        ("snapshots", np.full((5, 1, 3, 16), [np.nan] + [1.0] * 15), "or NaN in some elements of a link alone"),
+        ("snapshots", np.full((5, 1, 3, 16), 1e300), "snapshots contains infinity"),
         ("snapshots", np.zeros((5, 3, 16), np.complex64), "snapshots must be a 4-D complex64"),
         ("snapshots", np.zeros((5, 1, 3, 16), "U1"), "snapshots must be a 4-D complex64"),
         ("snapshots", None, "it holds none of snapshots, pas, power_db"),

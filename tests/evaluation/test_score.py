@@ -1,5 +1,6 @@
 """How good a field is on held-out links: figures of every kind that field and data have, and of the part that was asked for."""
 
+import dataclasses
 import json
 from typing import Any, ClassVar, NamedTuple
 
@@ -129,11 +130,22 @@ def test_the_validation_part_is_scored_by_itself(knowing, dataset):
         evaluate(knowing, dataset, "validation")
 
 
+def test_data_to_test_with_alone_have_no_baselines(knowing, dataset):
+    everything = np.arange(len(dataset))
+    report, _ = evaluate(
+        knowing, dataclasses.replace(dataset, train=everything[:0], validation=everything[:0], test=everything)
+    )
+    assert report["n"] == len(dataset) and report["baselines"] == {}
+
+
 def test_snapshots_are_scored_by_their_correlation_and_their_power(rng):
     truth = rng.normal(size=(5, 16)) + 1j * rng.normal(size=(5, 16))
     turned = truth * np.exp(1j * rng.uniform(0, 6, (5, 1))) * 10 ** (np.array([[1], [-2], [3], [-4], [5]]) / 20)
     figures = score_snapshots(turned.astype(np.complex64), truth.astype(np.complex64))
     assert figures["snapshot_correlation"] == pytest.approx(1, abs=1e-5)
     assert figures["power_error_db"] == pytest.approx(3, abs=1e-4)
+    silent = truth * [[1], [1], [0], [0], [0]]
+    assert score_snapshots(turned.astype(np.complex64), silent)["power_error_db"] == pytest.approx(1.5, abs=1e-4)
+    assert score_snapshots(turned.astype(np.complex64), 0 * truth) == {}, "nothing was heard"
     orthogonal = np.linalg.qr(np.stack([truth[0], rng.normal(size=16)], 1))[0].T
     assert score_snapshots(orthogonal[:1], orthogonal[1:])["snapshot_correlation"] == pytest.approx(0, abs=1e-5)

@@ -103,6 +103,18 @@ def test_snapshots_of_a_line_of_sight(rng, tmp_path):
     np.testing.assert_allclose(scene.snapshots[:, 0, 1], expected, rtol=1e-4)
 
 
+def test_what_is_measured_twice_at_a_place_is_on_one_side_of_the_split(rng):
+    places, elements = np.repeat(rng.uniform(1, 4, (6, 3)), 3, 0)[rng.permutation(18)], planar_array(2, 2)
+    measured = rng.normal(size=(18, 1, 1, 4)) + 1j * rng.normal(size=(18, 1, 1, 4))
+    where = np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])
+    scene = scene_of_snapshots(measured, places, np.array([2e9]), *where, elements, "twice")
+    tested = {tuple(place) for place in places[scene.split == TEST]}
+    assert len(tested) == 1 and (scene.split == TEST).sum() == 3
+    few = places[:1] + np.array([[0], [0], [1], [2], [3]])
+    with pytest.raises(UserError, match="4 transmitters, and a training needs 5"):
+        scene_of_snapshots(measured[:5], few, np.array([2e9]), *where, elements, "few")
+
+
 def test_places_of_interactions():
     """Reflections have one; transmissions are known by their wall alone."""
     points = np.array([[0, 0, 0], [1, 0, 0], [2, 2, 0], [3, 3, 3], [3, 3, 3]], float)[None, None]

@@ -125,3 +125,22 @@ def test_columns_stand_in_any_order_and_headers_in_capitals(tmp_path, rng):
     swapped = [["X", "Y", "Room", "RSSI_3", "RSSI_1", "RSSI_2"], *([*row[:3], row[5], row[3], row[4]] for row in rows)]
     (tmp_path / "readings.csv").write_text("\n".join(",".join(row) for row in swapped))
     np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers, first.powers)
+
+
+def test_columns_end_in_ids_that_hold_underscores(tmp_path, rng):
+    folder(tmp_path, rng, n=20, noise=0.0)
+    first = load_readings(tmp_path, HEIGHT)
+    _, *stations = (tmp_path / "receivers.csv").read_text().splitlines()
+    places = [line.split(",")[1:] for line in stations]
+    ids = ["1", "ap_1", "AP_3"]
+    lines = ["id,x,y,z", *(",".join([name, *place]) for name, place in zip(ids, places, strict=True))]
+    (tmp_path / "receivers.csv").write_text("\n".join(lines))
+    _, *rows = [line.split(",") for line in (tmp_path / "readings.csv").read_text().splitlines()]
+    for names in (["rssi_ap_3", "rssi_1", "rssi_ap_1"], ["ap_3", "1", "ap_1"]):
+        swapped = [["x", "y", "room", *names], *([*row[:3], row[5], row[3], row[4]] for row in rows)]
+        (tmp_path / "readings.csv").write_text("\n".join(",".join(row) for row in swapped))
+        np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers, first.powers)
+    swapped[0][3] = "rssi_ap_4"
+    (tmp_path / "readings.csv").write_text("\n".join(",".join(row) for row in swapped))
+    with pytest.raises(UserError, match="ends in the receiver's id 'ap_3'"):
+        load_readings(tmp_path, HEIGHT)

@@ -212,3 +212,20 @@ def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng
     assert entry["gain_db"] == pytest.approx(offset, abs=2.5 if rounds else 10)  # wrong materials reflect more or less
     assert set(entry) == ({"step", "search", "gain_db"} if rounds else {"step", "gain_db"})
     assert not rounds or entry["search"]["after"] < entry["search"]["before"] - 0.15, entry
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ordinary", [False, True])
+def test_snapshots_in_a_unit_of_their_own_get_a_gain(ordinary, run_on, tmp_path, rng):
+    """Measured voltages are not relative to what was transmitted; gradients alone cover less than 40 dB."""
+    search = dataclasses.replace(SETTINGS.search, rounds=0, antenna_rounds=1, placement_spectra=16)
+    offset = 0.0 if ordinary else float(rng.choice([-1, 1]) * rng.uniform(60, 160))
+    run = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search)
+    silent = np.asarray(run.dataset.train)[:2]
+    loud = (run.data.snapshots * 10 ** (offset / 20)).at[silent].set(0)
+    run.data = dataclasses.replace(run.data, snapshots=loud)
+    run.control()
+    entry = json.loads((tmp_path / "metrics.jsonl").read_text())
+    assert ("gain_db" in entry) is not ordinary
+    assert ordinary or entry["gain_db"] == pytest.approx(offset, abs=10)  # wrong materials reflect more or less
+    assert float(run.state.params.log_gain) == pytest.approx(entry.get("gain_db", 0.0) * np.log(10) / 20, abs=1e-5)

@@ -20,7 +20,8 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     """Returns the links of all data sets in their order.
 
     Receivers are numbered on, and a place where several data sets have a transmitter is one transmitter. It is of the test if
-    one of them tests it, and else of the validation if one of them validates it: its other receivers would give it away.
+    one of them tests it, and else of the validation if one of them validates it: its other receivers would give it away. Links
+    that are in no part of their data set are in none here.
 
     Raises:
         UserError: they are not of one scene, or of different kinds or arrays.
@@ -34,8 +35,9 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     receivers = np.cumsum([0, *(one.n_receivers for one in datasets)])
     named = {
         part: np.concatenate([getattr(one, part) + start for one, start in zip(datasets, before, strict=False)])
-        for part in ("validation", "test")
+        for part in ("train", "validation", "test")
     }
+    listed = np.isin(np.arange(len(tx_index)), np.concatenate(list(named.values())))
     tested, validated = (np.isin(tx_index, np.unique(tx_index[index])) for index in (named["test"], named["validation"]))
     arrays: dict[str, Any] = {name: _together(datasets, name) for name in OBSERVED}
     arrays |= {name: getattr(first, name) for name in SURFACES}
@@ -46,9 +48,9 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
         frequencies_hz=np.concatenate([one.frequencies_hz for one in datasets]),
         receiver_index=_numbered_on(datasets, receivers),
         tx_index=tx_index,
-        train=np.flatnonzero(~tested & ~validated),
-        validation=np.flatnonzero(validated & ~tested),
-        test=np.flatnonzero(tested),
+        train=np.flatnonzero(listed & ~tested & ~validated),
+        validation=np.flatnonzero(listed & validated & ~tested),
+        test=np.flatnonzero(listed & tested),
         **arrays,
         materials=first.materials,
     )

@@ -38,7 +38,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import scene_dataset
 from wbgs_jax.data.ply import read_ply, write_ply
 from wbgs_jax.data.scene_file import SceneFile, load_scene
-from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
+from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.types import (
     HIGHEST_FREQUENCY_HZ,
@@ -178,8 +178,8 @@ def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
 def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None) -> Float[np.ndarray, " n"]:
     if not path.exists():
         single = next(f for f in (wanted_hz, gateway_hz, NOMINAL_FREQUENCY_HZ) if f is not None)
-        if not (np.isfinite(single) and single > 0):
-            raise UserError(f"the frequency of {path.parent} is {single:g} Hz; it must be positive")
+        if not LOWEST_FREQUENCY_HZ <= single <= HIGHEST_FREQUENCY_HZ:
+            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; it must be 0.001 to 1000 GHz")
         return np.full(n, single, np.float64)
     if wanted_hz is not None:
         raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
@@ -235,9 +235,7 @@ def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
         both = np.intersect1d(split[first], split[second])
         if len(both):
             raise UserError(f"image {both[0] + 1:05d} is in both {folder / INDEX[first]} and {INDEX[second]}; keep it in one")
-        if shared := len(np.intersect1d(tx_index[split[first]], tx_index[split[second]])):
-            text = f"{folder}: {shared} TX positions are both in {first} and in {second}; scores will flatter"
-            warnings.warn(text, stacklevel=3)
+    note_shared_transmitters(str(folder), tx_index, split)
     return split
 
 

@@ -11,13 +11,16 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.join import join
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
-from wbgs_jax.data.splits import group_transmitters
+from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
 
 DATA_VARIABLE = "WBGS_DATA"
 """Environment variable: a folder of scene files to use instead of those released with the package."""
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
+
+PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
+"""Of a split, as scene files number them."""
 
 
 def load_dataset(
@@ -62,22 +65,26 @@ def source_paths(source: str) -> list[Path]:
 def scene_dataset(scene: SceneFile) -> Dataset:
     """Returns the links of a scene file, transmitter by transmitter, then receiver by receiver, frequency fastest.
 
-    The split is the file's own. Links whose power is NaN, of a transmitter that a receiver does not hear, are left out.
+    The split is the file's own. Links that nobody observed are left out: those whose power is NaN, where a receiver does not
+    hear a transmitter, or whose snapshot is NaN, where nobody measured.
     """
-    links = _heard(scene)
+    links = _observed(scene)
     tx, rx, freq = np.nonzero(links)
     observed = {"snapshots": scene.snapshots, "images": scene.pas, "power_db": scene.power_db}
     split = scene.split[tx]
+    tx_index = group_transmitters(scene.tx_positions[tx])
+    parts = {name: np.flatnonzero(split == code) for name, code in PARTS.items()}
+    note_shared_transmitters(scene.name, tx_index, parts)
     return Dataset(
         name=scene.name,
         receivers=stack_receivers(_receivers(scene)),
         tx_positions=scene.tx_positions[tx],
         frequencies_hz=scene.frequencies_hz[freq],
         receiver_index=rx,
-        tx_index=group_transmitters(scene.tx_positions[tx]),
-        train=np.flatnonzero(split == TRAIN),
-        validation=np.flatnonzero(split == VALIDATION),
-        test=np.flatnonzero(split == TEST),
+        tx_index=tx_index,
+        train=parts["train"],
+        validation=parts["validation"],
+        test=parts["test"],
         **{key: None if values is None else values[links] for key, values in observed.items()},
         vertices=scene.vertices,
         faces=scene.faces,
@@ -109,9 +116,11 @@ def _scene_folder() -> Path:
     return Path(folder) if folder else RELEASED
 
 
-def _heard(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
+def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
     """Returns which links of a scene file were observed."""
-    return np.ones(scene.observations.shape[:3], bool) if scene.power_db is None else ~np.isnan(scene.power_db)
+    if scene.power_db is not None:
+        return ~np.isnan(scene.power_db)
+    return np.ones(scene.observations.shape[:3], bool) if scene.snapshots is None else ~np.isnan(scene.snapshots).all(-1)
 
 
 def _receivers(scene: SceneFile) -> list[Receiver]:

@@ -89,8 +89,12 @@ def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, i
 
 
 def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
-    for key in (*ARRAYS, "snapshots"):
-        _demand(key not in arrays or np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
+    for key in ARRAYS:
+        _demand(np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
+    if (snapshots := arrays.get("snapshots")) is not None:
+        known, nothing = np.isfinite(snapshots).all(-1), np.isnan(snapshots).all(-1)
+        _demand((known | nothing).all(), "snapshots contains infinity, or NaN in some elements of a link alone")
+        _demand(known.any(), "snapshots contains NaN alone")
     if (power := arrays.get("power_db")) is not None:
         _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
     for key in ("tx_positions", "rx_position", "element_positions", "vertices"):

@@ -2,8 +2,10 @@
 and frequencies would give it away."""
 
 import dataclasses
+import itertools
+import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
@@ -22,6 +24,14 @@ def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "
     """Returns the transmitter (0, 1, ... by first appearance) of every link; positions (metres) agree to a micrometre."""
     _, first, group = np.unique(np.round(positions, 6), axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[group.reshape(-1)]
+
+
+def note_shared_transmitters(name: str, tx_index: Int[np.ndarray, " n"], split: Mapping[str, Int[np.ndarray, " k"]]) -> None:
+    """Warns of transmitters with links in two parts of a split."""
+    for first, second in itertools.combinations(split, 2):
+        if shared := len(np.intersect1d(tx_index[split[first]], tx_index[split[second]])):
+            text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will flatter"
+            warnings.warn(text, stacklevel=4)
 
 
 def tx_disjoint_split(

@@ -23,6 +23,11 @@ BLOCK = 256
 """Spectra held at a time: a scene has thousands, of 32,400 pixels each."""
 
 
+def can_lend(dataset: Dataset, index: Int[np.ndarray, " n"]) -> bool:
+    """Returns whether every receiver of some links has training links, from which they can be predicted."""
+    return bool(np.isin(dataset.receiver_index[index], dataset.receiver_index[dataset.train]).all())
+
+
 def baselines(dataset: Dataset) -> dict[str, Baseline]:
     """Returns the baselines of a data set by name; each call gives float32 PAS (b, 90, 360) of b spectra.
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.evaluation.baselines import nearest_links
+from wbgs_jax.evaluation.baselines import can_lend, nearest_links
 from wbgs_jax.evaluation.calibration import power_calibration
 from wbgs_jax.inference.confidence import PowerConfidence, expected_power
 from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
@@ -37,8 +37,8 @@ def score_power(
 
 def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
-    line) and nearest_tx (the power of the nearest training transmitter at the same frequency). None where the data know no
-    power.
+    line) and, where there is training data of the receivers, nearest_tx (the power of the nearest training transmitter at the
+    same frequency). None where the data know no power.
 
     Raises:
         UserError: as `score_power`.
@@ -46,7 +46,9 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
     report = score_heard(predicted, dataset, index)
     if report is None:
         return None
-    others = {"free_space": free_space(dataset, index), "nearest_tx": nearest_power(dataset, index)}
+    others = {"free_space": free_space(dataset, index)}
+    if can_lend(dataset, index):
+        others["nearest_tx"] = nearest_power(dataset, index)
     return report | {"baselines": {name: score_heard(values, dataset, index) for name, values in others.items()}}
 
 

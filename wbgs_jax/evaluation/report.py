@@ -1,6 +1,7 @@
 """Reports for people and for files: tables, and where a figure comes from."""
 
 import platform
+import shlex
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ def _commit() -> str | None:
 def provenance(trained: Any) -> dict[str, Any]:
     """Returns where the figures of a trained field come from; `trained` is a `training.run_folder.TrainedField`."""
     return environment() | {
-        "command": " ".join(["wbgs-jax train", *_training_arguments(trained.config)]),
+        "command": "wbgs-jax train " + shlex.join(_training_arguments(trained.config)),
         "preset": trained.config.preset,
         "seed": trained.config.seed,
         "steps": trained.step,

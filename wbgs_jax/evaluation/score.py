@@ -13,7 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.repeatability import repeatability
 from wbgs_jax.data.sight import in_sight
 from wbgs_jax.evaluation import metrics
-from wbgs_jax.evaluation.baselines import baselines
+from wbgs_jax.evaluation.baselines import baselines, can_lend
 from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_heard
@@ -55,8 +55,9 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if tested and (expected := expectations(trained.confidence, dataset, index, np.asarray(seen.pas), said)):
         report["confidence"] = calibration(expected, figures["ssim"])
     report |= time_queries(trained, dataset)
+    beside = baselines(dataset) if can_lend(dataset, index) else {}
     report["baselines"] = {
-        name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in baselines(dataset).items()
+        name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in beside.items()
     }
     return report, np.asarray(seen.pas)
 
@@ -103,8 +104,13 @@ def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | N
 
 
 def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
-    """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB)."""
+    """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB) over the links on which something
+    was heard; nothing, if there is none."""
+    heard = truth.any(-1)
+    if not heard.any():
+        return {}
     a, b = jnp.asarray(truth), jnp.asarray(predicted)
+    a, b = a[heard], b[heard]
     error = jnp.abs(channel.received_power_db(b) - channel.received_power_db(a))
     return {
         "snapshot_correlation": float(jnp.median(channel.correlation(a, b))),

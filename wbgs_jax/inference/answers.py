@@ -17,7 +17,7 @@ from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.bounds import Bounds, frequencies, link_words, point_words
 from wbgs_jax.inference.predictor import Trained, trained_band
-from wbgs_jax.types import LARGEST_COORDINATE_M, MIN_FREQUENCY_HZ, Receiver
+from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Receiver
 
 __all__ = [
     "bounds_of",
@@ -53,12 +53,20 @@ def receiver_at(word: str, dataset: Dataset) -> Receiver:
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 
 
-def check_frequencies(trained: Trained, lowest_hz: float) -> None:
-    """Raises a `UserError` where a field is asked below the band of the model, and knows no paths, which hold there too."""
-    if lowest_hz < MIN_FREQUENCY_HZ and "paths" not in trained.field.known():
+def lowest_answered(trained: Trained, dataset: Dataset) -> float:
+    """Returns the lowest frequency (hertz) at which a field can be asked: that of the model's band, or of its training; paths
+    hold below, too."""
+    if "paths" in trained.field.known():
+        return LOWEST_OF_PATHS_HZ
+    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
+
+
+def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> None:
+    """Raises a `UserError` where a field is asked below what it answers."""
+    if lowest_hz < (lowest := lowest_answered(trained, dataset)) * (1 - 1e-6):
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
         raise UserError(
-            f"the {trained.field.name} field of this run answers from {MIN_FREQUENCY_HZ / 1e9:g} GHz on, not at "
+            f"the {trained.field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at "
             f"{lowest_hz / 1e9:g} GHz; below, only fields with paths do: train --field {able} on data with a mesh"
         )
 

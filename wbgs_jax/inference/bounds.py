@@ -42,12 +42,14 @@ class Bounds(NamedTuple):
             if ((place < low) | (place > high)).any()
         ]
         for f in frequencies_hz:
+            if band[0] * (1 - 1e-6) <= f <= band[1] * (1 + 1e-6):
+                continue
             if f < MIN_FREQUENCY_HZ:
                 lines.append(
                     f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
                     "badly what is not many wavelengths large"
                 )
-            elif not band[0] <= f <= band[1]:
+            else:
                 trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
                 lines.append(f"{f / 1e9:g} GHz lies outside {trained}; the field was not trained there")
         return lines

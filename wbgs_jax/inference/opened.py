@@ -10,7 +10,6 @@ from jaxtyping import Float
 from wbgs_jax.inference.bounds import Bounds
 from wbgs_jax.inference.queries import Product, Queries
 from wbgs_jax.inference.ready import MOST, QUANTITIES, Ready, load_ready, make_ready
-from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ
 
 
 class Options(NamedTuple):
@@ -80,7 +79,7 @@ def _opened_run(
 ) -> Opened:
     # Here: what was left ready needs nothing of all this, and it takes seconds to load.
     from wbgs_jax.inference import asking
-    from wbgs_jax.inference.answers import bounds_of, check_frequencies, receiver_at, source_of
+    from wbgs_jax.inference.answers import bounds_of, check_frequencies, lowest_answered, receiver_at, source_of
     from wbgs_jax.inference.predictor import at_receiver
     from wbgs_jax.inference.quantities import check_known, known_quantities
 
@@ -88,15 +87,15 @@ def _opened_run(
     dataset = trained.dataset()
     receiver = receiver_at(rx, dataset)
     trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, lowest_hz)
+    check_frequencies(trained, dataset, lowest_hz)
+    check_known(what, trained, dataset)
     bounds, source = bounds_of(dataset), source_of(trained, dataset, receiver)
     if few:
-        check_known(what, trained, dataset)
         meta = {
             "source": source,
             "bounds": bounds.as_json(),
             "what": known_quantities(trained, dataset),
-            "lowest_hz": LOWEST_OF_PATHS_HZ if "paths" in trained.field.known() else MIN_FREQUENCY_HZ,
+            "lowest_hz": lowest_answered(trained, dataset),
         }
         if ready := make_ready(run, rx, len(queries), trained, receiver, watched, meta):
             return _opened_ready(ready, what, queries)

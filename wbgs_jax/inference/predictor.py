@@ -89,6 +89,15 @@ def at_receiver(trained: T, receiver: Receiver, dataset: Dataset | None = None) 
     return dataclasses.replace(trained, field=field, params=params, **nothing)  # type: ignore[type-var]
 
 
+def at_receivers(trained: T, dataset: Dataset) -> T:
+    """Returns a trained field for all receivers of other data (`at_receiver`): as it is if it was trained at every one."""
+    own = trained.dataset()
+    for number in range(dataset.n_receivers):
+        if (elsewhere := at_receiver(trained, dataset.receiver(number), own)) is not trained:
+            return elsewhere
+    return trained
+
+
 def _same(a: Receiver, b: Receiver) -> bool:
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)
@@ -118,6 +127,14 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
     check_power(trained.field, dataset)
     plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
     return on_any_shape(_shared(_render_power, (trained.field, trained.params, plan)), ())
+
+
+def check_spectra(field: Field, dataset: Dataset) -> None:
+    """Raises a `UserError` where a field learned nothing of spectra."""
+    if dataset.kind == "power" and "paths" not in field.known():
+        raise UserError(
+            f"{dataset.name} holds received powers, from which the {field.name} field learned no spectra; ask for --what power"
+        )
 
 
 def check_power(field: Field, dataset: Dataset) -> None:

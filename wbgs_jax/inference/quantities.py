@@ -15,12 +15,13 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.confidence import PowerConfidence, expected_power
-from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, observe_queries
+from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, check_spectra, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
 from wbgs_jax.types import Query, Receiver, make_query
 
+SPECTRA = "spectra"
 OfArrivals = Callable[[channel.Arrivals, Receiver, Any], Any]
 """(arrivals of one link, receiver, frequency_hz) -> a quantity of it."""
 
@@ -59,7 +60,9 @@ def ask_channel(
 
 
 def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
-    """Raises a `UserError` where a field knows nothing of a quantity; spectra every field knows."""
+    """Raises a `UserError` where a field knows nothing of a quantity."""
+    if what == SPECTRA:
+        check_spectra(trained.field, dataset)
     if what not in CHANNEL:
         return
     enough = {"paths", OBSERVED.get(what, "paths")}
@@ -72,8 +75,8 @@ def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
 
 def known_quantities(trained: Trained, dataset: Dataset) -> list[str]:
     """Returns what a field can be asked for beside what follows from paths alone: spectra, and names of `OBSERVED`."""
-    found = ["spectra"]
-    for what in OBSERVED:
+    found = []
+    for what in (SPECTRA, *OBSERVED):
         with contextlib.suppress(UserError):
             check_known(what, trained, dataset)
             found.append(what)

@@ -7,6 +7,7 @@ from jaxtyping import Complex, Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile
+from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
 from wbgs_jax.interchange.ray_paths import RayPaths
 
 TEST_SHARE = 0.2
@@ -75,7 +76,8 @@ def scene_of_snapshots(
     test.
 
     Args:
-        snapshots: complex voltages of the elements; phases count between the elements of one snapshot.
+        snapshots: complex voltages of the elements; phases count between the elements of one snapshot, and powers between
+            snapshots. They need not be relative to what was transmitted: a common gain is learned.
         tx_positions: world frame, metres.
         frequencies_hz: hertz, ascending.
         rx_position: world frame, metres.
@@ -96,10 +98,11 @@ def scene_of_snapshots(
             f"the snapshots of {name} have shape {np.shape(snapshots)}; by transmitter, receiver, frequency and element it "
             f"must be {wanted}"
         )
-    if count < FEWEST:
-        raise UserError(f"{name} has {count} transmitters, and a training needs {FEWEST}")
+    transmitter = group_transmitters(tx_positions)  # what is measured twice at one place
+    if (places := len(np.unique(transmitter))) < FEWEST:
+        raise UserError(f"{name} has {places} transmitters, and a training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
-    split[np.random.default_rng(seed).permutation(count)[: max(round(TEST_SHARE * count), 1)]] = TEST
+    split[tx_disjoint_split(transmitter, TEST_SHARE, seed)[1]] = TEST
     known = faces is not None and vertices is not None
     return SceneFile(
         name=name,

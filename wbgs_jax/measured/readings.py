@@ -77,7 +77,7 @@ def _load_tables(folder: Path, height: float) -> Readings:
             f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} {len(receivers)} receivers"
         )
     if "id" in names:
-        powers = _in_order(powers, [entry[names.index("id")].lower() for entry in entries])
+        powers = _in_order(path, powers, [entry[names.index("id")].lower() for entry in entries])
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
@@ -86,10 +86,23 @@ def _load_tables(folder: Path, height: float) -> Readings:
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers)
 
 
-def _in_order(columns: list[str], ids: list[str]) -> list[str]:
-    """Returns columns in the order of the receivers whose ids they end in; as they are, where they do not."""
-    by_id = {column.rsplit("_", 1)[-1]: column for column in columns}
-    return [by_id[name] for name in ids] if sorted(by_id) == sorted(ids) else columns
+def _in_order(where: Path, columns: list[str], ids: list[str]) -> list[str]:
+    """Returns columns in the order of the receivers whose ids they end in; as they are, where none does.
+
+    Raises:
+        UserError: some of them do, and others do not.
+    """
+    by_id: dict[str, str] = {}
+    for name in sorted(ids, key=len, reverse=True):  # a_1 before 1
+        ending = [one for one in columns if one not in by_id.values() and (one == name or one.endswith(f"_{name}"))]
+        by_id |= {name: ending[0]} if len(ending) == 1 else {}
+    if by_id and len(by_id) < len(ids):
+        other = next(name for name in ids if name not in by_id)
+        raise UserError(
+            f"{where}: no column of powers, or more than one, ends in the receiver's id {other!r}, as others end in theirs; "
+            f"name the columns {', '.join('rssi_' + name for name in ids[:3])}, ..."
+        )
+    return [by_id[name] for name in ids] if by_id else columns
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:

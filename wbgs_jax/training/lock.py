@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,10 +31,12 @@ def locked(folder: Path) -> Iterator[None]:
         if fcntl is not None:
             try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+            except BlockingIOError:
                 stream.seek(0)
                 holder = stream.read(200).strip() or "another process"
                 raise Taken(f"{folder} is being trained by {holder}; wait for it, or choose another OUT") from None
+            except OSError:  # some clusters' file systems know no locks
+                warnings.warn(f"{folder} cannot be locked on its file system; train one run there at a time", stacklevel=3)
         stream.truncate(0)
         stream.write(f"process {os.getpid()}")
         stream.flush()

@@ -170,8 +170,8 @@ class Run:
         saved = checkpoint.checkpoint_steps(self.checkpoints)
         last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
         raise UserError(
-            f"the loss of step {self.step} or its gradient is not finite (spectra {self.numbers[batch].tolist()}); {last}. "
-            "Check these spectra, or start again with smaller learning rates"
+            f"the loss of step {self.step} or its gradient is not finite; {last}. Check spectra "
+            f"{self.numbers[batch].tolist()}, counted from 0, or start again with smaller learning rates"
         )
 
     def control(self, say: Say = silent) -> bool:

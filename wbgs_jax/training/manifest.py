@@ -8,10 +8,9 @@ from typing import Any
 
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import provenance
-from wbgs_jax.training.run_folder import TrainedField
+from wbgs_jax.training.run_folder import MANIFEST, TrainedField
 
 FORMAT = 1
-FILE = "manifest.json"
 PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax")
 
 
@@ -24,7 +23,7 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
         report: of an evaluation (`evaluation.score.evaluate`), whose scores it is to say; those of earlier ones stay, as long
             as the run has not gone on.
     """
-    path = folder / FILE
+    path = folder / MANIFEST
     known: dict[str, Any] = {}
     if path.exists():
         before = read_json(path)

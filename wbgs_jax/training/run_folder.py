@@ -6,6 +6,7 @@ neighbours.npz   confidence.npz   power_confidence.npz
 
 import dataclasses
 import os
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ from wbgs_jax.training import checkpoint
 
 FIRST_PRESET = "cpu"
 
+MANIFEST = "manifest.json"
+"""Written last, when a training is finished."""
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -64,10 +68,14 @@ class RunConfig:
     neighbours: bool = True
     """Whether known spectra are asked beside the field, where that gains on validation."""
 
+    def other_data(self, source: str) -> Dataset:
+        """Returns data of any name, read as those that the run was trained on."""
+        frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
+        return load_dataset(source, frequency_hz=frequency, seed=self.seed)
+
     def dataset(self) -> Dataset:
         """Returns the data that the run was trained on."""
-        frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
-        dataset = load_dataset(self.source, frequency_hz=frequency, seed=self.seed)
+        dataset = self.other_data(self.source)
         if self.receiver is not None:
             dataset = select_receivers(dataset, [self.receiver])
         if self.test_box:
@@ -173,6 +181,18 @@ def difference(a: RunConfig, b: RunConfig) -> str:
 
     left, right = flat(a), flat(b)
     return next((f"{key}: {left[key]}, not {right.get(key)}" for key in left if left[key] != right.get(key)), "")
+
+
+def open_run(folder: Path) -> TrainedField:
+    """Returns what `load_trained` does, for a command, with a note if the training is not finished."""
+    trained = load_trained(folder)
+    if not (folder / MANIFEST).exists():
+        warnings.warn(
+            f"the training of {folder} is not finished (step {trained.step} is saved): its answers know neither neighbours "
+            "nor how sure they are; train on with the same command and --resume",
+            stacklevel=2,
+        )
+    return trained
 
 
 def load_trained(folder: Path | str) -> TrainedField:

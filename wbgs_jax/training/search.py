@@ -10,12 +10,14 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
+from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.absent import search_absent
 from wbgs_jax.training.antennas import search_antennas
 from wbgs_jax.training.clutter import search_clutter
@@ -30,20 +32,34 @@ from wbgs_jax.training.tuning import search_tuning
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
 """How far a gain may be from the one before, and the steps in which it is tried."""
+ROOMS_DB = -40.0, 10.0
+"""What rooms do to received powers beyond free space, in the median. Snapshots whose powers are not among these are in a unit
+of their own, as measured voltages are; what is less far off, gradients find."""
 SWEEPS = 2
 """Times that antennas are searched anew after materials are named, at most."""
 
 
-def search_gain(params: Any, score: Scores) -> tuple[Any, float]:
-    """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB): nobody
-    may have said what was transmitted."""
-    gain = 0.0
+def search_gain(params: Any, score: Scores, gain: float = 0.0) -> tuple[Any, float]:
+    """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB), near one
+    that is given: nobody may have said what was transmitted."""
     for reach, step in GAINS_DB:
         tried = gain + np.arange(-reach, reach + step, step)
         candidates = [dataclasses.replace(params, log_gain=jnp.asarray(db * np.log(10) / 20, jnp.float32)) for db in tried]
         best = int(np.argmin(score(candidates).mean(1)))
         params, gain = candidates[best], float(tried[best])
     return params, gain
+
+
+def unusual_level(told: Told) -> float:
+    """Returns the median of received powers beyond free space (dB), if no room explains it; else zero."""
+    assert told.data.snapshots is not None, "asked of snapshots"
+    snapshots, links = jax.tree.map(lambda leaf: leaf[told.spectra], (told.data.snapshots, told.data.links))
+    rx = told.data.receivers.position[links.receiver_index]
+    power, query = received_power_db(snapshots), links.query
+    beyond = np.asarray(beyond_free_space_db(power, query.tx_position, rx, query.frequency_hz))
+    heard = np.asarray(snapshots).any(-1)
+    level = float(np.median(beyond[heard])) if heard.any() else 0.0
+    return 0.0 if ROOMS_DB[0] <= level <= ROOMS_DB[1] else level
 
 
 @dataclass(frozen=True)
@@ -124,6 +140,9 @@ class Search:
             params, field = self._clutter(params, told, report, rng, say)
             thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
             report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # named again since then
+        if data.snapshots is not None and (level := unusual_level(told)):
+            scores = told.scores(config.placement_spectra, "powers")
+            params, report["gain_db"] = search_gain(params, scores, level)
         return Edit(params, (), None, report, field, cache)
 
     def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
