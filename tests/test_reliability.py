@@ -1,6 +1,8 @@
 """What goes wrong outside of the program: one line for people, and nothing that is silently something else."""
 
 import dataclasses
+import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -115,6 +117,15 @@ def _hold(folder, ready):
     with locked(folder):
         ready.set()
         time.sleep(60)
+
+
+def test_a_file_system_without_locks_is_no_reason_not_to_train(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.warns(UserWarning, match="cannot be locked on its file system"), locked(tmp_path):
+        assert (tmp_path / FILE).exists()
 
 
 @pytest.mark.heavy

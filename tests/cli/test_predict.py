@@ -1,5 +1,6 @@
 """`wbgs-jax predict`: spectra and pictures, exported fields, and what it says when something is wrong."""
 
+import dataclasses
 import json
 from typing import ClassVar
 
@@ -13,6 +14,7 @@ from synthetic import tiny_scene
 from toys import RippleConfig, RippleField, registered, toy_settings
 from untrained import SETTINGS, State, make_coherent_run, make_run
 
+from wbgs_jax import map as map_command
 from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene_file import save_scene
@@ -123,13 +125,36 @@ class HearingField(RippleField):
         return Observation(super().render(params, plan, query).pas, query.tx_position[:, :1] * jnp.ones(16) * 1j, power_db)
 
 
-def make_toy_run(folder, field):
+def make_toy_run(folder, field, scene=None):
     """As `untrained.make_run`, of a toy field."""
-    save_scene(folder.with_suffix(".npz"), tiny_scene())
+    save_scene(folder.with_suffix(".npz"), scene or tiny_scene())
     write_config(folder, RunConfig(str(folder.with_suffix(".npz")), field.name, "smoke", 0, None, toy_settings()))
     state = State(field.init(jax.random.key(0)))
     checkpoint.save(folder / "checkpoints", 3, state, field, {"limits": None, "seconds": 1.0}, keep=1)
     return folder
+
+
+def test_the_trained_band_can_be_asked_for_wherever_it_lies(tmp_path):
+    """Tags answer at 915 MHz."""
+    with registered(HearingField):
+        scene = dataclasses.replace(tiny_scene(), frequencies_hz=np.array([0.915e9, 2e9, 5e9]))
+        run = make_toy_run(tmp_path / "tags", HearingField(RippleConfig()), scene)
+        answered = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.915, "--out", tmp_path / "pas.npz")
+        assert answered.code == 0 and not [line for line in answered.lines if line.startswith("warning")], answered.err
+        refused = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.9, "--out", tmp_path / "no.npz")
+        assert refused.code == 2 and "of this run answers from 0.915 GHz on, not at 0.9 GHz" in refused.err
+
+
+def test_where_powers_alone_were_learned_there_are_no_spectra(tmp_path):
+    with registered(HearingField):
+        run = make_toy_run(tmp_path / "powers", HearingField(RippleConfig()), tiny_scene(kind="power"))
+        for wanted in (["--out", tmp_path / "pas.npz", *ASK], ["--export", tmp_path / "field.zip"]):
+            refused = predict("--run", run, *wanted)
+            assert refused.code == 2 and "from which the hearing field learned no spectra; ask for --what power" in refused.err
+        refused = call(map_command.main, "--run", run, "--ghz", 28, "--what", "best-beam", "--out", tmp_path / "beams.npz")
+        assert refused.code == 2 and "learned no spectra" in refused.err
+        assert predict("--run", run, *ASK, "--what", "power", "--out", tmp_path / "power.npz").code == 0
+        assert not [name for name in ("pas.npz", "field.zip", "beams.npz") if (tmp_path / name).exists()]
 
 
 def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):

@@ -20,6 +20,7 @@ from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.beams import plane_normal
 from wbgs_jax.evaluation.power import power_figures
+from wbgs_jax.evaluation.report import closing_lines, table
 from wbgs_jax.evaluation.score import evaluate, held_out, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
@@ -136,6 +137,7 @@ def test_data_to_test_with_alone_have_no_baselines(knowing, dataset):
         knowing, dataclasses.replace(dataset, train=everything[:0], validation=everything[:0], test=everything)
     )
     assert report["n"] == len(dataset) and report["baselines"] == {}
+    assert table(report).row_count and closing_lines(report, 8)
 
 
 def test_snapshots_are_scored_by_their_correlation_and_their_power(rng):
