@@ -92,7 +92,8 @@ def _assemble(job: jobs.Job, folder: Path, backend: str) -> SceneFile:
     scene = SceneFile(
         name=spec.name, snapshots=found["snapshots"][:, None], tx_positions=tx, frequencies_hz=np.array(job.frequencies_hz),
         rx_position=np.array([spec.rx_position]), rx_orientation=np.array([spec.rx_orientation]),
-        element_positions=job.array.element_positions()[None], element_unit=job.array.unit, element_pattern=job.array.pattern,
+        element_positions=job.array.element_positions()[None], element_unit=job.array.unit,
+        element_pattern=job.array.named_pattern(),
         split=draw_split(len(tx)),
         vertices=mesh["vertices"], faces=mesh["faces"], face_part=mesh["face_part"], meta=_provenance(job, backend),
     )  # fmt: skip

@@ -78,6 +78,11 @@ class ArraySettings:
     half-wavelength dipole."""
     polarization: Literal["V", "H"] = "V"
 
+    def named_pattern(self) -> str:
+        """Returns the pattern as scene files name it, which is that of vertical elements; of others they say nothing, and
+        fields look for what explains the spectra."""
+        return self.pattern if self.polarization == "V" else ""
+
     def element_positions(self) -> Float[np.ndarray, "elements 3"]:
         """Returns the local positions in `unit`, centred on the origin.
 

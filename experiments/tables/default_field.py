@@ -3,6 +3,7 @@
 They are no jobs of the runner but files that `wbgs-jax eval --results experiments/results` wrote, each with its command.
 """
 
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,10 @@ def _report(folder: Path, name: str) -> dict[str, Any] | None:
     return read_json(path) if path.exists() else None
 
 
-def median_ssim(folder: Path, scene: str) -> float | None:
-    """Returns the median SSIM of a released scene; None where it was not run."""
+def average_of_medians(folder: Path, scene: str) -> float | None:
+    """Returns the average over frequencies of the median SSIM of a released scene; None where it was not run."""
     report = _report(folder, f"scene{scene}")
-    return None if report is None else float(report["median_ssim"])
+    return None if report is None else statistics.fmean(row["median_ssim"] for row in report["per_frequency"])
 
 
 def _figures(report: dict[str, Any] | None) -> list[str]:

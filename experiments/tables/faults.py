@@ -13,8 +13,8 @@ from experiments.series import robustness
 
 PANELS = {
     "mesh position error (mm)": {"0": "", "1": "mesh_1mm", "3": "mesh_3mm", "10": "mesh_1cm", "30": "mesh_3cm"},
-    "furniture missing from the mesh (%)": {"0": "", "10": "missing_10", "30": "missing_30"},
-    "furniture only in the mesh (%)": {"0": "", "10": "added_10", "30": "added_30"},
+    "small pieces missing from the mesh (%)": {"0": "", "10": "missing_10", "30": "missing_30"},
+    "small pieces only in the mesh (%)": {"0": "", "10": "added_10", "30": "added_30"},
     "snapshot SNR (dB)": {"no noise": "", "30": "snr_30", "20": "snr_20", "10": "snr_10"},
     "training transmitters": {"all": "", "100": "tx_100", "20": "tx_20"},
 }
@@ -41,7 +41,7 @@ def draw(results: Results) -> Figure:
     return figure
 
 
-def _known(results: Results, scene: str, variants: list[str]) -> dict[str, list[list[float]]]:
+def _known(results: Results, scene: str, variants: list[str]) -> dict[str, list[robustness.BySeed]]:
     """Returns the scores of every field: of every variant those of the seeds that were run."""
     found = [robustness.scores(results, scene, variant) for variant in variants]
     return {
@@ -51,7 +51,7 @@ def _known(results: Results, scene: str, variants: list[str]) -> dict[str, list[
     }
 
 
-def _line(axis: Axes, known: list[list[float]], **style: Any) -> None:
+def _line(axis: Axes, known: list[robustness.BySeed], **style: Any) -> None:
     """Draws medians over seeds; what was not run is a gap."""
-    medians = [statistics.median(one) if one else float("nan") for one in known]
+    medians = [statistics.median(one.values()) if one else float("nan") for one in known]
     axis.plot(range(len(medians)), medians, marker="o", ms=3.5, lw=1.5, **style)

@@ -23,7 +23,7 @@ def summary(results: Results) -> dict[str, Any]:
         name: _average([_level(headline.found(results, scene, *model)) for scene in SCENES]) for name, model in models.items()
     }
     known["coherent"] = _average([_level(scores(results, table1.jobs_of(scene, "wave"), GHZ_10)) for scene in SCENES])
-    known["default"] = _average([default_field.median_ssim(results.folder, scene) for scene in SCENES])
+    known["default"] = _average([default_field.average_of_medians(results.folder, scene) for scene in SCENES])
     known["ceiling"] = _average([ceiling(scene, GHZ_10) for scene in SCENES])
     ours, theirs = known["wideband"], known["wrfgs"]
     known["gain_percent"] = None if ours is None or theirs is None else 100 * (ours / theirs - 1)

@@ -1,6 +1,7 @@
 """Meshes become facets, bodies and edges: nothing is lost, nothing is doubled."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -160,3 +161,51 @@ def test_corners_that_hardly_differ_are_one(shift):
     )
     facets = facets_of(joined)
     assert len(facets.body) == 1 and jnp.isclose(areas(facets)[0], 2)
+
+
+def flipped(faces, which):
+    faces = np.array(faces)
+    faces[which] = faces[which][:, ::-1]
+    return faces
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        (lambda faces, rng: np.concatenate([faces, faces]), "is there twice"),
+        (lambda faces, rng: np.concatenate([faces, faces[:, ::-1]])[rng.permutation(2 * len(faces))], "is there twice"),
+        (lambda faces, rng: flipped(faces, rng.permutation(len(faces))[: rng.integers(1, len(faces))]), "face both ways"),
+        (lambda faces, rng: flipped(faces, np.arange(0, len(faces), 2)), "face both ways"),
+    ],
+)
+def test_careless_exports_are_mended(wrong, said, rng):
+    """A table's leg is a box with six facets and twelve edges, however often and whichever way round its triangles are."""
+    right = mesh_of(box((0, 0, 0), (1, 2, 3)), box((5, 0, 0), (6, 2, 3)))
+    expected, count = facets_from_mesh(right), len(right.faces) // 2
+    first = wrong(np.asarray(right.faces[:count]), rng)
+    faces = np.concatenate([first, np.asarray(right.faces[count:])])
+    part = np.repeat([0, 1], [len(first), count])
+    mesh = dataclasses.replace(right, faces=jnp.asarray(faces), part=jnp.asarray(part), material=jnp.asarray(part))
+    with pytest.warns(UserWarning, match=said):
+        facets = facets_from_mesh(mesh)
+    assert len(facets.offset) == len(expected.offset) == 12
+    assert len(edges_of_facets(facets).length) == 24
+    planes = [np.round(np.column_stack([f.normal, f.offset]), 6) for f in (facets, expected)]
+    np.testing.assert_array_equal(*(np.unique(p + 0.0, axis=0) for p in planes))
+
+
+def test_bodies_of_one_part_that_touch_keep_both_faces():
+    """Two blocks, one on the other: where they touch there are two slabs to pass."""
+    lower, upper = box((0, 0, 0), (1, 1, 1)), box((0, 0, 1), (1, 1, 2))
+    together = trimesh.util.concatenate([lower, upper])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert areas(facets_from_mesh(mesh_of(together))).sum() == pytest.approx(12)
+
+
+def test_what_hits_a_seam_hits_one_of_its_facets():
+    """Two panels meet at y = 0, and so do what stands on either side."""
+    sheets = [rectangle((0, -2, 0), (0, 2, 0), (0, 0, 3)), rectangle((0, 0, 0), (0, 2, 0), (0, 0, 3))]
+    outline = outline_of(facets_from_mesh(mesh_of(*sheets)))
+    inside = (outline.inward @ np.array([0.0, 0.0, 1.3]) >= outline.offset).all(-1)
+    assert inside.sum() == 1

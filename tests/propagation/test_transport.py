@@ -23,7 +23,7 @@ from rooms import (
 )
 
 from wbgs_jax.propagation.slab import Slabs, complex_permittivity, slab_coefficients
-from wbgs_jax.propagation.transport import element_voltages, snapshots_from_paths
+from wbgs_jax.propagation.transport import _across, element_voltages, snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import planar_array, snapshot_to_pas
 from wbgs_jax.radio.patterns import Antenna, antenna_field, element_gain
@@ -267,3 +267,28 @@ def test_curved_waves_are_those_of_a_point_source_and_plane_ones_their_limit(rng
         np.testing.assert_allclose(curved, exact, atol=1e-5 * np.abs(exact).max())
         error = np.abs(plane - exact).max() / np.abs(exact).max()
         assert error > 0.2 if far < 10 else error < 2e-3
+
+
+def test_gradients_on_the_line_of_an_edge_are_finite(rng):
+    """Above the corner of a table at round coordinates; nothing is diffracted along its edge."""
+    rx, frequency = (3.0, 0.4, 1.3), jnp.float32(5e9)
+    search, receiver = search_of([box((0, 0, 0), (1, 1, 1))], rx), make_receiver(rx)
+
+    @jax.jit
+    @jax.value_and_grad
+    def power(tx):
+        found = arrivals_of(search, trace(search, tx, (8, 8), (32, 32)), slabs_of(search, frequency), receiver, frequency)
+        return channel.received_power_db(snapshots_from_paths(found, receiver, frequency))
+
+    for place in ([1.0, 1.0, 1.5], [0.0, 1.0, 2.0], [1.0, 2.0, 1.0], rng.uniform(1.5, 2.5, 3)):
+        value, slope = power(jnp.asarray(place, jnp.float32))
+        assert np.isfinite(value) and np.isfinite(slope).all() and slope.any(), place
+
+
+def test_straight_through_a_plate_of_any_direction(rng):
+    """Also where the normal is the same in x, y and z, in which no axis is any other."""
+    for normal in (np.ones(3), rng.normal(size=3), np.eye(3)[rng.integers(3)]):
+        normal = jnp.asarray(normal / np.linalg.norm(normal), jnp.float32)[None]
+        across = _across(normal, normal)[0]
+        assert float(jnp.linalg.norm(across)) == pytest.approx(1, abs=1e-5)
+        assert float(across @ normal[0]) == pytest.approx(0, abs=1e-5)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.propagation.repair import repaired
 from wbgs_jax.types import Mesh
 
 AnyArray = Array | np.ndarray
@@ -61,11 +62,14 @@ class Outline:
 
 
 def facets_from_mesh(mesh: Mesh) -> Facets:
-    """Returns the facets of a mesh as float64 and int32 NumPy arrays, the largest first; a mesh without any surface is a
-    `UserError`."""
+    """Returns the facets of a mesh, which is `repaired` first, as float64 and int32 NumPy arrays, the largest first; a mesh
+    without any surface is a `UserError`."""
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
-    triangles, material = index[np.asarray(mesh.faces)], np.asarray(mesh.material)
-    body = _bodies(triangles, np.asarray(mesh.part), material)
+    triangles, material, part = index[np.asarray(mesh.faces)], np.asarray(mesh.material), np.asarray(mesh.part)
+    _, piece = np.unique(np.column_stack([part, material]), axis=0, return_inverse=True)
+    triangles, kept = repaired(points, triangles, piece.reshape(-1))
+    material, part = material[kept], part[kept]
+    body = _bodies(triangles, part, material)
     mover = _movers(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
@@ -115,13 +119,15 @@ def remaining(facets: Facets, movers: Int[np.ndarray, " k"]) -> Facets:
 
 
 def outline_of(facets: Facets) -> Outline:
-    """Returns the sides of all facets (float64)."""
+    """Returns the sides of all facets (float64). Where two facets meet, one of them ends `WELD` before the other begins: what
+    hits the seam, as in rooms of round numbers, hits one of them."""
     corners = np.asarray(facets.corners, np.float64)
     along = np.roll(corners, -1, 1) - corners
     inward = np.cross(np.asarray(facets.normal)[:, None], along)
     length = np.linalg.norm(inward, axis=-1, keepdims=True)
     inward = np.where(length > WELD, inward / np.maximum(length, WELD), 0)
-    return Outline(inward, np.sum(inward * corners, -1))
+    first = np.take_along_axis(inward, np.argmax(np.abs(inward) > FLAT, -1)[..., None], -1)[..., 0]
+    return Outline(inward, np.sum(inward * corners, -1) + WELD * (first < 0))
 
 
 def areas(facets: Facets) -> Float[np.ndarray, " f"]:

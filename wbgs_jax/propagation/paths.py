@@ -182,6 +182,11 @@ def _on_mirror(start, goal, normal, offset):
     return start + jnp.clip(share, 0, 1)[..., None] * (goal - start), valid
 
 
+def _length(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+    """Returns the lengths of vectors, `NEAR` at least: that of none has no gradient, and what is nearer is no candidate."""
+    return jnp.sqrt(jnp.maximum(jnp.sum(vector**2, -1), NEAR**2))
+
+
 def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
     """Returns whether points of a facet's plane lie inside its sides."""
     return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
@@ -193,7 +198,7 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
 
     def place(p):
         t = jnp.sum((p - start) * along, -1)
-        return t, jnp.linalg.norm(p - start - t[..., None] * along, axis=-1)
+        return t, _length(p - start - t[..., None] * along)
 
     (t_in, r_in), (t_out, r_out) = place(source), place(goal)
     t = t_in + (t_out - t_in) * r_in / jnp.maximum(r_in + r_out, NEAR)
@@ -202,7 +207,7 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     valid = (t > 0) & (t < edges.length[edge]) & (jnp.minimum(r_in, r_out) > NEAR)
     for p in (source, goal):
         valid &= jnp.maximum(jnp.sum((p - point) * normal_0, -1), jnp.sum((p - point) * normal_n, -1)) > NEAR
-    before, after = (jnp.linalg.norm(p - point, axis=-1) for p in (source, goal))
+    before, after = (_length(p - point) for p in (source, goal))
     flat_in, flat_out = source - point, goal - point
     flat_in -= jnp.sum(flat_in * along, -1, keepdims=True) * along
     flat_out -= jnp.sum(flat_out * along, -1, keepdims=True) * along

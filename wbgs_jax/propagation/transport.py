@@ -249,7 +249,8 @@ def _through_slabs(
 def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Returns the unit vector across the plane of incidence; any one at normal incidence."""
     s = jnp.cross(along, normal)
-    return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, normal[..., jnp.array([1, 2, 0])]), s))
+    other = jnp.eye(3, dtype=normal.dtype)[jnp.argmin(jnp.abs(normal), -1)]  # the axis that is least along the normal
+    return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, other), s))
 
 
 def _over_edges(
