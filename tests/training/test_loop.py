@@ -15,9 +15,10 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
+from wbgs_jax.fields import get_field
 from wbgs_jax.fields.wideband import WidebandField
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.loop import Interrupted, Run, train
+from wbgs_jax.training.loop import Interrupted, Run, check_data, train
 
 STEPS = 8
 PLAIN = ("ripple", toy_settings())
@@ -253,3 +254,11 @@ def test_a_curriculum_starts_with_low_frequencies_and_ends_with_all(dataset, tmp
     assert highest == [1e9, 10e9, 10e9, 94e9, 94e9]
     np.testing.assert_array_equal(run.numbers[run.pool(0.5)], dataset.train)
     assert set(run.batches(0, 20).ravel()) <= set(run.pool(0.0))
+
+
+def test_coordinates_of_a_map_are_noted():
+    dataset = tiny_dataset()
+    check_data(dataset, get_field("wideband"))
+    far = dataclasses.replace(dataset, tx_positions=dataset.tx_positions + [5e3, 0, 0])
+    with pytest.warns(UserWarning, match="holds coordinates of 5,.* m, where single precision is coarse"):
+        check_data(far, get_field("wideband"))

@@ -44,6 +44,9 @@ CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "sea
 CALIBRATED, BLOCK = 720, 16
 """Validation links that a field is calibrated by, at most, and how many at a time."""
 
+FAR_M = 500.0
+"""From the origin: there single precision rounds positions to 30 micrometres, a hundredth of a wavelength at 100 GHz."""
+
 
 def make_control(name: str, settings: Settings) -> Control | None:
     """Returns the host control that a field asks for by this name; None where the settings switch it off."""
@@ -263,9 +266,17 @@ def _shapes(tree: Any) -> list[tuple[int, ...]]:
 
 
 def check_data(dataset: Dataset, field: type[Field]) -> None:
-    """Raises a `UserError` for data that a field cannot be trained on, before any work is done."""
+    """Raises a `UserError` for data that a field cannot be trained on, before any work is done, and warns of coordinates that
+    are too large."""
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
+    if far > FAR_M:
+        warnings.warn(
+            f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from mesh, "
+            "transmitters and receivers",
+            stacklevel=2,
+        )
     if dataset.kind == "power" and "power" not in field.gives:
         able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)
         raise UserError(
