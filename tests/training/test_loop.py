@@ -259,6 +259,6 @@ def test_a_curriculum_starts_with_low_frequencies_and_ends_with_all(dataset, tmp
 def test_coordinates_of_a_map_are_noted():
     dataset = tiny_dataset()
     check_data(dataset, get_field("wideband"))
-    far = dataclasses.replace(dataset, tx_positions=dataset.tx_positions + [5e3, 0, 0])
+    far = dataclasses.replace(dataset, tx_positions=dataset.tx_positions + np.array([5e3, 0, 0]))
     with pytest.warns(UserWarning, match="holds coordinates of 5,.* m, where single precision is coarse"):
         check_data(far, get_field("wideband"))

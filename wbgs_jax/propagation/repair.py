@@ -5,10 +5,12 @@ ways is none. Runs on the host.
 """
 
 import warnings
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 
 def repaired(
@@ -23,14 +25,13 @@ def repaired(
     """
     kept = _once(triangles, part)
     triangles, part = triangles[kept].copy(), part[kept]
-    turned = _both_ways(triangles, part)
-    for number in turned:
-        own = np.flatnonzero(part == number)
-        mesh = trimesh.Trimesh(points, triangles[own], process=False)
-        trimesh.repair.fix_normals(mesh, multibody=True)
-        triangles[own] = mesh.faces
-    if len(turned):
-        warnings.warn(f"triangles of {len(turned)} parts of the mesh face both ways; they are taken to face one", stacklevel=4)
+    neighbours = _neighbours(triangles, part)
+    wrong = np.unique(part[neighbours.first[neighbours.against]])
+    if len(wrong):
+        own = np.isin(part, wrong)
+        turned = _turned(points, triangles, neighbours) & own
+        triangles[turned] = triangles[turned, ::-1]
+        warnings.warn(f"triangles of {len(wrong)} parts of the mesh face both ways; they are taken to face one", stacklevel=4)
     return triangles, kept
 
 
@@ -48,12 +49,51 @@ def _once(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int
     return np.union1d(np.flatnonzero(single[part]), first)
 
 
-def _both_ways(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int[np.ndarray, " k"]:
-    """Returns the parts with two neighbouring triangles that go along their common side in the same direction."""
-    sides, owner = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), np.repeat(part, 3)
-    which = _row_numbers(owner, *np.sort(sides, 1).T)
-    along = np.bincount(which, np.sign(sides[:, 1] - sides[:, 0]))
-    return np.unique(owner[((np.bincount(which) == 2) & (np.abs(along) == 2))[which]])
+class _Neighbours(NamedTuple):
+    """Pairs of triangles with a side that no other triangle of their part has."""
+
+    first: Int[np.ndarray, " n"]
+    second: Int[np.ndarray, " n"]
+    against: Bool[np.ndarray, " n"]
+    """Whether both go along it in the same direction: they face different ways."""
+    closed: Bool[np.ndarray, " t"]
+    """Of every triangle, whether all of its sides are such ones."""
+
+
+def _neighbours(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> _Neighbours:
+    sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    which = _row_numbers(np.repeat(part, 3), *np.sort(sides, 1).T)
+    count, order = np.bincount(which), np.argsort(which, kind="stable")
+    start = (np.cumsum(count) - count)[count == 2]
+    one, other = order[start], order[start + 1]
+    along = sides[:, 1] > sides[:, 0]
+    closed = (count == 2)[which].reshape(-1, 3).all(1)
+    apart = one // 3 != other // 3  # a triangle without an area may be its own neighbour
+    return _Neighbours(one[apart] // 3, other[apart] // 3, (along[one] == along[other])[apart], closed)
+
+
+def _turned(
+    points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], neighbours: _Neighbours
+) -> Bool[np.ndarray, " t"]:
+    """Returns which triangles to turn round, so that all face as their neighbours do, and outwards where bodies are closed."""
+    count = len(triangles)
+    keys, first = np.unique(np.minimum(*neighbours[:2]) * count + np.maximum(*neighbours[:2]), return_index=True)
+    against = neighbours.against[first]
+    ends = neighbours.first[first].astype(np.int32), neighbours.second[first].astype(np.int32)
+    graph = coo_array((np.ones(len(first), bool), ends), shape=(count, count)).tocsr()
+    bodies, body = connected_components(graph, directed=False)
+    turned = np.zeros(count, bool)
+    for start in np.unique(body, return_index=True)[1]:
+        order, before = breadth_first_order(graph, int(start), directed=False)
+        later, earlier = order[1:].astype(np.int64), before[order[1:]].astype(np.int64)
+        differ = against[np.searchsorted(keys, np.minimum(later, earlier) * count + np.maximum(later, earlier))]
+        for triangle, parent, flip in zip(later, earlier, differ, strict=True):
+            turned[triangle] = turned[parent] ^ flip
+    a, b, c = (points - points.mean(0))[triangles].swapaxes(0, 1)
+    volume = np.where(turned, -1, 1) * np.sum(a * np.cross(b, c), -1)
+    inward = np.bincount(body, volume, bodies) < 0
+    inward &= np.bincount(body, ~neighbours.closed, bodies) == 0
+    return turned ^ inward[body]
 
 
 def _row_numbers(*columns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

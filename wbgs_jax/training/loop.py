@@ -273,8 +273,8 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
     far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
     if far > FAR_M:
         warnings.warn(
-            f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from mesh, "
-            "transmitters and receivers",
+            f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
+            "mesh, transmitters and receivers",
             stacklevel=2,
         )
     if dataset.kind == "power" and "power" not in field.gives:
