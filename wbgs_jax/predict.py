@@ -165,11 +165,11 @@ def _load(run: Path) -> tuple[Any, list[Path]]:
 
 def _export(command: Command) -> None:
     from wbgs_jax.inference.export import export_field
-    from wbgs_jax.inference.quantities import SPECTRA, check_known
+    from wbgs_jax.inference.quantities import check_known
 
     assert command.export is not None
     trained = _load(command.run)[0]
-    check_known(SPECTRA, trained, trained.dataset())
+    check_known("spectra", trained, trained.dataset())
     export_field(trained, command.export)
     say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
 

@@ -109,8 +109,7 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
     heard = truth.any(-1)
     if not heard.any():
         return {}
-    a, b = jnp.asarray(truth), jnp.asarray(predicted)
-    a, b = a[heard], b[heard]
+    a, b = (jnp.asarray(snapshots[heard]) for snapshots in (truth, predicted))
     error = jnp.abs(channel.received_power_db(b) - channel.received_power_db(a))
     return {
         "snapshot_correlation": float(jnp.median(channel.correlation(a, b))),

@@ -15,7 +15,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import field_names, get_field
-from wbgs_jax.inference.bounds import Bounds, frequencies, link_words, point_words
+from wbgs_jax.inference.bounds import ROUNDED, Bounds, frequencies, link_words, point_words
 from wbgs_jax.inference.predictor import Trained, trained_band
 from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Receiver
 
@@ -58,12 +58,12 @@ def lowest_answered(trained: Trained, dataset: Dataset) -> float:
     hold below, too."""
     if "paths" in trained.field.known():
         return LOWEST_OF_PATHS_HZ
-    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
+    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0] * (1 - ROUNDED))
 
 
 def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below what it answers."""
-    if lowest_hz < (lowest := lowest_answered(trained, dataset)) * (1 - 1e-6):
+    if lowest_hz < (lowest := lowest_answered(trained, dataset)):
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
         raise UserError(
             f"the {trained.field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at "

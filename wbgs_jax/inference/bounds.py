@@ -8,6 +8,9 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
 
+ROUNDED = 1e-6
+"""By what share a frequency that is asked for in gigahertz may miss that of the data."""
+
 
 class Bounds(NamedTuple):
     """What a field knows by training."""
@@ -42,7 +45,7 @@ class Bounds(NamedTuple):
             if ((place < low) | (place > high)).any()
         ]
         for f in frequencies_hz:
-            if band[0] * (1 - 1e-6) <= f <= band[1] * (1 + 1e-6):
+            if band[0] * (1 - ROUNDED) <= f <= band[1] * (1 + ROUNDED):
                 continue
             if f < MIN_FREQUENCY_HZ:
                 lines.append(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.inference.predictor import Trained, observe_queries
-from wbgs_jax.inference.quantities import SPECTRA, ask_channel, check_known
+from wbgs_jax.inference.quantities import ask_channel, check_known
 from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.radio.codebook import best_beams, codebook
 from wbgs_jax.radio.geometry import direction_to_angles
@@ -65,7 +65,7 @@ def ask_plane(
         UserError: the field knows nothing of it.
     """
     if what == BEST_BEAM:
-        check_known(SPECTRA, trained, dataset)
+        check_known("spectra", trained, dataset)
     places, parts = plane.positions(), []
     for some in np.array_split(places, pieces(plane, frequencies_hz)):
         if what == BEST_BEAM:

@@ -21,7 +21,6 @@ from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
 from wbgs_jax.types import Query, Receiver, make_query
 
-SPECTRA = "spectra"
 OfArrivals = Callable[[channel.Arrivals, Receiver, Any], Any]
 """(arrivals of one link, receiver, frequency_hz) -> a quantity of it."""
 
@@ -61,7 +60,7 @@ def ask_channel(
 
 def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
     """Raises a `UserError` where a field knows nothing of a quantity."""
-    if what == SPECTRA:
+    if what == "spectra":
         check_spectra(trained.field, dataset)
     if what not in CHANNEL:
         return
@@ -76,7 +75,7 @@ def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
 def known_quantities(trained: Trained, dataset: Dataset) -> list[str]:
     """Returns what a field can be asked for beside what follows from paths alone: spectra, and names of `OBSERVED`."""
     found = []
-    for what in (SPECTRA, *OBSERVED):
+    for what in ("spectra", *OBSERVED):
         with contextlib.suppress(UserError):
             check_known(what, trained, dataset)
             found.append(what)

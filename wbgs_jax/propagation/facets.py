@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.propagation.repair import repaired
+from wbgs_jax.propagation.triangles import components, names, sides
 from wbgs_jax.types import Mesh
 
 AnyArray = Array | np.ndarray
@@ -65,11 +64,12 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     """Returns the facets of a mesh, which is `repaired` first, as float64 and int32 NumPy arrays, the largest first; a mesh
     without any surface is a `UserError`."""
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
-    triangles, material, part = index[np.asarray(mesh.faces)], np.asarray(mesh.material), np.asarray(mesh.part)
-    _, piece = np.unique(np.column_stack([part, material]), axis=0, return_inverse=True)
-    triangles, kept = repaired(points, triangles, piece.reshape(-1))
-    material, part = material[kept], part[kept]
-    body = _bodies(triangles, part, material)
+    part_and_material = np.column_stack([np.asarray(mesh.part), np.asarray(mesh.material)])
+    pieces, piece = np.unique(part_and_material, axis=0, return_inverse=True)
+    triangles, kept = repaired(points, index[np.asarray(mesh.faces)], piece.reshape(-1))
+    piece = piece.reshape(-1)[kept]
+    material = pieces[piece, 1]
+    body = _bodies(triangles, piece, pieces[:, 1])
     mover = _movers(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
@@ -139,46 +139,27 @@ def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"],
     """Returns the corners without duplicates, and the new index of every vertex."""
     different, which = np.unique(vertices, axis=0, return_inverse=True)  # at once: pairs of equal ones may be many
     pairs = cKDTree(different).query_pairs(WELD, output_type="ndarray")
-    index = _components(len(different), pairs[:, 0], pairs[:, 1])[which.reshape(-1)]
+    index = components(len(different), pairs[:, 0], pairs[:, 1])[which.reshape(-1)]
     _, first = np.unique(index, return_index=True)
     return vertices[first], index
 
 
-def _components(count: int, first: Int[np.ndarray, " n"], second: Int[np.ndarray, " n"]) -> Int[np.ndarray, " nodes"]:
-    """Returns which connected component each of `count` nodes is in; components are numbered by their first nodes."""
-    ends = first.astype(np.int32), second.astype(np.int32)  # wider indices are not for every SciPy's graphs
-    joined = coo_array((np.ones(len(first), bool), ends), shape=(count, count))
-    return connected_components(joined, directed=False)[1]
-
-
-def _sides(triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "sides 2"]:
-    """Returns the three sides of every triangle, the smaller corner first."""
-    return np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-
-
-def _names(owner: Int[np.ndarray, " n"], sides: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Returns one integer for every side of an owner: equal for equal ones."""
-    corners = int(sides.max(initial=0)) + 1
-    return (owner.astype(np.int64) * corners + sides[:, 0]) * corners + sides[:, 1]
-
-
 def _bodies(
-    triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"], material: Int[np.ndarray, " t"]
+    triangles: Int[np.ndarray, "t 3"], piece: Int[np.ndarray, " t"], material: Int[np.ndarray, " pieces"]
 ) -> Int[np.ndarray, " t"]:
-    """Returns the body of every triangle: its part, or all open parts of its material that meet in corners of their borders.
+    """Returns the body of every triangle: its piece, which is what one part has of one material, or all open pieces of its
+    material that meet in corners of their borders.
 
-    A part is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
+    A piece is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
     blocks of one object that touch along an edge share it four times, and are closed.)
     """
-    pieces, piece = np.unique(np.stack([part, material], 1), axis=0, return_inverse=True)
-    piece, sides = piece.reshape(-1), _sides(triangles)
-    owner = np.repeat(piece, 3)
-    _, first, count = np.unique(_names(owner, sides), return_index=True, return_counts=True)
-    border = first[(count % 2 == 1) & (sides[first, 0] != sides[first, 1])]
-    owner, corner = np.repeat(owner[border], 2), sides[border].reshape(-1)
-    _, shared = np.unique(np.column_stack([pieces[owner, 1], corner]), axis=0, return_inverse=True)
-    # A graph whose nodes are the parts, and behind them the corners of borders, one for each material that meets there.
-    label = _components(len(pieces) + len(owner), owner, len(pieces) + shared.reshape(-1))
+    owner, side = np.repeat(piece, 3), sides(triangles)
+    _, first, count = np.unique(names(owner, side), return_index=True, return_counts=True)
+    border = first[(count % 2 == 1) & (side[first, 0] != side[first, 1])]
+    owner, corner = np.repeat(owner[border], 2), side[border].reshape(-1)
+    _, shared = np.unique(np.column_stack([material[owner], corner]), axis=0, return_inverse=True)
+    # A graph whose nodes are the pieces, and behind them the corners of borders, one for each material that meets there.
+    label = components(len(material) + len(owner), owner, len(material) + shared.reshape(-1))
     return label[piece]
 
 
@@ -186,7 +167,7 @@ def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]) -> I
     """Returns the mover of every triangle: those of one body that are joined by common corners share it."""
     _, node = np.unique(np.column_stack([np.repeat(body, 3), triangles.reshape(-1)]), axis=0, return_inverse=True)
     node = node.reshape(-1, 3)
-    label = _components(int(node.max(initial=-1)) + 1, node[:, [0, 1]].reshape(-1), node[:, [1, 2]].reshape(-1))
+    label = components(int(node.max(initial=-1)) + 1, node[:, [0, 1]].reshape(-1), node[:, [1, 2]].reshape(-1))
     return label[node[:, 0]]
 
 
@@ -216,11 +197,11 @@ def _coplanar(
     triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]
 ) -> list[Int[np.ndarray, " k"]]:
     """Returns the triangles of one body that share sides and a plane, as groups of indices."""
-    _, first, which = np.unique(_names(np.repeat(body, 3), _sides(triangles)), return_index=True, return_inverse=True)
+    _, first, which = np.unique(names(np.repeat(body, 3), sides(triangles)), return_index=True, return_inverse=True)
     owner = np.repeat(np.arange(len(triangles)), 3)
     other = owner[first[which]]
     flat = _parallel(normal[owner], normal[other])
-    label = _components(len(triangles), owner[flat], other[flat])
+    label = components(len(triangles), owner[flat], other[flat])
     by_group = np.argsort(label, kind="stable")
     return np.split(by_group, np.flatnonzero(np.diff(label[by_group])) + 1)
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from wbgs_jax.propagation.triangles import components, names, sides
 
 
 def repaired(
@@ -25,11 +25,11 @@ def repaired(
     """
     kept = _once(triangles, part)
     triangles, part = triangles[kept].copy(), part[kept]
-    neighbours = _neighbours(triangles, part)
-    wrong = np.unique(part[neighbours.first[neighbours.against]])
+    pairs = _neighbours(triangles, part)
+    wrong = np.unique(part[pairs.first[pairs.against]])
     if len(wrong):
-        own = np.isin(part, wrong)
-        turned = _turned(points, triangles, neighbours) & own
+        own = np.flatnonzero(np.isin(part, wrong))
+        turned = own[_turned(points, triangles[own], _neighbours(triangles[own], part[own]))]
         triangles[turned] = triangles[turned, ::-1]
         warnings.warn(f"triangles of {len(wrong)} parts of the mesh face both ways; they are taken to face one", stacklevel=4)
     return triangles, kept
@@ -38,8 +38,11 @@ def repaired(
 def _once(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int[np.ndarray, " k"]:
     """Returns the triangles without the repetitions in parts of which every triangle is repeated, either side up. Where only
     some are, bodies of one part touch."""
-    which = _row_numbers(part, *np.sort(triangles, 1).T)
-    _, first, count = np.unique(which, return_index=True, return_counts=True)
+    corners = np.sort(triangles, 1)
+    _, side = np.unique(names(part, corners[:, :2]), return_inverse=True)
+    _, first, which, count = np.unique(
+        side * (int(corners.max(initial=0)) + 1) + corners[:, 2], return_index=True, return_inverse=True, return_counts=True
+    )
     single = np.zeros(part.max(initial=-1) + 1, bool)
     single[part[count[which] == 1]] = True
     if single[part].all():
@@ -61,44 +64,25 @@ class _Neighbours(NamedTuple):
 
 
 def _neighbours(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> _Neighbours:
-    sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    which = _row_numbers(np.repeat(part, 3), *np.sort(sides, 1).T)
-    count, order = np.bincount(which), np.argsort(which, kind="stable")
-    start = (np.cumsum(count) - count)[count == 2]
+    side = sides(triangles)
+    _, which, count = np.unique(names(np.repeat(part, 3), side), return_inverse=True, return_counts=True)
+    start, order = (np.cumsum(count) - count)[count == 2], np.argsort(which, kind="stable")
     one, other = order[start], order[start + 1]
-    along = sides[:, 1] > sides[:, 0]
+    forward = (np.roll(triangles, -1, 1) > triangles).reshape(-1)
     closed = (count == 2)[which].reshape(-1, 3).all(1)
-    apart = one // 3 != other // 3  # a triangle without an area may be its own neighbour
-    return _Neighbours(one[apart] // 3, other[apart] // 3, (along[one] == along[other])[apart], closed)
+    against = (forward[one] == forward[other]) & (side[one, 0] != side[one, 1])  # one of no length has no direction
+    return _Neighbours(one // 3, other // 3, against, closed)
 
 
-def _turned(
-    points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], neighbours: _Neighbours
-) -> Bool[np.ndarray, " t"]:
+def _turned(points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], pairs: _Neighbours) -> Bool[np.ndarray, " t"]:
     """Returns which triangles to turn round, so that all face as their neighbours do, and outwards where bodies are closed."""
-    count = len(triangles)
-    keys, first = np.unique(np.minimum(*neighbours[:2]) * count + np.maximum(*neighbours[:2]), return_index=True)
-    against = neighbours.against[first]
-    ends = neighbours.first[first].astype(np.int32), neighbours.second[first].astype(np.int32)
-    graph = coo_array((np.ones(len(first), bool), ends), shape=(count, count)).tocsr()
-    bodies, body = connected_components(graph, directed=False)
-    turned = np.zeros(count, bool)
-    for start in np.unique(body, return_index=True)[1]:
-        order, before = breadth_first_order(graph, int(start), directed=False)
-        later, earlier = order[1:].astype(np.int64), before[order[1:]].astype(np.int64)
-        differ = against[np.searchsorted(keys, np.minimum(later, earlier) * count + np.maximum(later, earlier))]
-        for triangle, parent, flip in zip(later, earlier, differ, strict=True):
-            turned[triangle] = turned[parent] ^ flip
+    count, across = len(triangles), len(triangles) * pairs.against
+    # Every triangle twice, as it is and turned round. What faces alike is joined, so that a body is there twice, too.
+    first = np.concatenate([pairs.first, pairs.first + count])
+    second = np.concatenate([pairs.second + across, pairs.second + count - across])
+    as_it_is, other_way = components(2 * count, first, second).reshape(2, count)
+    body, turned = np.minimum(as_it_is, other_way), as_it_is > other_way
     a, b, c = (points - points.mean(0))[triangles].swapaxes(0, 1)
-    volume = np.where(turned, -1, 1) * np.sum(a * np.cross(b, c), -1)
-    inward = np.bincount(body, volume, bodies) < 0
-    inward &= np.bincount(body, ~neighbours.closed, bodies) == 0
+    volume = np.bincount(body, np.where(turned, -1, 1) * np.sum(a * np.cross(b, c), -1))
+    inward = (volume < 0) & (np.bincount(body, ~pairs.closed) == 0)
     return turned ^ inward[body]
-
-
-def _row_numbers(*columns: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Returns a number for every row, equal for equal rows, without gaps: sorting integers is faster than sorting rows."""
-    number = np.zeros(len(columns[0]), np.int64)
-    for column in columns:
-        number = np.unique(number * (int(column.max(initial=0)) + 1) + column, return_inverse=True)[1]
-    return number

@@ -275,7 +275,7 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
         warnings.warn(
             f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
             "mesh, transmitters and receivers",
-            stacklevel=2,
+            stacklevel=1,  # of this line, whoever checks: it is said once
         )
     if dataset.kind == "power" and "power" not in field.gives:
         able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)

@@ -9,13 +9,12 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
 from wbgs_jax._util.statistics import by_transmitter, standard_error
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.losses import log_decorrelation, surprise
-from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.data import TrainingData
 from wbgs_jax.types import Batch, Links
 
@@ -138,9 +137,10 @@ def _score(
         if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
             return surprise(seen.covariance, batch.snapshots)[0]
         if batch.pas is None or compared == "powers":
-            power, heard = _received(batch)
-            assert seen.power_db is not None, "only fields that know powers are searched by them"
-            return jnp.where(heard, jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db[0] - power)), 0)
+            received = batch.received_db
+            assert received is not None and seen.power_db is not None, "images are searched by spectra"
+            unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])
+            return unlike if batch.snapshots is None else jnp.where(jnp.any(batch.snapshots != 0), unlike, 0)
         unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(seen.pas - batch.pas)), ALIKE))
         return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
 
@@ -151,14 +151,6 @@ def _score(
         return jax.vmap(lambda *leaves: compare(batch, leaves), axes)(*leaves)
 
     return jax.vmap(one)(batches).T
-
-
-def _received(batch: Batch) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Returns what was received on the only link of a batch (dB), and whether there was anything."""
-    if batch.power_db is not None:
-        return batch.power_db[0], jnp.asarray(True)
-    assert batch.snapshots is not None, "images tell no power"
-    return received_power_db(batch.snapshots)[0], jnp.any(batch.snapshots != 0)
 
 
 def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:

@@ -141,8 +141,8 @@ class Search:
             thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
             report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # named again since then
         if data.snapshots is not None and (level := unusual_level(told)):
-            scores = told.scores(config.placement_spectra, "powers")
-            params, report["gain_db"] = search_gain(params, scores, level)
+            told = dataclasses.replace(told, field=field)  # which may know of clutter since
+            params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
         return Edit(params, (), None, report, field, cache)
 
     def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
