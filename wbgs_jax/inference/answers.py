@@ -58,12 +58,12 @@ def lowest_answered(trained: Trained, dataset: Dataset) -> float:
     hold below, too."""
     if "paths" in trained.field.known():
         return LOWEST_OF_PATHS_HZ
-    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0] * (1 - ROUNDED))
+    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
 
 
 def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below what it answers."""
-    if lowest_hz < (lowest := lowest_answered(trained, dataset)):
+    if lowest_hz < (lowest := lowest_answered(trained, dataset)) * (1 - ROUNDED):
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
         raise UserError(
             f"the {trained.field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at "
