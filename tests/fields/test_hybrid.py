@@ -11,8 +11,9 @@ from synthetic import tiny_dataset, tiny_settings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field, hybrid
-from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
-from wbgs_jax.fields.trust import Shares, constant
+from wbgs_jax.fields.hybrid import HybridField, Trust, _informed, _Seen
+from wbgs_jax.fields.noise import with_floor, without_floor
+from wbgs_jax.fields.trust import FEATURES, Opinions, Shares, constant, reported
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.training.loop import Run, train
@@ -36,7 +37,8 @@ def run(dataset, tmp_path_factory):
 
 def trusting(params, spectra, power):
     """Each given as the share of the coherent field over the splatting one's own opinion, and of both over the informed one."""
-    return dataclasses.replace(params, trust=Trust(*(Shares(*map(constant, pair)) for pair in (spectra, power))))
+    trust = Trust(*(Shares(*map(constant, pair)) for pair in (spectra, power)), jnp.zeros(()))
+    return dataclasses.replace(params, trust=trust)
 
 
 def opinions(run, params, index):
@@ -93,26 +95,49 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
 
 
 @pytest.mark.heavy
-def test_noise_on_snapshots_does_not_speak_against_the_coherent_field(run, rng, monkeypatch):
-    params, index, share = run.state.params, np.arange(len(run.dataset)), 0.1  # of a few transmitters nothing is sure
+def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rng, monkeypatch):
+    """The coherent field is right, the splatting one has learned what noise makes of a blurred spectrum."""
+    params, index = run.state.params, np.arange(len(run.dataset))
     batch = run.data.batch(jnp.asarray(index), run.key)
-    clean = np.asarray(observe_links(run.field.wave, params.wave, run.dataset, index).snapshots)
-    level = np.sqrt(np.mean(np.abs(clean) ** 2, -1, keepdims=True) * share / (1 - share) / 2)
-    noisy = clean + level * (rng.normal(size=clean.shape) + 1j * rng.normal(size=clean.shape))
+    seen = observe_links(run.field.wave, params.wave, run.dataset, index)
 
-    def weighed(snapshots):
-        heard = jnp.asarray(snapshots, jnp.complex64)
-        observed = dataclasses.replace(batch, snapshots=heard, pas=snapshot_to_pas(heard, batch.receiver.element_positions))
-        found, report = run.field.calibrate(params, run.cache, [observed])
-        return float(jax.nn.sigmoid(found.trust.spectra.coherent.bias)), report["noise_share"]
+    def drawn():
+        power = np.mean(np.abs(seen.snapshots) ** 2, -1, keepdims=True) / 20
+        white = np.sqrt(power) * (rng.normal(size=seen.snapshots.shape) + 1j * rng.normal(size=seen.snapshots.shape))
+        return snapshot_to_pas(jnp.asarray(seen.snapshots + white, jnp.complex64), batch.receiver.element_positions)
 
-    trusted, found = weighed(clean)
-    assert trusted > 0.9
-    assert found == 0
-    allowed, found = weighed(noisy)
-    assert 0.2 * share < found < 1.2 * share
-    monkeypatch.setattr(hybrid, "noise_share", lambda *_: 0.0)
-    assert allowed > weighed(noisy)[0]
+    own = jnp.mean(jnp.stack([drawn() for _ in range(10)]), 0)
+    own = own / own.max((1, 2), keepdims=True)
+    said = _Seen(
+        Opinions(seen.pas, own, own), Opinions(*3 * (seen.power_db,)), jnp.zeros((len(index), FEATURES)), drawn(), None
+    )
+    monkeypatch.setattr(hybrid, "_opinions", lambda *_: said)
+    found, report = run.field.calibrate(params, run.cache, [batch])
+    assert report["noise_floor"] == pytest.approx(float(found.trust.floor)) > 1e-3
+    assert float(run.field.as_observed(found, jnp.zeros((1, 90, 360))).min()) > 0.03
+    again, _ = run.field.calibrate(found, run.cache, [batch])
+    assert float(again.trust.floor) == float(found.trust.floor)
+    monkeypatch.setattr(hybrid, "floor_of", lambda *_: 0.0)
+    without, _ = run.field.calibrate(params, run.cache, [batch])
+    trusted, less = (report_of(p, said.told)["coherent"] for p in (found, without))
+    assert trusted > max(less, 0.8)
+
+
+def report_of(params, told):
+    return reported(params.trust.spectra, np.asarray(told))
+
+
+@pytest.mark.heavy
+def test_its_answers_are_without_the_floor(run):
+    """Of the splatting field's opinions; what arrives along paths has none."""
+    params, index = trusting(run.state.params, (0.3, 0.6), (0.8, 1.0)), run.dataset.validation
+    noisy = dataclasses.replace(params, trust=dataclasses.replace(params.trust, floor=jnp.asarray(0.02)))
+    wave, *learned = opinions(run, params, index)
+    seen = observe_links(run.field, noisy, run.dataset, index)
+    np.testing.assert_allclose(
+        seen.pas, mixture((0.3, 0.6), wave.pas, *(without_floor(one.pas, 0.02) for one in learned)), atol=2e-3
+    )
+    np.testing.assert_allclose(run.field.as_observed(noisy, jnp.asarray(seen.pas)), with_floor(seen.pas, 0.02), rtol=1e-6)
 
 
 @pytest.mark.heavy

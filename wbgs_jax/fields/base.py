@@ -203,6 +203,10 @@ class Field(ABC):
         the last step). By default nothing changes."""
         return params, {}
 
+    def as_observed(self, params: Any, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
+        """Returns its answers as they would appear in the data that it was trained on; by default as they are."""
+        return pas
+
     def known(self) -> tuple[Quantity, ...]:
         """Returns what it knows of a link: what its class `gives`, unless the scene lacks what that takes."""
         return self.gives

@@ -23,7 +23,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
-from wbgs_jax.fields.noise import floor_of, noise_share, unexplained, with_noise
+from wbgs_jax.fields.noise import at_least_floor, floor_of, with_floor, without_floor
 from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import (
     Opinions,
@@ -58,6 +58,8 @@ class Trust:
     spectra: Shares
     power: Shares
     """Of the received power in decibels."""
+    floor: Float[Array, ""]
+    """What noise has put under the spectra that the splatting field learned; its answers are without it."""
 
 
 @pytree
@@ -129,7 +131,7 @@ class HybridField(Field):
         """Returns initial parameters, both fields trusted alike."""
         wave = None if self.wave is None else self.wave.init(key)
         wideband = self.wideband.init(key, given=wave is not None)
-        return HybridParams(wave, wideband, Trust(at_first(), at_first()))
+        return HybridParams(wave, wideband, Trust(at_first(), at_first(), jnp.zeros(())))
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths | None:
         """Returns the paths of all transmitters of some links (host)."""
@@ -177,8 +179,13 @@ class HybridField(Field):
         assert own.power_db is not None, "as the coherent field does"
         met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field has no opinion
         powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
-        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, own.pas), own.pas, informed.pas)
+        clean, as_told = (without_floor(seen.pas, params.trust.floor) for seen in (own, informed))
+        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, clean), clean, as_told)
         return spectra, powers, told
+
+    def as_observed(self, params: HybridParams, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
+        """Returns spectra with what noise adds to them."""
+        return pas if self.wave is None else with_floor(pas, params.trust.floor)
 
     def probe(self, params: HybridParams) -> Any:
         """Returns that of the splatting field."""
@@ -199,27 +206,24 @@ class HybridField(Field):
 
     def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
         """Returns the parameters with the shares that explain best what neither field was trained on; of what was not observed,
-        spectra or powers, the coherent field's are taken. Where snapshots are noisy, the coherent field's spectra are compared
-        with theirs as noise would let them appear (noise.py)."""
+        spectra or powers, the coherent field's are taken. With them, the floor under noisy spectra is found (noise.py)."""
         if self.wave is None or not batches:
             return params, {}
+        raw = dataclasses.replace(params, trust=dataclasses.replace(params.trust, floor=jnp.zeros(())))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
-        plans = {number: self.plan(params, receiver, None, cache) for number, receiver in receivers.items()}
-        seen = [
-            jax.tree.map(np.asarray, _opinions(self, params, plans[_receiver_of(batch)], cache, batch)) for batch in batches
-        ]
-        said, powers, told, pas, heard_db, noisy = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
+        plans = {number: self.plan(raw, receiver, None, cache) for number, receiver in receivers.items()}
+        seen = [jax.tree.map(np.asarray, _opinions(self, raw, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
+        said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        noise = 0.0
-        if noisy is not None:
-            left, floor = noisy
-            noise = noise_share(left, floor, said.coherent, pas, tx_index)
-            said = said._replace(coherent=np.asarray(with_noise(jnp.asarray(said.coherent), jnp.asarray(noise * floor))))
-        spectra = coherent_alone() if pas is None else learn_shares(told, tx_index, said, partial(similarity, pas))
+        floor = 0.0 if pas is None else floor_of(said.coherent, said.informed, pas, tx_index)
+        spectra = (
+            coherent_alone() if pas is None else learn_shares(told, tx_index, _noisy(said, floor), partial(similarity, pas))
+        )
         known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
-        return dataclasses.replace(params, trust=Trust(spectra, power)), {"shares": report, "noise_share": noise}
+        trust = Trust(spectra, power, jnp.asarray(floor, jnp.float32))
+        return dataclasses.replace(params, trust=trust), {"shares": report, "noise_floor": floor}
 
     def arrivals(self, params: HybridParams, plan: HybridPlan, query: Query) -> Arrivals:
         """Returns every path of B queries: amplitudes, directions, lengths."""
@@ -326,15 +330,17 @@ class _Seen(NamedTuple):
     """What tells whom to trust."""
     pas: Float[Array, "b 90 360"] | None
     power_db: Float[Array, " b"] | None
-    noisy: tuple[Float[Array, " b"], Float[Array, " b"]] | None
-    """How much of their snapshots is `unexplained` at most, and `floor_of` them."""
 
 
 @jax.jit
 def _opinions(hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch) -> _Seen:
     """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
-    coherent, noisy = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links), None
-    if batch.snapshots is not None:
-        elements = batch.receiver.element_wavelengths(batch.links.query.frequency_hz)
-        noisy = unexplained(coherent.snapshots, batch.snapshots), floor_of(batch.snapshots, elements)
-    return _Seen(*hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db, noisy)
+    coherent = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
+    return _Seen(*hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db)
+
+
+def _noisy(said: Opinions, floor: float) -> Opinions:
+    """Returns opinions as they would be observed, had those that have learned the floor been without it."""
+    coherent, *learned = (jnp.asarray(spectra) for spectra in said)
+    noisy = with_floor(coherent, floor), *(at_least_floor(spectra, floor) for spectra in learned)
+    return Opinions(*(np.asarray(spectra) for spectra in noisy))

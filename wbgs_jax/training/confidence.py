@@ -59,11 +59,11 @@ def learn_confidence(
         return None, None
     index = np.random.default_rng(1).permutation(dataset.validation)[:MOST]
     seen = observe_links(field, params, dataset, index)
-    return _of_spectra(seen, dataset, index, neighbours), _of_powers(seen, dataset, index)
+    return _of_spectra(field, params, seen, dataset, index, neighbours), _of_powers(seen, dataset, index)
 
 
 def _of_spectra(
-    seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
+    field: Field, params: Any, seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
 ) -> Confidence | None:
     if dataset.kind == "power":
         return None
@@ -72,7 +72,8 @@ def _of_spectra(
     trained, receivers = _trained(dataset), jnp.asarray(dataset.rx_positions(index), jnp.float32)
     power = None if seen.power_db is None else jnp.asarray(seen.power_db)
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
-    error = np.log(1 + MARGIN - np.minimum(ssim(pas, np.asarray(dataset.pas(index))), 1))
+    alike = ssim(np.asarray(field.as_observed(params, jnp.asarray(pas))), np.asarray(dataset.pas(index)))
+    error = np.log(1 + MARGIN - np.minimum(alike, 1))
     *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
     arrays = *learned, interval(rest, dataset.tx_index[index]), np.exp(rest).mean()
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position

@@ -73,7 +73,7 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
         return Learned()
     asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
     truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
-    own = predict_spectra(field, params, dataset, asked)
+    own = _as_observed(field, params, dataset, asked)
     alone, of_training = ssim(own, truth), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
@@ -84,6 +84,11 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
         return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
     line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
     return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
+
+
+def _as_observed(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
+    """Returns what a field says as it would be observed: what noise has added is nothing that neighbours know better."""
+    return np.asarray(field.as_observed(params, jnp.asarray(predict_spectra(field, params, dataset, index))))
 
 
 _correct = jax.jit(correct)
@@ -100,7 +105,7 @@ class _Known:
         """Returns them as neighbours."""
         if choice.kind not in self._made:
             spectra = eight_bit(self.dataset, self.index)
-            predicted = None if choice.kind == "spectra" else predict_spectra(*self._asked, self.dataset, self.index)
+            predicted = None if choice.kind == "spectra" else _as_observed(*self._asked, self.dataset, self.index)
             self._made[choice.kind] = images_of(choice.kind, spectra, predicted)
         return make_neighbours(choice, self.dataset, self.index, self._made[choice.kind])
 
