@@ -56,6 +56,16 @@ class RippleField(Field):
         return {"all": Group(config.learning_rate)}
 
 
+@pytree
+class NoisyField(RippleField):
+    """The same, trained on spectra under which noise has put a floor."""
+
+    name: ClassVar[str] = "noisy ripple"
+
+    def as_observed(self, params, pas):
+        return jnp.sqrt((pas**2 + 0.3) / 1.3)
+
+
 @dataclass(frozen=True)
 class Room:
     """Limits of `SwellingField`."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import FREQUENCIES_HZ, tiny_dataset
-from toys import RippleConfig, RippleField
+from toys import NoisyField, RippleConfig, RippleField
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
@@ -105,6 +105,16 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
     assert report["ms_per_pas"] > 0 and report["ms_per_pas_single"] > 0
     json.dumps(report, allow_nan=False)
     assert not {"snapshot_correlation", "power_error_db", "power"} & evaluate(blind, dataset)[0].keys()
+
+
+def test_answers_are_scored_with_the_noise_of_the_training_too(blind, dataset):
+    report, predicted = evaluate(blind._replace(field=NoisyField(RippleConfig())), dataset)
+    alike = metrics.ssim(np.sqrt((predicted**2 + 0.3) / 1.3), np.asarray(dataset.pas(dataset.test)))
+    assert report["as_observed"] == pytest.approx({"median_ssim": np.median(alike), "mean_ssim": np.mean(alike)}, abs=1e-5)
+    assert report["mean_ssim"] != pytest.approx(np.mean(alike), abs=1e-3)
+    said = f"with the noise of the training spectra: {np.median(alike):.3f} / {np.mean(alike):.3f}"
+    assert any(said in line for line in closing_lines(report, 8))
+    assert "as_observed" not in evaluate(blind, dataset)[0]
 
 
 def test_powers_are_scored_where_there_is_nothing_else(knowing, blind):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import tiny_dataset
+from toys import NoisyField, RippleConfig, RippleField
 from untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
@@ -149,6 +150,20 @@ def test_it_is_learned_from_the_validation_part_alone(dataset):
     scores = ssim(pas, np.asarray(dataset.pas(index)))
     assert abs(expected.ssim.mean() - scores.mean()) < 0.15
     assert calibration(expected, scores)["coverage"] > 0.6
+
+
+def test_answers_are_judged_as_they_would_be_observed(dataset):
+    """The data are noisy and the answers are not: that is no error of theirs."""
+    clean, noisy = RippleField(RippleConfig()), NoisyField(RippleConfig())
+    params = clean.init(jax.random.key(1))
+    said = observe_links(clean, params, dataset, np.arange(len(dataset))).pas
+    observed = np.asarray(255 * noisy.as_observed(params, jnp.asarray(said))).round().astype(np.uint8)
+    told = dataclasses.replace(dataset, snapshots=None, images=observed)
+    sure, doubted = (
+        expectations(learn_confidence(field, params, told, None)[0], told, told.test, said[told.test], None)
+        for field in (noisy, clean)
+    )
+    assert sure[0].min() > 0.98 > doubted[0].mean()
 
 
 def test_receivers_share_what_is_learned_and_are_asked_one_by_one():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import tiny_dataset
-from toys import RippleConfig, RippleField
+from toys import NoisyField, RippleConfig, RippleField
 
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.metrics import ssim
@@ -55,6 +55,17 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     noisy = dataclasses.replace(dataset, snapshots=None, images=told)
     neighbours, line, _ = learn_neighbours(field, params, hold_out_validation(noisy))
     assert neighbours is None and "the field answers alone" in line
+
+
+def test_noise_is_nothing_that_neighbours_know(field, params):
+    """They would add it to every answer: the field leaves it out, and the known spectra have it."""
+    noisy, dataset = NoisyField(RippleConfig()), tiny_dataset(24)
+    plan = field.plan(params, dataset.receiver())
+    clean = jax.jit(lambda query: field.render(params, plan, query).pas)(dataset.query(np.arange(len(dataset))))
+    observed = np.asarray(255 * noisy.as_observed(params, clean)).round().astype(np.uint8)
+    told = hold_out_validation(dataclasses.replace(dataset, snapshots=None, images=observed))
+    assert learn_neighbours(noisy, params, told)[0] is None
+    assert learn_neighbours(field, params, told)[0] is not None
 
 
 def test_the_smoothest_within_a_standard_error_of_the_best_is_chosen(rng):

@@ -139,6 +139,11 @@ def closing_lines(report: dict[str, Any], block: int) -> list[str]:
             f"strongest direction: {report['angle_error_deg']:.1f} degrees off (median); best predicted beam: "
             f"{report['beam_loss_db']:.2f} dB lost, best of three {report['beam_loss_top3_db']:.2f} dB (means)"
         )
+    if noisy := report.get("as_observed"):
+        lines.append(
+            f"with the noise of the training spectra: {noisy['median_ssim']:.3f} / {noisy['mean_ssim']:.3f} (median / mean; "
+            "the answers leave it out, and score lower where these spectra have it too)"
+        )
     if (same := report.get("truth_repeats")) is not None:
         lines.append(f"truth against itself, traced with more rays: {same:.3f} (median): no score says more than that")
     if "snapshot_correlation" in report:

@@ -47,6 +47,10 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
     report |= metrics.summarise(figures, *known, dataset.receiver_index[index])
+    noisy = np.asarray(trained.field.as_observed(trained.params, jnp.asarray(seen.pas)))
+    if not np.array_equal(noisy, seen.pas):
+        alike = metrics.ssim(noisy, truth)
+        report["as_observed"] = {"median_ssim": float(np.median(alike)), "mean_ssim": float(np.mean(alike))}
     repeats = repeatability(dataset.name, np.unique(known[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
     if seen.snapshots is not None and dataset.snapshots is not None:
