@@ -111,7 +111,12 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
     said = _Seen(
         Opinions(seen.pas, own, own), Opinions(*3 * (seen.power_db,)), jnp.zeros((len(index), FEATURES)), drawn(), None
     )
-    monkeypatch.setattr(hybrid, "_opinions", lambda *_: said)
+
+    def opinions_without_floor(field, given, *_):
+        assert float(given.trust.floor) == 0  # or it would be found in what is left of it
+        return said
+
+    monkeypatch.setattr(hybrid, "_opinions", opinions_without_floor)
     found, report = run.field.calibrate(params, run.cache, [batch])
     assert report["noise_floor"] == pytest.approx(float(found.trust.floor)) > 1e-3
     assert float(run.field.as_observed(found, jnp.zeros((1, 90, 360))).min()) > 0.03

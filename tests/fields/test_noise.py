@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.fields.noise import at_least_floor, floor_of, with_floor, without_floor
+from wbgs_jax.fields.noise import at_least_floor, floor_of, observed_opinions, with_floor, without_floor
+from wbgs_jax.fields.trust import Opinions
 from wbgs_jax.radio.array import pas_directions, planar_array, snapshot_to_pas, steering_vector
 
 ARRAY = planar_array(4, 4, 0.5)
@@ -62,7 +63,7 @@ def test_it_is_taken_out_again(rng):
 
 
 def known(rng, share, n_tx=20, per_tx=2):
-    """Arguments of `floor_of` where snapshots are noisy, and the true floor: spectra of a field without the noise, of one that
+    """Arguments of `found` where snapshots are noisy, and the true floor: spectra of a field without the noise, of one that
     has learned what it does on average, and observed ones; whose they are."""
     clean = waves(rng, n_tx * per_tx)
     learned = np.mean([spectra(clean + noise(rng, clean, share)[0]) for _ in range(20)], 0)
@@ -70,10 +71,14 @@ def known(rng, share, n_tx=20, per_tx=2):
     return (spectra(clean), learned, observed, np.repeat(np.arange(n_tx), per_tx)), np.median(share / (1 - share) / peak(clean))
 
 
+def found(unaware, learned, observed, tx):
+    return floor_of(Opinions(unaware, np.zeros_like(unaware), learned), observed, tx)
+
+
 @pytest.mark.parametrize("share", [0.01, 0.1])
 def test_it_is_found_and_hardly_ever_too_high(rng, share):
     arguments, floor = known(rng, share)
-    assert 0.3 * floor < floor_of(*arguments) < 1.2 * floor  # of the dark, spectra show the median: ln 2 of the mean
+    assert 0.3 * floor < found(*arguments) < 1.2 * floor  # of the dark, spectra show the median: ln 2 of the mean
 
 
 def test_raising_is_taking_out_and_adding_again(rng):
@@ -85,18 +90,37 @@ def test_raising_is_taking_out_and_adding_again(rng):
 
 def test_without_noise_there_is_none(rng):
     clean, _, observed, tx = known(rng, 0.0)[0]
-    assert floor_of(clean, clean, observed, tx) == 0
+    assert found(clean, clean, observed, tx) == 0
+    fewer = np.where(clean < 0.3, 0, clean)  # paths are missing, which is as if there were noise
+    assert found(fewer, clean, observed, tx) == 0
+    assert found(fewer, np.where(clean < 0.05, 0, clean), observed, tx) < 3e-4  # too dark, but not for want of noise
 
 
-def test_spectra_that_are_darker_than_noise_allows_tell_of_less(rng):
-    """Missing paths look like noise to the field that adds them up; the other one knows that it is dark there."""
+def test_missing_paths_look_like_noise_to_one_field_alone(rng):
     (clean, learned, observed, tx), floor = known(rng, 0.02)
     fewer = np.where(clean < 0.3, 0, clean)
-    assert floor_of(fewer, fewer, observed, tx) > 1.2 * floor > floor_of(fewer, learned, observed, tx) > 0
+    assert 0 < found(fewer, learned, observed, tx) < 1.2 * floor
+
+
+def test_where_no_path_arrives_both_have_learned_the_floor(rng):
+    """The coherent field takes over what the splatting one says there."""
+    (clean, learned, observed, tx), _ = known(rng, 0.1)
+    unmet = rng.permutation(len(tx)) < 10
+    said = Opinions(np.where(unmet[:, None, None], learned, clean), learned, learned)
+    met = Opinions(*(spectra[~unmet] for spectra in said))
+    assert floor_of(said, observed, tx) == pytest.approx(floor_of(met, observed[~unmet], tx[~unmet]), rel=0.6)
+    seen = observed_opinions(said, 0.02)
+    np.testing.assert_array_equal(seen.coherent[unmet], seen.own[unmet])
+    np.testing.assert_allclose(seen.coherent[~unmet], with_floor(jnp.asarray(clean[~unmet]), 0.02), rtol=1e-6)
+    np.testing.assert_array_equal(seen.informed, at_least_floor(jnp.asarray(learned, jnp.float32), 0.02))
+
+
+def test_noise_of_a_diverged_field_stays_visible():
+    assert np.isnan(without_floor(jnp.full((1, 90, 360), jnp.nan), 0.01)).all()
 
 
 def test_what_is_not_sure_is_none(rng):
     (clean, learned, observed, tx), _ = known(rng, 0.1)
-    assert floor_of(clean, learned, observed, tx) > 0
-    assert floor_of(learned, learned, clean, tx) == 0  # the observed ones are darker
-    assert floor_of(clean, learned, observed, np.zeros_like(tx)) == 0  # all of one transmitter
+    assert found(clean, learned, observed, tx) > 0
+    assert found(learned, learned, clean, tx) == 0  # the observed ones are darker
+    assert found(clean, learned, observed, tx // 4) == 0  # of five transmitters

@@ -47,7 +47,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
     report |= metrics.summarise(figures, *known, dataset.receiver_index[index])
-    noisy = np.asarray(trained.field.as_observed(trained.params, jnp.asarray(seen.pas)))
+    noisy, alike = np.asarray(trained.field.as_observed(trained.params, jnp.asarray(seen.pas))), figures["ssim"]
     if not np.array_equal(noisy, seen.pas):
         alike = metrics.ssim(noisy, truth)
         report["as_observed"] = {"median_ssim": float(np.median(alike)), "mean_ssim": float(np.mean(alike))}
@@ -57,7 +57,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
     if tested and (expected := expectations(trained.confidence, dataset, index, np.asarray(seen.pas), said)):
-        report["confidence"] = calibration(expected, figures["ssim"])
+        report["confidence"] = calibration(expected, alike)  # as it was learned
     report |= time_queries(trained, dataset)
     beside = baselines(dataset) if can_lend(dataset, index) else {}
     report["baselines"] = {
@@ -127,7 +127,8 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " 
     said = power_of(seen, dataset)
     if dataset.kind == "power" and said is not None and (report := score_heard(said, dataset, index)):
         return {"held_out_power_error_db": report["power_error_db"]}
-    return {"held_out_ssim": float(np.median(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index)))))}
+    noisy = np.asarray(field.as_observed(params, jnp.asarray(seen.pas)))
+    return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
 
 
 def time_queries(trained: Trained, dataset: Dataset, repeats: int = 7) -> dict[str, float]:

@@ -23,7 +23,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
-from wbgs_jax.fields.noise import at_least_floor, floor_of, with_floor, without_floor
+from wbgs_jax.fields.noise import floor_of, observed_opinions, with_floor, without_floor
 from wbgs_jax.fields.prepared_paths import PreparedPaths
 from wbgs_jax.fields.trust import (
     Opinions,
@@ -179,13 +179,15 @@ class HybridField(Field):
         assert own.power_db is not None, "as the coherent field does"
         met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field has no opinion
         powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
-        clean, as_told = (without_floor(seen.pas, params.trust.floor) for seen in (own, informed))
+        floor = jax.lax.stop_gradient(params.trust.floor)  # found, not trained
+        clean, as_told = (without_floor(seen.pas, floor) for seen in (own, informed))
         spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, clean), clean, as_told)
         return spectra, powers, told
 
     def as_observed(self, params: HybridParams, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
         """Returns spectra with what noise adds to them."""
-        return pas if self.wave is None else with_floor(pas, params.trust.floor)
+        floor = jax.lax.stop_gradient(params.trust.floor)
+        return jnp.where(floor > 0, with_floor(pas, floor), pas)
 
     def probe(self, params: HybridParams) -> Any:
         """Returns that of the splatting field."""
@@ -215,9 +217,11 @@ class HybridField(Field):
         seen = [jax.tree.map(np.asarray, _opinions(self, raw, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        floor = 0.0 if pas is None else floor_of(said.coherent, said.informed, pas, tx_index)
+        floor = 0.0 if pas is None else floor_of(said, pas, tx_index)
         spectra = (
-            coherent_alone() if pas is None else learn_shares(told, tx_index, _noisy(said, floor), partial(similarity, pas))
+            coherent_alone()
+            if pas is None
+            else learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
         )
         known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
@@ -337,10 +341,3 @@ def _opinions(hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache
     """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
     coherent = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
     return _Seen(*hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db)
-
-
-def _noisy(said: Opinions, floor: float) -> Opinions:
-    """Returns opinions as they would be observed, had those that have learned the floor been without it."""
-    coherent, *learned = (jnp.asarray(spectra) for spectra in said)
-    noisy = with_floor(coherent, floor), *(at_least_floor(spectra, floor) for spectra in learned)
-    return Opinions(*(np.asarray(spectra) for spectra in noisy))

@@ -4,27 +4,35 @@ White noise n of an array of N elements makes the spectrum of y = h + n brighter
 
     E |a^H y|^2 = |a^H h|^2 + N sigma^2
 
-A field that is trained on such spectra learns this floor, one that adds up paths cannot. The floor is taken out of what the one
-says, since the channel is asked for, and added wherever either is compared with observations. How high it is nobody says, but
-both tell: spectra of paths are most like the observed ones if the right floor is added, or a higher one if paths are missing;
-learned spectra, hardly ever darker than the floor, are less like them if they are raised to a higher one.
+A field that is trained on such spectra learns this floor, one that adds up paths cannot. The floor is taken out of what the
+one says, since the channel is asked for, and added where either is compared with observations to learn from that
+(`as_observed`). How high it is nobody says, but both tell: spectra of paths are most like the observed ones if the right floor
+is added, or a higher one if paths are missing; learned spectra are hardly anywhere darker than the floor, and less like them if
+they are raised to a higher one.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.losses import ssim
+from wbgs_jax.fields.trust import Opinions
 
 LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
 """Floors that are tried, as shares of the largest square of a spectrum: of less, spectra show hardly anything."""
 SURE = 2.0
-"""Standard errors over transmitters that spectra have to be more alike with a floor."""
+"""Standard errors over transmitters that spectra have to be more alike with a floor ..."""
+HARMLESS = 1.0
+"""... and that they may be less so where learned ones are raised to it."""
+DARKEST = 0.05
+"""Share of the pixels of learned spectra that may be darker than the floor."""
+FEWEST_TX = 10
+"""Transmitters of which less is no evidence."""
 COMPARED = 240
 """Spectra that are looked at."""
 BLOCK = 48
@@ -38,9 +46,9 @@ def with_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -
 
 def without_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
     """Returns spectra without what noise has added; of what is darker than the floor nothing remains."""
-    square = jnp.maximum((1 + floor) * pas**2 - floor, 0)
-    positive = square > 0  # the root has no gradient at 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
+    square = (1 + floor) * pas**2 - floor
+    dark = square <= 0  # the root has no gradient at 0
+    return jnp.where(dark, 0, jnp.sqrt(jnp.where(dark, 1, square)))
 
 
 def at_least_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
@@ -48,30 +56,40 @@ def at_least_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | floa
     return jnp.maximum(pas, jnp.sqrt(floor / (1 + floor)))
 
 
-def floor_of(
-    unaware: Float[np.ndarray, "n 90 360"],
-    learned: Float[np.ndarray, "n 90 360"],
-    observed: Float[np.ndarray, "n 90 360"],
-    tx_index: Int[np.ndarray, " n"],
-) -> float:
-    """Returns the floor that noise puts under N observed spectra (host); 0 unless those of a field that knows no noise are
-    surely more like them with it.
+def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: Int[np.ndarray, " n"]) -> float:
+    """Returns the floor that noise puts under N observed spectra (host): the lowest of three accounts; 0 unless the coherent
+    field's spectra, which know no noise, are surely more like the observed ones with it.
 
     Args:
-        unaware: what a field says that cannot have learned it.
-        learned: what a field says that was trained on such spectra.
+        said: of the links, with the floor in what has been learned.
         observed: spectra.
         tx_index: their transmitters, which are what was drawn.
     """
-    looked = np.random.default_rng(0).permutation(len(observed))[:COMPARED]
-    unaware, learned, observed = unaware[looked], learned[looked], observed[looked]
+    looked = np.random.default_rng(0).permutation(np.flatnonzero(_met(said)))[:COMPARED]
+    unaware, learned, observed, tx_index = said.coherent[looked], said.informed[looked], observed[looked], tx_index[looked]
+    if len(np.unique(tx_index)) < FEWEST_TX:
+        return 0.0
     added = np.concatenate([np.asarray(_added(*block)) for block in _blocks(unaware, observed)])
-    highest = int(added.mean(0).argmax())
-    gain, error = standard_error(added[:, highest] - added[:, 0], tx_index[looked])
+    best = int(added.mean(0).argmax())
+    gain, error = standard_error(added[:, best] - added[:, 0], tx_index)
     if gain <= SURE * error:
         return 0.0
     raised = np.concatenate([np.asarray(_raised(*block)) for block in _blocks(learned, observed)])
-    return float(LEVELS[min(highest, int(raised.mean(0).argmax()))])
+    losses = [standard_error(raised[:, 0] - with_level, tx_index) for with_level in raised.T]
+    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= HARMLESS * error)
+    return float(min(LEVELS[best], harmless, np.quantile(learned**2, DARKEST)))
+
+
+def observed_opinions(said: Opinions, floor: float) -> Opinions:
+    """Returns opinions as they would be observed, had those that have learned the floor been without it (host)."""
+    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in said[1:])
+    coherent = jnp.where(_met(said)[:, None, None], with_floor(jnp.asarray(said.coherent), floor), own)
+    return Opinions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
+
+
+def _met(said: Opinions) -> Bool[np.ndarray, " n"]:
+    """Returns on which links the coherent field has an opinion of its own."""
+    return np.asarray((said.coherent != said.own).any((-2, -1)))
 
 
 def _blocks(said: np.ndarray, observed: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -79,7 +97,9 @@ def _blocks(said: np.ndarray, observed: np.ndarray) -> list[tuple[np.ndarray, np
     return [(said[start : start + BLOCK], observed[start : start + BLOCK]) for start in starts]
 
 
-def _alike(change: Any, said: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]) -> Float[Array, "b levels"]:
+def _alike(
+    change: Callable[..., Array], said: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
+) -> Float[Array, "b levels"]:
     """Returns how like the observed spectra others are when every floor has changed them."""
     return jax.lax.map(lambda floor: ssim(change(said, floor), observed), jnp.asarray(LEVELS, said.dtype)).T
 

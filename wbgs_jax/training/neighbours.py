@@ -73,11 +73,15 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
         return Learned()
     asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
     truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
-    own = _as_observed(field, params, dataset, asked)
-    alone, of_training = ssim(own, truth), _Known(field, params, dataset, dataset.train)
+    own = predict_spectra(field, params, dataset, asked)
+
+    def alike(pas: Float[Array, "n 90 360"]) -> Float[np.ndarray, " n"]:
+        return ssim(np.asarray(field.as_observed(params, pas)), truth)
+
+    alone, of_training = alike(jnp.asarray(own)), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
-        return ssim(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query)), truth) - alone
+        return alike(_correct(of_training.neighbours(choice), jnp.asarray(own), query)) - alone
 
     chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
