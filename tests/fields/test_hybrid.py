@@ -96,7 +96,7 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
 
 @pytest.mark.heavy
 def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rng, monkeypatch):
-    """The coherent field is right, the splatting one has learned what noise makes of a blurred spectrum."""
+    """The coherent field is right, the splatting one has learned what noise makes of that."""
     params, index = run.state.params, np.arange(len(run.dataset))
     batch = run.data.batch(jnp.asarray(index), run.key)
     seen = observe_links(run.field.wave, params.wave, run.dataset, index)
@@ -127,7 +127,7 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
     monkeypatch.setattr(hybrid, "floor_of", lambda *_: 0.0)
     without, _ = run.field.calibrate(params, run.cache, [batch])
     trusted, less = (report_of(p, said.told)["coherent"] for p in (found, without))
-    assert trusted > max(less, 0.8)
+    assert trusted > less + 0.1  # the splatting one is as right here, but for the noise
 
 
 def report_of(params, told):
