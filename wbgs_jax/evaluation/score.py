@@ -20,7 +20,7 @@ from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_hear
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.confidence import Confidence, Expected, expect_many
 from wbgs_jax.inference.neighbours import for_receiver
-from wbgs_jax.inference.predictor import BLOCK, Trained, observe, observe_links, render_pas
+from wbgs_jax.inference.predictor import BLOCK, Trained, as_observed, observe, observe_links, render_pas
 from wbgs_jax.radio import channel
 
 Part = Literal["test", "validation"]
@@ -47,7 +47,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
     report |= metrics.summarise(figures, *known, dataset.receiver_index[index])
-    noisy, alike = np.asarray(trained.field.as_observed(trained.params, jnp.asarray(seen.pas))), figures["ssim"]
+    noisy, alike = as_observed(trained.field, trained.params, np.asarray(seen.pas)), figures["ssim"]
     if not np.array_equal(noisy, seen.pas):
         alike = metrics.ssim(noisy, truth)
         report["as_observed"] = {"median_ssim": float(np.median(alike)), "mean_ssim": float(np.mean(alike))}
@@ -127,7 +127,7 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " 
     said = power_of(seen, dataset)
     if dataset.kind == "power" and said is not None and (report := score_heard(said, dataset, index)):
         return {"held_out_power_error_db": report["power_error_db"]}
-    noisy = np.asarray(field.as_observed(params, jnp.asarray(seen.pas)))
+    noisy = as_observed(field, params, np.asarray(seen.pas))
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
 
 

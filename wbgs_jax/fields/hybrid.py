@@ -217,12 +217,10 @@ class HybridField(Field):
         seen = [jax.tree.map(np.asarray, _opinions(self, raw, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
-        floor = 0.0 if pas is None else floor_of(said, pas, tx_index)
-        spectra = (
-            coherent_alone()
-            if pas is None
-            else learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
-        )
+        floor, spectra = 0.0, coherent_alone()
+        if pas is not None:
+            floor = floor_of(said, pas, tx_index)
+            spectra = learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
         known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}

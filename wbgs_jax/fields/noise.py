@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.losses import ssim
-from wbgs_jax.fields.trust import Opinions
+from wbgs_jax.fields.trust import Opinions, in_blocks
 
 LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
 """Floors that are tried, as shares of the largest square of a spectrum: of less, spectra show hardly anything."""
@@ -35,8 +35,6 @@ FEWEST_TX = 10
 """Transmitters of which less is no evidence."""
 COMPARED = 240
 """Spectra that are looked at."""
-BLOCK = 48
-"""Spectra that are compared at once."""
 
 
 def with_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
@@ -69,12 +67,12 @@ def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: 
     unaware, learned, observed, tx_index = said.coherent[looked], said.informed[looked], observed[looked], tx_index[looked]
     if len(np.unique(tx_index)) < FEWEST_TX:
         return 0.0
-    added = np.concatenate([np.asarray(_added(*block)) for block in _blocks(unaware, observed)])
+    added = in_blocks(_added, unaware, observed)
     best = int(added.mean(0).argmax())
     gain, error = standard_error(added[:, best] - added[:, 0], tx_index)
     if gain <= SURE * error:
         return 0.0
-    raised = np.concatenate([np.asarray(_raised(*block)) for block in _blocks(learned, observed)])
+    raised = in_blocks(_raised, learned, observed)
     losses = [standard_error(raised[:, 0] - with_level, tx_index) for with_level in raised.T]
     harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= HARMLESS * error)
     return float(min(LEVELS[best], harmless, np.quantile(learned**2, DARKEST)))
@@ -90,11 +88,6 @@ def observed_opinions(said: Opinions, floor: float) -> Opinions:
 def _met(said: Opinions) -> Bool[np.ndarray, " n"]:
     """Returns on which links the coherent field has an opinion of its own."""
     return np.asarray((said.coherent != said.own).any((-2, -1)))
-
-
-def _blocks(said: np.ndarray, observed: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    starts = range(0, len(said), BLOCK)
-    return [(said[start : start + BLOCK], observed[start : start + BLOCK]) for start in starts]
 
 
 def _alike(

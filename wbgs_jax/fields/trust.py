@@ -38,7 +38,7 @@ RIDGE = 5e-3
 """Penalty on the squared weights, in the unit of the scores' spread over shares."""
 STEPS, RATE = 400, 0.03
 """Of Adam, which finds the weights."""
-BLOCK = 64
+BLOCK = 48
 """Spectra that are compared at once."""
 FAINTEST_DB = 60.0
 """Received powers are told apart down to so many decibels below free space."""
@@ -155,8 +155,13 @@ def learn_shares(
 
 def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
     """Returns the SSIM of every mixture of two spectra."""
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(truth), BLOCK)]
-    return np.concatenate([np.asarray(_ssim_of_mixtures(one[block], other[block], truth[block])) for block in blocks])
+    return in_blocks(_ssim_of_mixtures, one, other, truth)
+
+
+def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
+    """Returns what a function says of N spectra, or of several beside each other; few are on the device at once."""
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(spectra[0]), BLOCK)]
+    return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
 
 
 @jax.jit

@@ -325,6 +325,11 @@ def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.n
     return np.asarray(observe_links(field, params, dataset, index).pas)
 
 
+def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
+    """Returns what a field says as it would appear in its training data (host): what noise adds is no error of the field."""
+    return np.asarray(field.as_observed(params, jnp.asarray(pas)))
+
+
 def trained_band(dataset: Dataset) -> tuple[float, float]:
     """Returns the lowest and the highest frequency (hertz) of the training links."""
     frequencies = dataset.frequencies_hz[dataset.train]

@@ -29,7 +29,7 @@ from wbgs_jax.inference.confidence import (
     power_features,
 )
 from wbgs_jax.inference.neighbours import Neighbours, correct
-from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.inference.predictor import as_observed, observe_links
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 FEWEST, MOST = 8, 1000
@@ -72,7 +72,7 @@ def _of_spectra(
     trained, receivers = _trained(dataset), jnp.asarray(dataset.rx_positions(index), jnp.float32)
     power = None if seen.power_db is None else jnp.asarray(seen.power_db)
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
-    alike = ssim(np.asarray(field.as_observed(params, jnp.asarray(pas))), np.asarray(dataset.pas(index)))
+    alike = ssim(as_observed(field, params, pas), np.asarray(dataset.pas(index)))
     error = np.log(1 + MARGIN - np.minimum(alike, 1))
     *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
     arrays = *learned, interval(rest, dataset.tx_index[index]), np.exp(rest).mean()

@@ -22,7 +22,7 @@ from wbgs_jax.data.splits import training_links
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
 from wbgs_jax.inference.neighbours import Neighbours, correct
-from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.inference.predictor import as_observed, predict_spectra
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 20_000
@@ -75,24 +75,19 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
     own = predict_spectra(field, params, dataset, asked)
 
-    def alike(pas: Float[Array, "n 90 360"]) -> Float[np.ndarray, " n"]:
-        return ssim(np.asarray(field.as_observed(params, pas)), truth)
+    def alike(pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
+        return ssim(as_observed(field, params, pas), truth)
 
-    alone, of_training = alike(jnp.asarray(own)), _Known(field, params, dataset, dataset.train)
+    alone, of_training = alike(own), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
-        return alike(_correct(of_training.neighbours(choice), jnp.asarray(own), query)) - alone
+        return alike(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query))) - alone
 
     chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
         return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
     line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
     return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
-
-
-def _as_observed(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns what a field says as it would be observed: what noise has added is nothing that neighbours know better."""
-    return np.asarray(field.as_observed(params, jnp.asarray(predict_spectra(field, params, dataset, index))))
 
 
 _correct = jax.jit(correct)
@@ -109,9 +104,11 @@ class _Known:
         """Returns them as neighbours."""
         if choice.kind not in self._made:
             spectra = eight_bit(self.dataset, self.index)
-            predicted = None if choice.kind == "spectra" else _as_observed(*self._asked, self.dataset, self.index)
-            self._made[choice.kind] = images_of(choice.kind, spectra, predicted)
+            self._made[choice.kind] = images_of(choice.kind, spectra, self._predicted() if choice.kind == "residuals" else None)
         return make_neighbours(choice, self.dataset, self.index, self._made[choice.kind])
+
+    def _predicted(self) -> Float[np.ndarray, "m 90 360"]:
+        return as_observed(*self._asked, predict_spectra(*self._asked, self.dataset, self.index))
 
 
 def eight_bit(dataset: Dataset, index: Int[np.ndarray, " m"]) -> UInt8[np.ndarray, "m 90 360"]:
