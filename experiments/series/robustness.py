@@ -27,12 +27,12 @@ NOTE = (
     " the coherent field alone, without the searches for absent bodies, displaced surfaces, the receiver's pose, clutter and"
     " array gains. *Ahead by*: hybrid minus the best of wideband, nearest TX and 1/d². These three do not use the mesh's"
     " details: where only the mesh is wrong, they are those of the fault-free data (cells left empty), and for *all together*"
-    " those at 20 dB SNR. Seeds that not all of them have do not count there. *Missing* and *added* are shares of"
+    " those at 20 dB SNR. Only seeds that all of them share count there. *Missing* and *added* are shares of"
     " the mesh's connected pieces below 3 m: boards, legs, doors and panes, of which an object has several."
 )
 WORST = (
-    "The hybrid field is least ahead with *{fault}*, by {ahead:+.3f}, among the {count} faults with which it, wideband and the"
-    " predictors that learn nothing were run."
+    "The hybrid field's smallest lead over the best of the others, among the {count} faults with which all were run, is"
+    " {ahead:+.3f}, with *{fault}*."
 )
 
 

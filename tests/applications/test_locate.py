@@ -11,8 +11,10 @@ from rooms import METAL, field_of, rectangle
 from synthetic import RX
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
 from wbgs_jax.applications.descent import best_apart, gauss_newton, grid_over, in_blocks
 from wbgs_jax.applications.locate import Locator, locator
+from wbgs_jax.fields.noise import with_floor
 from wbgs_jax.types import Query, make_receiver
 
 HZ = np.array([1e9, 10e9])
@@ -72,6 +74,23 @@ def test_an_unknown_transmitted_power_does_not_matter(rng):
         asked.loss(jnp.asarray(place[None]), said(asked, place, "power_db").reshape(-1) + gain, 0.0)[0] for gain in (0.0, 17.0)
     ]
     np.testing.assert_allclose(losses, 0, atol=1e-6)
+
+
+@pytree
+class Noisy(MirrorsField):
+    """One whose data had noise, as it has found."""
+
+    def as_observed(self, params, pas):
+        return with_floor(pas, 0.1)
+
+
+def test_an_observation_has_the_noise_that_the_data_had(rng):
+    field = Noisy()
+    asked = locator(Trained(field, field.init(jax.random.key(0))), HZ, box=BOX, step=2.0)
+    place = jnp.asarray(somewhere(rng, 1)[0])
+    clean = said(asked, place, "pas")[0]
+    losses = [float(asked.loss(place[None], observed, 0.0)[0]) for observed in (with_floor(clean, 0.1), clean)]
+    assert losses[0] == pytest.approx(0, abs=1e-6) and losses[1] > 1e-3
 
 
 @pytest.mark.heavy

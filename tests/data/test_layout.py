@@ -4,9 +4,11 @@ import dataclasses
 import shutil
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from synthetic import tiny_scene
 
@@ -129,6 +131,16 @@ def test_one_frequency_from_the_gateway_or_the_caller(folder, where):
     assert set(load_layout(folder, frequency_hz=868e6).frequencies_hz) == {868e6}
     with pytest.raises(UserError, match=r"must be 0\.001 to 1000 GHz"):
         load_layout(folder, frequency_hz=0.0)
+
+
+def test_a_folder_with_walls_but_no_frequency_is_doubted(folder):
+    (folder / "freq.txt").unlink()
+    trimesh.creation.box().export(folder / "point_cloud.ply")
+    with pytest.warns(UserWarning, match="names no frequency: its spectra are taken to be of 1 GHz"):
+        load_layout(folder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_layout(folder, frequency_hz=2e9)
 
 
 def test_a_frequency_at_odds_with_the_file_is_refused(folder):

@@ -128,9 +128,24 @@ def test_links_of_several_receivers_go_transmitter_receiver_frequency(three):
         np.testing.assert_array_equal(dataset.receiver(i).element_positions, np.float32(three.element_positions[i]))
 
 
+def test_of_very_many_materials_the_smaller_ones_are_one(scene):
+    """By area; a thickness that is known stays."""
+    faces = np.arange(300).reshape(-1, 3)
+    corners = np.random.default_rng(0).uniform(-1, 1, (100, 3, 3)) * np.linspace(0.1, 3, 100)[:, None, None]
+    parts = [{"name": f"part {i}", "thickness": 0.1 * (i % 2)} for i in range(100)]
+    changes = {"vertices": np.float32(corners.reshape(-1, 3)), "faces": np.int32(faces), "meta": {"parts": parts}}
+    with pytest.warns(UserWarning, match="names 100 materials: all but the 64 of the largest area"):
+        materials = scene_dataset(dataclasses.replace(scene, face_part=np.arange(100, dtype=np.int32), **changes)).materials
+    assert len(materials.names) == 66 and {"others 0", "others 0.1"} < set(materials.names)
+    others = np.array([materials.names[kind].startswith("others") for kind in materials.material])
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    assert others.sum() == 36 and area[others].max() < area[~others].min()
+    np.testing.assert_allclose(materials.thickness[materials.material], [0.1 * (i % 2) for i in range(100)])
+
+
 def test_what_a_receiver_does_not_hear_is_no_link(tmp_path):
     scene = tiny_scene(4, n_rx=3, kind="power")
-    scene.power_db[1], scene.power_db[0, 2, 1] = np.nan, np.nan
+    scene.power_db[1], scene.power_db[0, 2, 1] = np.nan, -300  # as some simulators say it
     save_scene(tmp_path / "s.npz", scene)
     dataset = load_dataset(tmp_path / "s.npz")
     assert len(dataset) == 3 * 3 * 3 - 1 and np.isfinite(dataset.power_db).all()

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from synthetic import RX, tiny_dataset
 
+from wbgs_jax.data import sight
 from wbgs_jax.data.sight import in_sight
 
 
@@ -29,6 +30,20 @@ def test_a_triangle_in_between_obstructs():
     wall = trimesh.Trimesh(np.array([[1, -5, -5], [1, 5, -5], [1, 0, 8]]) + RX, [[0, 1, 2]])
     tx = np.array([[2.0, 0.1, 0.2], [0.9, 0.1, 0.2], [2.0, 30.0, 0.2]]) + RX
     np.testing.assert_array_equal(of_transmitters(with_mesh(wall, tx)), [False, True, True])
+
+
+def test_triangles_far_from_a_line_need_no_look(rng):
+    """Against all of them, line by line."""
+    triangles = rng.uniform(-2, 2, (80, 1, 3)) + rng.uniform(-0.5, 0.5, (80, 3, 3)) + RX
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(240).reshape(-1, 3), process=False)
+    dataset = with_mesh(mesh, rng.uniform(-2, 2, (200, 3)) + RX)
+    corners = dataset.vertices[dataset.faces].astype(float)
+    normals = trimesh.unitize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    start = np.asarray(dataset.receivers.position, float)[0]
+    ends = dataset.tx_positions[np.unique(dataset.tx_index, return_index=True)[1]]
+    expected = [not sight._obstructed(np.stack([start, end]), corners, normals) for end in ends]
+    assert 0 < sum(expected) < 200
+    np.testing.assert_array_equal(of_transmitters(dataset), expected)
 
 
 def test_it_agrees_with_trimeshs_search(rng):

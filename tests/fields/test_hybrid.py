@@ -226,7 +226,8 @@ def test_elsewhere_it_is_the_coherent_field(run):
 def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     nothing = np.zeros((0, 3), np.int32)
     dataset = dataclasses.replace(tiny_dataset(12), faces=nothing, materials=None, face_part=None)
-    result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
+    with pytest.warns(UserWarning, match="is its wideband half alone: box has no mesh"):
+        result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
     assert result.field.wave is None and set(result.field.known()) == {"pas", "power"}
     seen = observe_links(result.field, result.params, dataset, dataset.test)
     alone = observe_links(result.field.wideband, result.params.wideband, dataset, dataset.test)

@@ -98,6 +98,20 @@ def test_few_scores_give_a_wide_interval(rng):
     np.testing.assert_array_equal(interval(many, np.arange(199)), [9, 189])
 
 
+@pytest.mark.parametrize("n_tx", [8, 12, 30])
+@pytest.mark.parametrize("own", [0.4, 1.0])
+def test_intervals_of_links_that_are_alike_hold_for_other_transmitters(n_tx, own, rng):
+    """Ten links each: quantiles of all links would hold 82 to 88 % where there are 8 to 20 transmitters."""
+    held = []
+    for _ in range(600):
+        tx = np.repeat(np.arange(n_tx + 40), 10)
+        rest = rng.normal(size=n_tx + 40)[tx] + own * rng.normal(size=len(tx))
+        seen = tx < n_tx
+        low, high = interval(rest[seen], tx[seen])
+        held.append(np.mean((low <= rest[~seen]) & (rest[~seen] <= high)))
+    assert 0.86 < np.mean(held) < 0.94
+
+
 @pytest.mark.parametrize("n_tx", [2, 3, 5, 7])
 def test_intervals_of_few_transmitters_hold_for_another_one(n_tx, rng):
     """Whose spectra are alike: twenty of each say no more than how much transmitters differ."""
@@ -116,6 +130,18 @@ def test_of_one_validation_transmitter_nothing_is_said():
     one = dataset.train[dataset.tx_index[dataset.train] == dataset.tx_index[dataset.train[0]]]
     alone = dataclasses.replace(dataset, validation=np.tile(one, 8), train=np.setdiff1d(dataset.train, one))
     assert learn_confidence(make_field(), make_params(), alone, None) == (None, None)
+
+
+def test_answers_of_one_expectation_are_in_no_order(rng):
+    """Whatever the order of the links; two expectations are two groups."""
+    scores = np.sort(rng.uniform(0.3, 0.9, 40))
+    for truth in (scores, scores[::-1]):
+        report = calibration(Expected(*np.full((3, 40), 0.6)), truth)
+        assert report["correlation"] == 0
+        np.testing.assert_allclose(list(report["risk_coverage"].values()), truth.mean())
+    two = calibration(Expected(*np.repeat([[0.4, 0.8]], 3, 0).repeat(20, 1)), scores)
+    assert two["risk_coverage"]["0.25"] == pytest.approx(scores[20:].mean())
+    assert two["risk_coverage"]["1"] == pytest.approx(scores.mean()) and 0.8 < two["correlation"] < 1
 
 
 def test_calibration_reports_what_it_says(rng):

@@ -57,6 +57,13 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     assert neighbours is None and "the field answers alone" in line
 
 
+def test_where_they_cannot_be_asked_it_says_why(field, params):
+    for dataset, why in ((tiny_dataset(9, n_rx=2), "several receivers"), (tiny_dataset(9), "of 0 validation spectra")):
+        found = learn_neighbours(field, params, dataset)
+        assert found.neighbours is None and why in found.line
+    assert learn_neighbours(field, params, tiny_dataset(9, kind="power")) == (None, "", None)
+
+
 def test_noise_is_nothing_that_neighbours_know(field, params):
     """They would add it to every answer: the field leaves it out, and the known spectra have it."""
     noisy, dataset = NoisyField(RippleConfig()), tiny_dataset(24)

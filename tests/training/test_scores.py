@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
+from synthetic import tiny_scene, tiny_settings
 from wave_runs import PARTS, places, run_in
 
+from wbgs_jax.data import scene_dataset
 from wbgs_jax.training import scores
+from wbgs_jax.training.loop import Run
 from wbgs_jax.training.materials import with_entry
 from wbgs_jax.training.scores import make_scores, surely_better
 
@@ -94,6 +96,19 @@ def test_a_link_on_which_nothing_was_heard_speaks_for_no_candidate(run, rng, com
     assert np.isfinite(found).all()
     assert np.ptp(found[:, 1]) == 0
     np.testing.assert_array_equal(np.delete(found, 1, 1), np.delete(heard(candidates), 1, 1))
+
+
+@pytest.mark.heavy
+def test_snapshots_of_one_element_are_compared_by_their_power(rng, tmp_path):
+    """Their correlation is 1 whatever is compared."""
+    scene = tiny_scene(N_TX)
+    scene = dataclasses.replace(scene, snapshots=scene.snapshots[..., :1], element_positions=np.zeros((1, 1, 3)))
+    run = Run(scene_dataset(scene), "wave", SETTINGS, 0, tmp_path)
+    candidates = [run.state.params, other_materials(run.state.params, rng)]
+    train = jnp.asarray(run.dataset.train)
+    found, powers = (make_scores(run.field, run.cache, run.data, train, by)(candidates) for by in ("snapshots", "powers"))
+    np.testing.assert_allclose(found, powers, atol=1e-5)
+    assert np.abs(found[0] - found[1]).mean() > 1e-3
 
 
 def test_one_transmitter_is_never_sure(rng):

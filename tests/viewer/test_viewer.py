@@ -61,6 +61,15 @@ def test_the_nearest_sample_is_the_datas(coherent):
     assert sample.part == "test" and sample.distance_m < 1e-3 and -1 <= sample.ssim <= 1
 
 
+def test_a_sample_is_compared_with_what_would_be_observed(coherent, monkeypatch):
+    asker = Asker(coherent.trained, coherent.dataset, coherent.receiver)
+    truth = coherent.dataset.pas(coherent.dataset.test[:1])
+    monkeypatch.setattr(type(coherent.trained.field), "as_observed", lambda self, params, pas: jnp.asarray(truth))
+    link = int(coherent.dataset.test[0])
+    sample = asker.nearest_sample(coherent.dataset.tx_positions[link], coherent.dataset.frequencies_hz[link])
+    assert sample.ssim == pytest.approx(1, abs=1e-5)
+
+
 def test_another_material_is_seen_at_once_and_taken_back(coherent):
     before, trained = coherent.ask(PLACE, HZ).power_db, coherent.trained
     names, properties = coherent.materials()

@@ -113,7 +113,10 @@ class Locator:
 
         def at(plan: Any, frequency_hz: Float[Array, ""]) -> Array:
             query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
-            return _compared(self.what, self.field.render(params, plan, query))
+            seen = self.field.render(params, plan, query)
+            if self.what == "spectra":  # an observation has the noise that the data had
+                seen = seen._replace(pas=self.field.as_observed(params, seen.pas))
+            return _compared(self.what, seen)
 
         # Under `vmap` over frequencies what depends on places alone, such as paths, is computed once.
         seen = [jax.vmap(partial(at, plan))(self.frequencies_hz) for plan in self.plans]

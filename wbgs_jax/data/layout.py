@@ -54,7 +54,7 @@ SHORTEST, LONGEST = 1e-6, 1e6
 DIGITS = 9
 """Of the number of an image, at most."""
 NOMINAL_FREQUENCY_HZ = 1e9
-"""Stands for the frequency of a folder that names none: a model of one frequency only needs some constant."""
+"""Stands for the frequency of a folder that names none: without a mesh, a model of one frequency only needs some constant."""
 
 SPECTRA, POSITIONS, GATEWAY, FREQUENCIES, MESH = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt", "point_cloud.ply"
 INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
@@ -83,6 +83,12 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
+    if len(faces) and frequency_hz is None and gateway_hz is None and not (folder / FREQUENCIES).exists():
+        warnings.warn(
+            f"{folder} names no frequency: its spectra are taken to be of {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz; if they are not, "
+            f"give --frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
+            stacklevel=2,
+        )
     return Dataset(
         name=name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),

@@ -1,6 +1,7 @@
 """Data sets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.join import join
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
+from wbgs_jax.radio.channel import NOT_HEARD_DB
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
 
 DATA_VARIABLE = "WBGS_DATA"
@@ -19,6 +21,8 @@ DATA_VARIABLE = "WBGS_DATA"
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
 
+MOST_MATERIALS, REST = 64, "others"
+"""Materials of a scene that are told apart, and what the rest of them is called."""
 PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 """Of a split, as scene files number them."""
 
@@ -119,8 +123,24 @@ def _scene_folder() -> Path:
 def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
     """Returns which links of a scene file were observed."""
     if scene.power_db is not None:
-        return ~np.isnan(scene.power_db)
+        return scene.power_db > NOT_HEARD_DB  # nor is what is no number
     return np.ones(scene.observations.shape[:3], bool) if scene.snapshots is None else ~np.isnan(scene.snapshots).all(-1)
+
+
+def _common(labels: list[tuple[str, float]], scene: SceneFile) -> list[tuple[str, float]]:
+    """Returns the labels of parts with at most `MOST_MATERIALS` of them, the largest by area, and one for the others of every
+    thickness: where each object is of a material of its own, searching them all takes hours."""
+    if len(set(labels)) <= MOST_MATERIALS:
+        return labels
+    a, b, c = np.moveaxis(scene.vertices[scene.faces].astype(np.float64), 1, 0)
+    area = np.bincount(scene.face_part, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(labels))
+    of_label = {label: sum(area[i] for i, own in enumerate(labels) if own == label) for label in set(labels)}
+    largest = sorted(of_label, key=lambda label: (-of_label[label], label))[:MOST_MATERIALS]
+    warnings.warn(
+        f"{scene.name} names {len(of_label)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
+        stacklevel=3,
+    )
+    return [label if label in largest else (REST, label[1]) for label in labels]
 
 
 def _receivers(scene: SceneFile) -> list[Receiver]:
@@ -134,12 +154,14 @@ def _receivers(scene: SceneFile) -> list[Receiver]:
 
 
 def _materials(scene: SceneFile) -> Materials | None:
-    """Returns what the triangles are made of: parts of one material and thickness share a material. None if the file does not
-    name its parts; what is no part is a `UserError`."""
+    """Returns what the triangles are made of: parts of one material and thickness share a material, and of very many materials
+    the smaller ones do. None if the file does not name its parts; what is no part is a `UserError`."""
     parts = scene.meta.get("parts", [])
     if not isinstance(parts, list) or len(parts) <= int(scene.face_part.max(initial=-1)):
+        if parts:
+            warnings.warn(f"{scene.name} does not name all of its parts: they are taken to be of one material", stacklevel=2)
         return None
-    labels = [_label(part, i, scene.name) for i, part in enumerate(parts)]
+    labels = _common([_label(part, i, scene.name) for i, part in enumerate(parts)], scene)
     kinds = sorted(set(labels))
     material = np.array([kinds.index(label) for label in labels], np.int32)[scene.face_part]
     return Materials(material, tuple(f"{name} {thickness:g}" for name, thickness in kinds), np.array([t for _, t in kinds]))

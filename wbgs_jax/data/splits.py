@@ -156,6 +156,11 @@ def training_links(dataset: Dataset) -> Int[np.ndarray, " n"]:
     return np.sort(np.concatenate([dataset.train, dataset.validation]))
 
 
+def with_validation_trained(dataset: Dataset) -> Dataset:
+    """Returns the data set whose validation part is trained, too: what those may look at that choose nothing by it."""
+    return dataclasses.replace(dataset, train=training_links(dataset), validation=dataset.validation[:0])
+
+
 def without_test(dataset: Dataset) -> Dataset:
     """Returns the data set of its `training_links` alone."""
     return _keep_links(dataset, training_links(dataset))

@@ -4,7 +4,8 @@ left out."""
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
+from scipy.stats import rankdata
 
 from wbgs_jax.inference.confidence import LEVEL, Expected, ExpectedPower
 
@@ -17,9 +18,8 @@ def calibration(expected: Expected, scores: Float[np.ndarray, " n"]) -> dict[str
     `width`, the mean `expected` and true `scored` SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the
     mean SSIM of the surest share."""
     expectation, low, high = (np.asarray(values, np.float64) for values in expected)
-    surest = np.argsort(-expectation, kind="stable")
     held = (low <= scores) & (scores <= high)
-    return _figures(expectation, scores, surest, held) | {"width": float(np.mean(np.minimum(high, 1) - low))}
+    return _figures(expectation, scores, -expectation, held) | {"width": float(np.mean(np.minimum(high, 1) - low))}
 
 
 def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"]) -> dict[str, Any]:
@@ -27,29 +27,31 @@ def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"
     to stay within, its mean `within_db`, the mean `expected` and true `scored` error, their rank `correlation`, and the
     `risk_coverage` curve: the mean error of the surest share."""
     expectation, within = (np.asarray(values, np.float64) for values in expected)
-    surest = np.argsort(expectation, kind="stable")
-    return _figures(expectation, errors_db, surest, errors_db <= within) | {"within_db": float(within.mean())}
+    return _figures(expectation, errors_db, expectation, errors_db <= within) | {"within_db": float(within.mean())}
 
 
 def _figures(
     expectation: Float[np.ndarray, " n"],
     truth: Float[np.ndarray, " n"],
-    surest: Int[np.ndarray, " n"],
+    doubt: Float[np.ndarray, " n"],
     held: Bool[np.ndarray, " n"],
 ) -> dict[str, Any]:
-    """Returns what both have in common; `surest` is the order of the answers, the surest first."""
+    """Returns what both have in common; `doubt` orders the answers, the surest first, and those of equal doubt count as their
+    mean."""
+    ranks, equal = np.unique(doubt, return_inverse=True)
+    means = np.bincount(equal, truth, len(ranks)) / np.bincount(equal, minlength=len(ranks))
+    surest = means[np.sort(equal)]
     return {
         "level": LEVEL,
         "coverage": float(held.mean()),
         "expected": float(expectation.mean()),
         "scored": float(truth.mean()),
         "correlation": _rank_correlation(expectation, truth),
-        "risk_coverage": {
-            f"{share:g}": float(truth[surest[: max(1, round(share * len(truth)))]].mean()) for share in COVERAGES
-        },
+        "risk_coverage": {f"{share:g}": float(surest[: max(1, round(share * len(truth)))].mean()) for share in COVERAGES},
     }
 
 
 def _rank_correlation(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
-    ranks = [np.argsort(np.argsort(values, kind="stable")).astype(float) for values in (a, b)]
-    return float(np.corrcoef(ranks[0], ranks[1])[0, 1]) if len(a) > 1 else 0.0
+    """Returns Spearman's; 0 where one of both is constant."""
+    ranks = [rankdata(values) for values in (a, b)]
+    return float(np.corrcoef(*ranks)[0, 1]) if min(map(np.ptp, ranks)) > 0 else 0.0

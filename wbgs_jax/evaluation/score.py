@@ -1,5 +1,6 @@
 """How good a trained field is on held-out links: figures of every kind that field and data have, beside the baselines."""
 
+import dataclasses
 import time
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.repeatability import repeatability
 from wbgs_jax.data.sight import in_sight
+from wbgs_jax.data.splits import with_validation_trained
 from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines, can_lend
 from wbgs_jax.evaluation.beams import plane_normal
@@ -19,7 +21,7 @@ from wbgs_jax.evaluation.calibration import calibration
 from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_heard
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.confidence import Confidence, Expected, expect_many
-from wbgs_jax.inference.neighbours import for_receiver
+from wbgs_jax.inference.neighbours import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, Trained, as_observed, observe, observe_links, render_pas
 from wbgs_jax.radio import channel
 
@@ -34,12 +36,16 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
         UserError: nothing is held out, or the field knows nothing of what was observed.
     """
     index = held_out(dataset, part)
+    tested = part == "test"
+    if not tested and trained.neighbours is not None:  # they know the validation part
+        asked = without_asked(trained.neighbours, dataset.query(index))
+        trained = dataclasses.replace(trained, neighbours=asked)  # type: ignore[type-var]
+    others_know = with_validation_trained(dataset) if tested else dataset
     seen = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     said = power_of(seen, dataset)
-    power = None if said is None else power_figures(said, dataset, index)
-    tested = part == "test"  # how sure a field is has been learned from the validation part
-    if said is not None and power and trained.power_confidence and tested:
+    power = None if said is None else power_figures(said, others_know, index)
+    if said is not None and power and trained.power_confidence and tested:  # how sure it is, the validation part has told
         power |= {"confidence_db": calibrate_power(trained.power_confidence, said, dataset, index)}
     if dataset.kind == "power":
         return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
@@ -59,7 +65,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if tested and (expected := expectations(trained.confidence, dataset, index, np.asarray(seen.pas), said)):
         report["confidence"] = calibration(expected, alike)  # as it was learned
     report |= time_queries(trained, dataset)
-    beside = baselines(dataset) if can_lend(dataset, index) else {}
+    beside = baselines(others_know) if can_lend(others_know, index) else {}
     report["baselines"] = {
         name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in beside.items()
     }

@@ -9,6 +9,7 @@ Without a mesh it is the splatting field by itself.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -301,10 +302,11 @@ class HybridField(Field):
 
 
 def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
-    """Returns the coherent field of a scene; None where there is no mesh that it could use."""
+    """Returns the coherent field of a scene; None, and a warning, where there is no mesh that it could use."""
     try:
         return WaveField.make(config, scene, seed)
-    except UserError:
+    except UserError as why:
+        warnings.warn(f"the hybrid field is its wideband half alone: {why}", stacklevel=1)  # of this line: it is said once
         return None
 
 

@@ -56,6 +56,18 @@ class Neighbours:
     """L in metres."""
 
 
+def without_asked(neighbours: Neighbours | None, query: Query) -> Neighbours | None:
+    """Returns neighbours that do not know the spectra that are asked for (host); None where nothing is left."""
+    if neighbours is None:
+        return None
+    known = nearness(neighbours.tx_position, neighbours.frequency_hz, query.tx_position, query.frequency_hz, SAME_PLACE_M)
+    kept = np.flatnonzero(np.asarray(known).max(1, initial=0) < np.exp(-1))
+    if not len(kept):
+        return None
+    taken = {name: getattr(neighbours, name)[kept] for name in ("tx_position", "frequency_hz", "images")}
+    return dataclasses.replace(neighbours, **taken)
+
+
 def nearness(
     tx_position: Float[Array, "b 3"],
     frequency_hz: Float[Array, " b"],

@@ -99,6 +99,8 @@ def at_receivers(trained: T, dataset: Dataset) -> T:
 
 
 def _same(a: Receiver, b: Receiver) -> bool:
+    if np.vdot(a.orientation, b.orientation) < 0:  # a quaternion and its negative are one turn
+        b = dataclasses.replace(b, orientation=-b.orientation)
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)
 
@@ -327,7 +329,8 @@ def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.n
 
 def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns what a field says as it would appear in its training data (host): what noise adds is no error of the field."""
-    return np.asarray(field.as_observed(params, jnp.asarray(pas)))
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(pas), BLOCK)]
+    return np.concatenate([np.asarray(field.as_observed(params, jnp.asarray(pas[block]))) for block in blocks] or [pas])
 
 
 def trained_band(dataset: Dataset) -> tuple[float, float]:

@@ -27,9 +27,9 @@ FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16
 """Bytes that a checkpoint takes beside its arrays."""
 STATE = "state"
+"""Folder of the arrays in a checkpoint."""
 REMOVED = ".removed"
 """Ending of a checkpoint that is being removed."""
-"""Folder of the arrays in a checkpoint."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import itertools
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num, UInt8
@@ -21,8 +20,8 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
-from wbgs_jax.inference.neighbours import Neighbours, correct
-from wbgs_jax.inference.predictor import as_observed, predict_spectra
+from wbgs_jax.inference.neighbours import Neighbours
+from wbgs_jax.inference.predictor import as_observed, corrected, predict_spectra
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 20_000
@@ -69,10 +68,12 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     none.
     """
     links = training_links(dataset)
-    if dataset.kind == "power" or dataset.n_receivers > 1 or len(dataset.validation) < FEWEST or len(links) > MOST:
+    if dataset.kind == "power":
         return Learned()
+    if why := _why_not(dataset, len(links)):
+        return Learned(line=f"neighbours are not asked: {why}")
     asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
-    truth, query, tx = np.asarray(dataset.pas(asked)), dataset.query(asked), dataset.tx_index[asked]
+    truth, tx = np.asarray(dataset.pas(asked)), dataset.tx_index[asked]
     own = predict_spectra(field, params, dataset, asked)
 
     def alike(pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
@@ -81,7 +82,7 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     alone, of_training = alike(own), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
-        return alike(np.asarray(_correct(of_training.neighbours(choice), jnp.asarray(own), query))) - alone
+        return alike(corrected(of_training.neighbours(choice), own, dataset, asked)) - alone
 
     chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
@@ -90,7 +91,13 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
 
 
-_correct = jax.jit(correct)
+def _why_not(dataset: Dataset, known: int) -> str:
+    """Returns why a data set can have no neighbours; nothing, where it can."""
+    if dataset.n_receivers > 1:
+        return "the data have several receivers"
+    if len(dataset.validation) < FEWEST:
+        return f"of {len(dataset.validation)} validation spectra there is nothing to learn whether that gains"
+    return f"{known:,} known spectra are more than {MOST:,}" if known > MOST else ""
 
 
 class _Known:

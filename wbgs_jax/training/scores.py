@@ -132,11 +132,13 @@ def _score(
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
         seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
-        if batch.snapshots is not None and compared == "snapshots" and seen.snapshots is not None:
-            return log_decorrelation(seen.snapshots, batch.snapshots)[0]
-        if batch.snapshots is not None and compared == "covariances" and seen.covariance is not None:
-            return surprise(seen.covariance, batch.snapshots)[0]
-        if batch.pas is None or compared == "powers":
+        elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
+        several = batch.snapshots if elements > 1 else None  # that of a single element tells its power only
+        if several is not None and compared == "snapshots" and seen.snapshots is not None:
+            return log_decorrelation(seen.snapshots, several)[0]
+        if several is not None and compared == "covariances" and seen.covariance is not None:
+            return surprise(seen.covariance, several)[0]
+        if batch.pas is None or compared == "powers" or elements == 1:
             received = batch.received_db
             assert received is not None and seen.power_db is not None, "images are searched by spectra"
             unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])

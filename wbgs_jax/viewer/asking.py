@@ -20,7 +20,7 @@ from wbgs_jax.inference.confidence import Expected, expected_ssim
 from wbgs_jax.inference.floor import Plane, ask_plane, pieces
 from wbgs_jax.inference.links import describe_interactions, names_of
 from wbgs_jax.inference.neighbours import SAME_PLACE_M, correct, for_receiver
-from wbgs_jax.inference.predictor import Trained, check_power
+from wbgs_jax.inference.predictor import Trained, as_observed, check_power
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
 from wbgs_jax.types import Query, Receiver, make_query
@@ -193,10 +193,10 @@ class Asker:
         data, index = self.dataset, np.array([link])
         position, frequency = data.tx_positions[link], float(data.frequencies_hz[link])
         truth = np.asarray(data.pas(index))
-        said = self.ask(position, frequency).pas
+        said = as_observed(self.trained.field, self.trained.params, self.ask(position, frequency).pas[None])
         parts = {"training": data.train, "validation": data.validation, "test": data.test}
         part = next((name for name, links in parts.items() if link in links), "other")
-        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said[None], truth)[0]))
+        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said, truth)[0]))
 
     def _listed(self, arrived: Arrivals, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
         power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
