@@ -28,10 +28,11 @@ from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.confidence import learn_confidence
+from wbgs_jax.training.data import check_data
 from wbgs_jax.training.estimate import duration_words, expected_seconds
 from wbgs_jax.training.interrupts import Interrupted
 from wbgs_jax.training.lock import locked
-from wbgs_jax.training.loop import TrainResult, check_data, train
+from wbgs_jax.training.loop import TrainResult, train
 from wbgs_jax.training.manifest import write_manifest
 from wbgs_jax.training.neighbours import Learned, learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder

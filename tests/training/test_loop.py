@@ -18,7 +18,8 @@ from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.wideband import WidebandField
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.loop import Interrupted, Run, check_data, train
+from wbgs_jax.training.data import check_data
+from wbgs_jax.training.loop import Interrupted, Run, train
 
 STEPS = 8
 PLAIN = ("ripple", toy_settings())

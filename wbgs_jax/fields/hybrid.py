@@ -306,7 +306,8 @@ def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
     try:
         return WaveField.make(config, scene, seed)
     except UserError as why:
-        warnings.warn(f"the hybrid field is its wideband half alone: {why}", stacklevel=1)  # of this line: it is said once
+        reason = str(why).split(";")[0]  # what to do about it is for those who asked for a coherent field
+        warnings.warn(f"the hybrid field is its wideband half alone: {reason}", stacklevel=1)  # of this line: it is said once
         return None
 
 

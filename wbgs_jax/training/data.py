@@ -1,14 +1,22 @@
-"""A dataset on the device: snapshots or 8-bit pixels of all links, from which a step makes the spectra of its batch."""
+"""A dataset on the device, if a field can be trained on it: snapshots or 8-bit pixels of all links, of which a step makes the
+spectra of its batch."""
+
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key, UInt8
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.radio.array import cbf, normalise, pas_directions, snapshot_to_pas, steering_vector
 from wbgs_jax.types import Batch, Links, Receiver
+
+FAR_M = 500.0
+"""From the origin: there single precision rounds positions to 30 micrometres, a hundredth of a wavelength at 100 GHz."""
 
 
 @pytree
@@ -77,3 +85,22 @@ def training_data(dataset: Dataset) -> TrainingData:
         images=None if dataset.images is None else jnp.asarray(dataset.images),
         power_db=None if dataset.power_db is None else jnp.asarray(dataset.power_db, jnp.float32),
     )
+
+
+def check_data(dataset: Dataset, field: type[Field]) -> None:
+    """Raises a `UserError` for data that a field cannot be trained on, before any work is done, and warns of coordinates that
+    are too large."""
+    if len(dataset.train) == 0:
+        raise UserError(f"{dataset.name} has no training spectra; choose another split")
+    far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
+    if far > FAR_M:
+        warnings.warn(
+            f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
+            "mesh, transmitters and receivers",
+            stacklevel=1,  # of this line, whoever checks: it is said once
+        )
+    if dataset.kind == "power" and "power" not in field.gives:
+        able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)
+        raise UserError(
+            f"{dataset.name} holds received powers, of which the {field.name} field knows nothing; choose one of: {able}"
+        )

@@ -20,6 +20,7 @@ from jaxtyping import Int
 
 from wbgs_jax._util.devices import devices_for
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.memory import give_back
 from wbgs_jax._util.processes import any_process, by_first, check_alike, is_first
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.checksum import checksum
@@ -27,10 +28,10 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
-from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.fields import Field, get_field
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.controls import Context, Control, Edit, OfPart, Say, silent
-from wbgs_jax.training.data import TrainingData, training_data
+from wbgs_jax.training.data import TrainingData, check_data, training_data
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
 from wbgs_jax.training.moments import map_moments
@@ -43,9 +44,6 @@ CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "sea
 """Host controls by the names that fields and settings give them."""
 CALIBRATED, BLOCK = 720, 16
 """Validation links that a field is calibrated by, at most, and how many at a time."""
-
-FAR_M = 500.0
-"""From the origin: there single precision rounds positions to 30 micrometres, a hundredth of a wavelength at 100 GHz."""
 
 
 def make_control(name: str, settings: Settings) -> Control | None:
@@ -192,6 +190,7 @@ class Run:
                 if edit.report:
                     self.log({"step": step} | edit.report)
                 acted = True
+        give_back()
         return acted
 
     def _commit(self, number: int, edit: Edit) -> None:
@@ -265,25 +264,6 @@ def _shapes(tree: Any) -> list[tuple[int, ...]]:
     return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
 
 
-def check_data(dataset: Dataset, field: type[Field]) -> None:
-    """Raises a `UserError` for data that a field cannot be trained on, before any work is done, and warns of coordinates that
-    are too large."""
-    if len(dataset.train) == 0:
-        raise UserError(f"{dataset.name} has no training spectra; choose another split")
-    far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
-    if far > FAR_M:
-        warnings.warn(
-            f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
-            "mesh, transmitters and receivers",
-            stacklevel=1,  # of this line, whoever checks: it is said once
-        )
-    if dataset.kind == "power" and "power" not in field.gives:
-        able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)
-        raise UserError(
-            f"{dataset.name} holds received powers, of which the {field.name} field knows nothing; choose one of: {able}"
-        )
-
-
 def train(
     dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, resume: bool = False, devices: int = 0
 ) -> TrainResult:
@@ -316,6 +296,7 @@ def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> 
     """Does what is due before the first step, and saves what that took."""
 
     def say(stage: str) -> None:
+        give_back()
         progress.stage(stage)
         if any_process(interrupt["set"]):
             raise Interrupted("stopped before the first step; run the same command with --resume to begin again")
