@@ -57,13 +57,6 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     assert neighbours is None and "the field answers alone" in line
 
 
-def test_where_they_cannot_be_asked_it_says_why(field, params):
-    for dataset, why in ((tiny_dataset(9, n_rx=2), "several receivers"), (tiny_dataset(9), "of 0 validation spectra")):
-        found = learn_neighbours(field, params, dataset)
-        assert found.neighbours is None and why in found.line
-    assert learn_neighbours(field, params, tiny_dataset(9, kind="power")) == (None, "", None)
-
-
 def test_noise_is_nothing_that_neighbours_know(field, params):
     """They would add it to every answer: the field leaves it out, and the known spectra have it."""
     noisy, dataset = NoisyField(RippleConfig()), tiny_dataset(24)
@@ -116,11 +109,14 @@ def test_the_test_part_changes_nothing(field, params, rng):
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
 
-def test_data_that_cannot_have_any_have_none(field, params, monkeypatch):
+def test_data_that_cannot_have_any_have_none_and_say_why(field, params, monkeypatch):
     dataset = hold_out_validation(tiny_dataset(24))
     fewer = dataclasses.replace(dataset, validation=dataset.validation[: FEWEST - 1])
-    others = hold_out_validation(tiny_dataset(24, n_rx=2)), hold_out_validation(tiny_dataset(24, kind="power"))
-    for data in (fewer, *others):
-        assert learn_neighbours(field, params, data) == (None, "", None)
+    several = hold_out_validation(tiny_dataset(24, n_rx=2))
+    for data, why in ((fewer, f"of {FEWEST - 1} validation spectra"), (several, "several receivers")):
+        found = learn_neighbours(field, params, data)
+        assert found.neighbours is None is found.of_training and why in found.line
+    assert learn_neighbours(field, params, hold_out_validation(tiny_dataset(24, kind="power"))) == (None, "", None)
     monkeypatch.setattr(module, "MOST", len(dataset.train))
-    assert learn_neighbours(field, params, dataset) == (None, "", None) and len(dataset.train) < MOST
+    found = learn_neighbours(field, params, dataset)
+    assert found.neighbours is None and "known spectra are more than" in found.line and len(dataset.train) < MOST

@@ -126,7 +126,7 @@ def test_gains_that_are_not_finite_are_not_sure(rng, wrong):
 
 
 def test_more_errors_than_random_flips_can_tell_are_counted(rng):
-    gains = rng.normal(1, 0.1, 200)
-    assert surely_better(gains, np.arange(200), 6.0)
-    assert not surely_better(rng.normal(0.3, 1, 200), np.arange(200), 6.0)
-    assert not surely_better(-gains, np.arange(200), 6.0)
+    noise = rng.normal(size=200)
+    noise = (noise - noise.mean()) / noise.std(ddof=1)
+    for errors, sure in ((6.1, True), (5.9, False), (-6.1, False)):
+        assert surely_better(noise + errors / np.sqrt(200), np.arange(200), 6.0) is sure
