@@ -83,17 +83,11 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
-    if len(faces) and frequency_hz is None and gateway_hz is None and not (folder / FREQUENCIES).exists():
-        warnings.warn(
-            f"{folder} names no frequency: its spectra are taken to be of {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz; if they are not, "
-            f"give --frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
-            stacklevel=2,
-        )
     return Dataset(
         name=name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),
         tx_positions=positions,
-        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz),
+        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz, walls=len(faces) > 0),
         receiver_index=np.zeros(len(images), int),
         tx_index=tx_index,
         train=split["train"],
@@ -181,9 +175,18 @@ def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
     return np.array([_vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
 
 
-def _read_frequencies(path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None) -> Float[np.ndarray, " n"]:
+def _read_frequencies(
+    path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None, walls: bool
+) -> Float[np.ndarray, " n"]:
     if not path.exists():
-        single = next(f for f in (wanted_hz, gateway_hz, NOMINAL_FREQUENCY_HZ) if f is not None)
+        single = wanted_hz if wanted_hz is not None else gateway_hz
+        if single is None and walls:
+            warnings.warn(
+                f"{path.parent} names no frequency: its spectra are taken to be of {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz; if they "
+                f"are not, give --frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
+                stacklevel=3,
+            )
+        single = NOMINAL_FREQUENCY_HZ if single is None else single
         if not LOWEST_FREQUENCY_HZ <= single <= HIGHEST_FREQUENCY_HZ:
             raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; it must be 0.001 to 1000 GHz")
         return np.full(n, single, np.float64)

@@ -130,14 +130,15 @@ def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
 def _common(labels: list[tuple[str, float]], scene: SceneFile) -> list[tuple[str, float]]:
     """Returns the labels of parts with at most `MOST_MATERIALS` of them, the largest by area, and one for the others of every
     thickness: where each object is of a material of its own, searching them all takes hours."""
-    if len(set(labels)) <= MOST_MATERIALS:
+    kinds = sorted(set(labels))
+    if len(kinds) <= MOST_MATERIALS:
         return labels
     a, b, c = np.moveaxis(scene.vertices[scene.faces].astype(np.float64), 1, 0)
-    area = np.bincount(scene.face_part, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(labels))
-    of_label = {label: sum(area[i] for i, own in enumerate(labels) if own == label) for label in set(labels)}
-    largest = sorted(of_label, key=lambda label: (-of_label[label], label))[:MOST_MATERIALS]
+    of_face = np.array([kinds.index(label) for label in labels])[scene.face_part]
+    area = np.bincount(of_face, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(kinds))
+    largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:MOST_MATERIALS]}
     warnings.warn(
-        f"{scene.name} names {len(of_label)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
+        f"{scene.name} names {len(kinds)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
         stacklevel=3,
     )
     return [label if label in largest else (REST, label[1]) for label in labels]

@@ -315,8 +315,7 @@ def corrected(
     """Returns predicted spectra of some of a dataset's links with what the neighbours say."""
     if neighbours is None:
         return pas
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(index), BLOCK)]
-    return np.concatenate([_correct(neighbours, pas[block], dataset.query(index[block])) for block in blocks])
+    return np.concatenate([_correct(neighbours, pas[block], dataset.query(index[block])) for block in _slices(len(index))])
 
 
 _correct = jax.jit(correct)
@@ -329,8 +328,13 @@ def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.n
 
 def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns what a field says as it would appear in its training data (host): what noise adds is no error of the field."""
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(pas), BLOCK)]
-    return np.concatenate([np.asarray(field.as_observed(params, jnp.asarray(pas[block]))) for block in blocks] or [pas])
+    seen = [np.asarray(field.as_observed(params, jnp.asarray(pas[block]))) for block in _slices(len(pas))]
+    return np.concatenate(seen or [pas])
+
+
+def _slices(count: int) -> list[slice]:
+    """Returns blocks of so many spectra that are there already."""
+    return [slice(start, start + BLOCK) for start in range(0, count, BLOCK)]
 
 
 def trained_band(dataset: Dataset) -> tuple[float, float]:
