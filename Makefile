@@ -111,8 +111,9 @@ typecheck: setup  ## mypy
 bench: setup  ## measure this machine, compare: make bench [GATE=1 to fail on a regression] [ARGS="--only renderer --update"]
 	$(PY) -m experiments.bench $(if $(filter-out 0,$(GATE)),--gate) $(ARGS)
 
-gpu-check: setup  ## check a GPU in nine minutes: parity with the CPU, times, memory, one JSON [OUT=folder]; without one a stand-in
-	$(PY) -m experiments.gpu_check $(if $(OUT),--out $(OUT)) $(ARGS)
+gpu-check: setup  ## check a GPU in pieces of eight minutes that continue: parity, times, trainings [NEXT=1 ONLY=piece MINUTES= OUT= ARGS=--list]
+	$(PY) -m experiments.gpu_check $(if $(NEXT),--next) $(if $(ONLY),--only $(ONLY)) $(if $(MINUTES),--minutes $(MINUTES)) \
+		$(if $(OUT),--out $(OUT)) $(ARGS)
 
 experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE=quick|paper MINUTES=60 ARGS="--only table1"]
 	$(PY) -m experiments.runner --profile $(PROFILE) $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)

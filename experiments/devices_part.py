@@ -26,6 +26,7 @@ from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.training import loop
+from wbgs_jax.training.controls import Context
 from wbgs_jax.training.step import loss_and_gradients
 
 STEPS, EVERY, BATCH, TRANSMITTERS = 40, 5, 8, 24
@@ -151,7 +152,7 @@ def _gradients(run: loop.Run) -> Callable[[], Any]:
 
 def _control(run: loop.Run) -> None:
     for number, control in enumerate(run.controls):
-        context = loop.Context(run.data, run.cache, run.dataset.train)
+        context = Context(run.data, run.cache, run.dataset.train)
         control.apply(run.field, run.state.params, run.state.statistics[number], context, 20, np.random.default_rng(0))
 
 

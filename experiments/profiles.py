@@ -84,6 +84,9 @@ PROFILES = {
         fields={"wideband": GAUSSIANS},
         validation=True,
     ),
+    "precision": Profile(
+        "paper", 2000, 4000, {"density": {"every": 0}}, {"wideband": {"gaussians": 800}}, validation=True, scored_tx=SCORED_FEW
+    ),
     "choices": Profile("cpu", 1500, 600, fields={"wideband": BEFORE}),
     "choices_octaves4": Profile("cpu", 1500, 600, fields={"wideband": BEFORE | {"frequency_octaves": 4}}),
 }

@@ -36,6 +36,8 @@ def _batch(size: int, steps: int) -> Variant:
     return Variant({"optim": {"batch": size}, "field": {"fusion": 1}}, steps=steps, rates=(size / 8) ** 0.5)
 
 
+PRECISIONS = ("precision_float32", "precision_tf32", "precision_bfloat16")
+"""Of what the networks multiply."""
 RATES = ("1e-3", "2e-3", "3e-3", "8e-3", "1.6e-2", "3.2e-2")
 """Learning rates of the networks; the presets' is 4e-3."""
 HIGHER_RATE = 1.6e-2
@@ -211,6 +213,7 @@ TO_OURS = {
 }
 """Each with all changes before it, and as many spectra as the paper's form saw one at a time."""
 VARIANTS: dict[str, Variant] = {
+    **{name: _of_field(precision=name.removeprefix("precision_")) for name in PRECISIONS},
     **TABLES,
     **GAUSSIANS_AND_NETWORKS,
     **SCHEDULES,

@@ -19,6 +19,7 @@ from wbgs_jax import (
     render_dense,
     render_splats,
 )
+from wbgs_jax.splat.tiles import Tiling
 
 Render = Callable[[Gaussians, Float[Array, "n b"], Float[Array, "n b"]], Float[Array, "b 90 360"]]
 
@@ -91,13 +92,13 @@ def random_gaussians(rng: np.random.Generator, n: int) -> Gaussians:
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
-def random_scene(n: int, b: int, seed: int) -> Scene:
-    """Returns a scene for up to b queries."""
+def random_scene(n: int, b: int, seed: int, tiling: Tiling | None = None) -> Scene:
+    """Returns a scene for up to b queries, in tiles of the device's size or of another."""
     rng = np.random.default_rng([seed, n])
     gaussians, receiver = random_gaussians(rng, n), make_receiver([0.0, 0.0, 0.0])
     attenuation, signal = (jnp.asarray(rng.uniform(0, 0.6, (n, b)), jnp.float32) for _ in range(2))
     cotangent = jnp.asarray(rng.normal(size=(b, 90, 360)), jnp.float32)
-    limits = measure_limits(project(gaussians, receiver), 1.05)
+    limits = measure_limits(project(gaussians, receiver), 1.05, tiling)
     return Scene(gaussians, receiver, attenuation, signal, cotangent, limits)
 
 

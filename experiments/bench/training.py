@@ -12,19 +12,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from experiments.bench.timing import Effort, Report, interleaved
 from experiments.profiles import TINY
 from wbgs_jax._util.command import say
-from wbgs_jax.config import Settings, changed, limit_steps
+from wbgs_jax.config import Settings, changed
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.train import default_preset
+from wbgs_jax.training.data import limited
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients
 
@@ -47,7 +47,7 @@ def settings(effort: Effort) -> Settings:
 def start_run(effort: Effort, folder: Path, epoch_steps: int | None = None) -> Run:
     """A training of scene 1 before its first step."""
     dataset = hold_out_validation(load_dataset(1))
-    chosen = limit_steps(settings(effort), len(dataset.train))
+    chosen = limited(settings(effort), dataset, get_field(FIELD))
     if epoch_steps:
         chosen = changed(chosen, {"loop": {"epoch_steps": epoch_steps}})
     return Run(dataset, FIELD, chosen, effort.seed, folder)
@@ -91,7 +91,9 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
     planned = wideband.WidebandPlan(geometry, None, field.frame, receiver, field.config)  # features: in every call
     even = jnp.full((params.gaussians.alive.size, len(index)), 0.3)  # the time does not depend on these values
     splatting = (geometry.splats, geometry.jobs, even, even)
-    image, gradients = 0.9 * run.dataset.pas(np.asarray(index)), params
+    observed = run.data.pas(index)
+    assert observed is not None, "scenes hold snapshots"
+    image, gradients = 0.9 * observed, params
     calls: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         "plan": (plan, (params,)),
         "networks": (networks, (params, query, planned)),

@@ -1,14 +1,17 @@
-"""Check a GPU: is everything right there, and how fast is it? One command, at most nine minutes, one JSON.
+"""Check a GPU in pieces of at most eight minutes each, every one of which continues where an earlier call of it ended.
 
-    python -m experiments.gpu_check [--minutes 9] [--only parity renderer] [--out folder]
+    python -m experiments.gpu_check [--minutes 8] [--next | --only paper_scene1] [--list] [--out folder] [--runs folder]
 
-Parity of values and gradients with the CPU, a table of the renderer's times and memory, the coherent field, queries a second,
-and the training of the preset `paper` with what time is left. Everything is in experiments/results/gpu_check_<device>.json as
-soon as it is known; what was cut or failed is listed there and at the end. The exit code is 0 when parity holds. Without a GPU
-a stand-in runs: small sizes, the program that a GPU would compile run on the CPU, and memory by the compilers.
+`parity` compares values and gradients with the CPU; `renderer` is a table of times; the others train the paper's form, WRF-GS
+and the default field to the last step, and score them on all test transmitters (training.py). By default all pieces that are
+not done run, one after another; `--next` runs the first that is missing or part. Each has a result file with its provenance,
+experiments/results/gpu/<piece>_<device>.json, which is whole after every figure, and a training has its checkpoints in
+runs/gpu/<piece>: take both along to continue on another machine. The exit code is 2 where parity does not hold.
+
+Without a GPU a stand-in runs: tiny sizes, the kernels interpreted, and results beside the checkpoints.
 """
 
-# Nothing here may touch JAX: the sections, one process after the other, need all of the device's memory.
+# Nothing here may touch JAX: the pieces, one process after the other, need all of the device's memory.
 import contextlib
 import json
 import os
@@ -19,53 +22,103 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
-from experiments.gpu_check.record import Record, not_done, parity_holds
+from experiments.gpu_check import progress
+from experiments.gpu_check.record import PART, PIECES, TRAININGS, Name, State, begin, parity_holds
 from wbgs_jax._util.command import run_command, say
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax._util.files import read_json
 
-RESULTS = Path(__file__).parents[1] / "results"
-Name = Literal["parity", "renderer", "coherent", "queries", "compiled", "paper"]
-SHARES: dict[Name, float] = {"parity": 0.35, "renderer": 0.15, "coherent": 0.15, "queries": 0.1, "compiled": 0.15, "paper": 1.0}
-"""Sections as they run, and the share of the whole time that each may take, if it is left: the training takes the rest."""
-STAND_IN_ONLY = ("compiled",)
-SMALL = ("parity", "coherent", "queries", "paper")
-"""Sections whose stand-ins compute next to nothing: ..."""
-CHEAP = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"}
-"""... half of the time that compiling them takes is for their speed."""
-MODULE = "experiments.gpu_check.sections"
 ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "experiments" / "results" / "gpu"
+RUNS = ROOT / "runs" / "gpu"
+CHEAP = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"}
+"""Of the stand-in, which computes next to nothing: half of the time that compiling takes is for speed."""
+MODULE = "experiments.gpu_check.pieces"
 START_S = 60.0
 """What finding the device may take."""
-GRACE_S = 8.0
-"""A section is asked to end this long before its process is ended."""
-LEAST_S = 15.0
-"""With less time a section does not begin."""
+GRACE_S = 45.0
+"""A piece is interrupted so long before its process is ended: a program may have to be compiled until an epoch is over."""
+INTERRUPTED = 130
+"""Exit code of a piece that another call continues, beside `PART`."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Check the GPU of this machine, or what can be checked without one."""
+    """Check the GPU of this machine, piece by piece, or what can be checked without one."""
 
-    minutes: float = 9.0
-    """The most that all of it takes."""
+    minutes: float = 8.0
+    """The most that a piece takes in this call."""
     only: tuple[Name, ...] = ()
-    """Sections; all by default. The file keeps the others, of an earlier run on the same device."""
-    out: Path = RESULTS
-    """Folder of the result file."""
+    """These pieces, done or not: what is done is measured anew, and what is trained scored anew."""
+    next: bool = False
+    """The first piece that is missing or part, and no other."""
+    list: bool = False
+    """Print the pieces and how they stand, and run none."""
+    out: Path | None = None
+    """Folder of the result files; by default experiments/results/gpu, without a GPU RUNS/stand_in/results."""
+    runs: Path = RUNS
+    """Folder of checkpoints and logs."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A device, and the folders of results and of checkpoints."""
+
+    device: dict[str, Any]
+    out: Path
+    runs: Path
 
     @property
-    def sections(self) -> list[Name]:
-        """Those that are wanted, in their order."""
-        return [name for name in SHARES if not self.only or name in self.only]
+    def stand_in(self) -> bool:
+        """Whether there is no GPU."""
+        return self.device["platform"] == "cpu"
+
+    def path(self, name: str) -> Path:
+        """Returns the result file of a piece."""
+        return self.out / f"{name}_{self.device['name']}.json"
+
+    def found(self, name: str) -> Path | None:
+        """Returns the result file that there is: a training counts wherever it ran, since its checkpoints are carried along."""
+        own = self.path(name)
+        others = sorted(self.out.glob(f"{name}_*.json")) if name in TRAININGS else []
+        same = [path for path in others if read_json(path)["stand_in"] == self.stand_in]
+        return own if own.exists() else next(iter(same), None)
+
+    def state(self, name: str) -> State | None:
+        """Returns how a piece stands; None if it is missing."""
+        path = self.found(name)
+        state = read_json(path)["state"] if path else None
+        return "part" if state == "running" else state
+
+    def earlier(self, name: str) -> dict[str, Any] | None:
+        """Returns the result that a call of a piece continues: a measurement only if the same code made it; of a training that
+        was done or has failed, its calls."""
+        path, state = self.found(name), self.state(name)
+        if path is None:
+            return None
+        result = read_json(path)
+        if name in TRAININGS:
+            return result if state == "part" else result | {"figures": {}}
+        return result if state == "part" and result["provenance"] == self.device["environment"] else None
+
+    def line(self, name: str) -> str:
+        """Returns a line that shows how a piece stands."""
+        path = self.found(name)
+        if path is None:
+            return f"{name}: missing"
+        result = read_json(path)
+        training = result["figures"].get("training", {})
+        steps = f", step {training.get('steps', 0)} of {training['of']}" if "of" in training else ""
+        reason = f", {result['reason']}" if result["reason"] else ""
+        return f"{name}: {self.state(name)}{steps}, {result['seconds']:.0f} s in {len(result['calls'])} calls{reason}"
 
 
 def start(*arguments: str, **options: Any) -> subprocess.Popen[str]:
-    """Starts the module of the sections in a process group of its own."""
+    """Starts the module of the pieces in a process group of its own."""
     command = [sys.executable, "-m", MODULE, *arguments]
     return subprocess.Popen(command, cwd=ROOT, text=True, start_new_session=True, **options)
 
@@ -78,99 +131,129 @@ def end(process: subprocess.Popen[str]) -> None:
 
 
 def find_device() -> dict[str, Any]:
-    """Returns what `sections.device` says.
+    """Returns the device of `pieces.device`.
 
     Raises:
         UserError: JAX does not start here.
     """
     process = start("device", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
-        said, complaints = process.communicate(timeout=START_S)
+        printed, complaints = process.communicate(timeout=START_S)
     except subprocess.TimeoutExpired:
         end(process)
         raise UserError(f"JAX found no device within {START_S:.0f} s; look at `nvidia-smi` and JAX_PLATFORMS") from None
     if process.returncode:
         last = (complaints.strip().splitlines() or ["no reason given"])[-1]
         raise UserError(f"JAX does not start here: {last}")
-    return json.loads(said.strip().splitlines()[-1])
+    return json.loads(printed.strip().splitlines()[-1])
 
 
-def run_section(name: str, seconds: float, path: Path, stand_in: bool) -> None:
-    """Runs a section within so many seconds, and keeps how it ended."""
-    record, begin = Record(path, name), time.monotonic()
-    record.begin(read_json(path)["provenance"]["commit"])
-    wanted = (name, str(seconds - GRACE_S), str(path), "yes" if stand_in else "no")
-    process = start(*wanted, stderr=subprocess.PIPE, env=os.environ | (CHEAP if stand_in and name in SMALL else {}))
+def run_piece(check: Check, name: str, seconds: float) -> None:
+    """Runs a piece for so many seconds at most, and keeps how it ended."""
+    earlier, inherited = check.earlier(name), check.found(name)
+    record, folder, started = begin(check.path(name), name, check.device, earlier), check.runs / name, time.monotonic()
+    if inherited not in (None, record.path):
+        inherited.unlink()  # begun on another device: it continues under the name of this one
+    log = check.runs / f"{name}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    grace = min(GRACE_S, seconds / 2)
+    arguments = (name, str(seconds - grace), str(record.path), "yes" if check.stand_in else "no", str(folder))
+    state: State = "part"
+    reason = "interrupted"
+    with log.open("w") as stream:
+        process = start(*arguments, stderr=stream, env=os.environ | (CHEAP if check.stand_in else {}))
+        try:
+            code = wait(process, seconds - grace, grace)
+            state, reason = ending(code, log.read_text(errors="replace"))
+        except BaseException:
+            interrupt(process, grace)
+            raise
+        finally:
+            end(process)
+            if name in TRAININGS:
+                record.add("training", progress.figures_of(folder))
+            record.finish(state, time.monotonic() - started, reason)
+
+
+def wait(process: subprocess.Popen[str], seconds: float, grace: float) -> int | None:
+    """Returns the exit code of a process that is interrupted after so many seconds; None if it goes on after the grace."""
     try:
-        _, complaints = process.communicate(timeout=seconds)
-        state, reason = ("done", "") if process.returncode == 0 else ("failed", last_line(complaints, process.returncode))
+        return process.wait(seconds)
     except subprocess.TimeoutExpired:
-        state, reason = "cut", f"it took more than its {seconds:.0f} s"
-    except BaseException:
-        record.set_state("cut", reason="interrupted")
-        raise
-    finally:
-        end(process)
-    more: dict[str, Any] = {"reason": reason} if reason else {}
-    record.set_state(state, seconds=round(time.monotonic() - begin, 1), **more)  # type: ignore[arg-type]
+        return interrupt(process, grace)
 
 
-def last_line(complaints: str, code: int) -> str:
-    """Returns the last line that a process said of its failure."""
-    lines = [line for line in complaints.strip().splitlines() if not line.startswith((" ", "For simplicity", "---"))]
-    return lines[-1] if lines else f"exit code {code}"
+def interrupt(process: subprocess.Popen[str], grace: float) -> int | None:
+    """Interrupts a process as Ctrl-C does, and returns its exit code; None if it goes on after the grace."""
+    with contextlib.suppress(ProcessLookupError):
+        process.send_signal(signal.SIGINT)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.wait(grace)
+    return None
 
 
-def whole(device: dict[str, Any], command: Command, path: Path) -> dict[str, Any]:
-    """Returns a result file without the results of the sections that are about to run."""
-    known = read_json(path)["sections"] if command.only and path.exists() else {}
-    about = {"command": "python -m experiments.gpu_check", "minutes": command.minutes, "stand_in": device["platform"] == "cpu"}
-    kept = {name: section for name, section in known.items() if name not in command.only}
-    return about | {"device": device, "provenance": device.pop("environment"), "sections": kept}
+def ending(code: int | None, log: str) -> tuple[State, str]:
+    """Returns the state of a piece by the exit code of its process, and the reason of a state that is not `done`."""
+    if code == 0:
+        return "done", ""
+    if code in (PART, INTERRUPTED, -signal.SIGINT, None):
+        return "part", "the time was up"
+    lines = [line for line in log.strip().splitlines() if not line.startswith((" ", "For simplicity", "---"))]
+    return "failed", lines[-1] if lines else f"exit code {code}"
 
 
-def check(command: Command) -> None:
-    """Runs all sections.
+def chosen(check: Check, command: Command) -> list[str]:
+    """Returns the pieces to run, in their order."""
+    if command.only:
+        return [name for name in PIECES if name in command.only]
+    if command.next:
+        return [name for name in PIECES if check.state(name) in (None, "part")][:1]
+    return [name for name in PIECES if check.state(name) != "done"]
+
+
+def make_check(device: dict[str, Any], command: Command) -> Check:
+    """Returns the folders for a device: a stand-in has its own, so that nothing of it is taken for a GPU's."""
+    if device["platform"] != "cpu":
+        return Check(device, (command.out or RESULTS).resolve(), command.runs.resolve())
+    runs = command.runs.resolve() / "stand_in"
+    return Check(device, (command.out or runs / "results").resolve(), runs)
+
+
+def run(command: Command) -> None:
+    """Runs the pieces that are wanted.
 
     Raises:
         UserError: parity does not hold.
     """
-    deadline = time.monotonic() + 60 * command.minutes
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the section is ended too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that the piece is ended too
     device = find_device()
-    stand_in, path = device["platform"] == "cpu", command.out / f"gpu_check_{device['name']}.json"
-    write_json(path, whole(device, command, path))
-    if stand_in:
+    check = make_check(device, command)
+    if check.stand_in:
         there = ", although nvidia-smi is here: is the extra `cuda` installed?" if shutil.which("nvidia-smi") else ""
         say(f"JAX sees no GPU{there}: a stand-in on the CPU, with small sizes")
-    for name in command.sections:
-        if name in STAND_IN_ONLY and not stand_in:
-            continue
-        seconds = min(60 * command.minutes * SHARES[name], deadline - time.monotonic())
-        if seconds < LEAST_S:
-            Record(path, name).set_state("left out", reason="the time was up", figures={})
-            continue
-        say(f"{name}: at most {seconds:.0f} s")
-        run_section(name, seconds, path, stand_in)
-    close(path, command)
+    names = [] if command.list else chosen(check, command)
+    for name in names:
+        say(f"{name}: at most {60 * command.minutes:.0f} s; its progress is in {check.runs / name}.log")
+        run_piece(check, name, 60 * command.minutes)
+        say(check.line(name))
+    if not names:
+        print("\n".join(check.line(name) for name in PIECES))
+    if "parity" in names:
+        demand_parity(check.path("parity"))
 
 
-def close(path: Path, command: Command) -> None:
-    """Says what there is and what there is not, in the file too."""
+def demand_parity(path: Path) -> None:
+    """Raises a `UserError` unless parity holds."""
     result = read_json(path)
-    missing, right = not_done(result["sections"]), parity_holds(result["sections"])
-    write_json(path, result | {"parity_holds": right, "not_done": missing})
-    for line in missing:
-        say(f"not done: {line}")
-    say(f"results: {path}")
-    if "parity" in command.sections and not right:
-        off = [name for name, case in result["sections"]["parity"]["figures"].items() if not case["holds"]]
+    if not parity_holds(result):
+        cases = result["figures"].get("cases", {})
+        off = [name for name, case in cases.items() if not case["holds"]]
         raise UserError(f"parity does not hold: {', '.join(off) or 'not everything was compared'}; see {path}")
 
 
 def main() -> None:
     """Entry point."""
-    check(tyro.cli(Command, prog="python -m experiments.gpu_check"))
+    run(tyro.cli(Command, prog="python -m experiments.gpu_check"))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wbgs_jax as wb
+from experiments.bench.scene import Scene as RandomScene
 from experiments.bench.scene import random_scene
 from experiments.profiles import TINY
 from wbgs_jax.config import Settings, changed
@@ -29,18 +30,18 @@ from wbgs_jax.training.run_folder import RunConfig, TrainedField
 ON_THE_HOST = frozenset(
     """
     arrivals_anywhere arrivals_of as_deepmimo at_receiver cell_means choose_beams export_field from_arrivals
-    from_deepmimo from_sionna get_field learn_map load_dataset load_exported load_paths load_readings load_scene
+    from_deepmimo from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings load_scene
     load_trained load_walls locator make_mesh make_query make_receiver make_surface map_queries measure_limits
     pas_directions place_reflector planar_array power_at_users power_predictor power_when_turned predict_blocks
     predict_many predict_map predictor pytree rank_beams read_deepmimo read_gaussians register save_paths
-    save_scene scene_of_paths scene_of_snapshots score_beams stack_receivers static straight_powers surface_from_points
-    write_deepmimo write_gaussians
+    save_scene scene_of_paths scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers
+    surface_from_points write_deepmimo write_gaussians
     """.split()  # noqa: SIM905
 )
 """Public functions that read and write, prepare, or make the functions that a device runs: those of the predictors, the locator
 and `power_at_users` are cases."""
-N, B = 200, 2
-"""Gaussians and queries."""
+N, B, FEW = 200, 2, 8
+"""Gaussians and queries, and Gaussians of small cases."""
 TINY_WAVE: dict[str, Any] = {
     "specular_tried": 64,
     "specular_kept": 32,
@@ -102,14 +103,16 @@ def _weighted(leaf: Any) -> Any:
     return jnp.sum(jnp.where(finite, leaf, 0) * weights)
 
 
-def splatting() -> list[Case]:
-    """Returns the cases of the renderer and its parts."""
-    scene = random_scene(N, B, SEED)
+def splatting(small: bool = False) -> list[Case]:
+    """Returns the cases of the renderer and its parts; small ones are quick where kernels are interpreted."""
+    scene = _small_scene() if small else random_scene(N, B, SEED)
     receiver, limits = scene.receiver, scene.limits
     planned = scene.gaussians, scene.attenuation, scene.signal
 
     def plan(gaussians: Any) -> Any:
-        return wb.geometry_plan(gaussians, receiver, limits)
+        made = wb.geometry_plan(gaussians, receiver, limits)
+        jobs = [leaf for name, leaf in vars(made.jobs).items() if name not in ("slots", "tiling")]
+        return made.splats, jobs  # the slots are zeros on a CPU
 
     return [
         Case("project", lambda gaussians: wb.project(gaussians, receiver), (scene.gaussians,)),
@@ -117,6 +120,14 @@ def splatting() -> list[Case]:
         Case("render_splats", scene.tiled, planned, (0, 1, 2)),
         Case("render_dense", scene.dense, planned, (0, 1, 2)),
     ]
+
+
+def _small_scene() -> RandomScene:
+    """Returns few Gaussians, whose tile lists have no room to spare: every job in them is interpreted, empty or not."""
+    scene = random_scene(FEW, B, SEED)
+    jobs = wb.geometry_plan(scene.gaussians, scene.receiver, scene.limits).jobs
+    exact = {"entries": int(jobs.required_entries), "jobs": int(jobs.required_jobs)}
+    return dataclasses.replace(scene, limits=dataclasses.replace(scene.limits, **exact))
 
 
 def arrays() -> list[Case]:
@@ -159,8 +170,8 @@ def statistics() -> list[Case]:
     def learned(count: int) -> tuple[Any, ...]:
         return jnp.zeros(count), jnp.ones(count), jnp.linspace(-0.5, 0.5, count + 1)
 
-    of_spectra = jnp.zeros(3), places, *learned(FEATURES), jnp.array([-1.0, 1.0]), jnp.ones(())
-    spectra, powers = Confidence(*of_spectra), PowerConfidence(*(places, *learned(POWER_FEATURES), jnp.ones(()), jnp.ones(())))
+    of_spectra = jnp.zeros(3), places, *learned(FEATURES), jnp.array([-1.0, 1.0]), jnp.ones(()), jnp.ones(())
+    spectra, powers = Confidence(*of_spectra), PowerConfidence(*(places, *learned(POWER_FEATURES), *(jnp.ones(()),) * 3))
     return [
         Case("expected_ssim", lambda pas, power: wb.expected_ssim(spectra, pas, query, power), (pas, power), (0, 1)),
         Case("expected_power", lambda power: wb.expected_power(powers, power, query, jnp.zeros(3)), (power,)),
@@ -317,3 +328,5 @@ ROOMS: dict[str, Callable[[], list[Case]]] = {
     "placing": placing,
 }
 """Makers of cases."""
+SMALL_ROOMS: dict[str, Callable[[], list[Case]]] = {"splatting": functools.partial(splatting, small=True), "arrays": arrays}
+"""Those of the stand-in."""

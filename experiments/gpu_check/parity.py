@@ -17,8 +17,10 @@ import jax
 import numpy as np
 from jax import export
 
-from experiments.gpu_check.cases import ROOMS, Case
-from experiments.gpu_check.record import NEEDED, Record, rounded
+from experiments.bench.scene import random_scene
+from experiments.gpu_check.cases import ROOMS, SMALL_ROOMS, Case
+from experiments.gpu_check.record import NEEDED, NEEDED_OF_STAND_IN, Record, rounded
+from wbgs_jax.splat import gpu_arithmetic
 
 TOLERANCE = {"values": 5e-3, "gradients": 2e-2}
 """Of the norm of a difference relative to the norm: phases at 94 GHz are known to 1e-3 radians in single precision. Positions
@@ -29,6 +31,10 @@ STANDS_IN = version("jaxlib").startswith("0.10.")
 """Whether a CPU can stand in for a GPU: the compiler of jaxlib 0.12 ends the process at some programs for CUDA
 (computation_partitioner.cc: Check failed: operand_maps.size() == 1)."""
 ORDER = (*NEEDED, *(name for name in ROOMS if name not in NEEDED))
+
+REPEATS = 5
+REPEATED, REPEATED_BY_STAND_IN = (10_000, 8), (20, 2)
+"""Gaussians and queries of the gradient that is computed several times."""
 
 
 class Difference(NamedTuple):
@@ -42,31 +48,47 @@ class Difference(NamedTuple):
         return all(own <= factor * TOLERANCE[name] for name, own in self._asdict().items())
 
 
-def measure(record: Record, deadline: float, quick: bool) -> None:
-    """Compares all cases until the deadline (of `time.monotonic`), several at once: most of the time goes into compiling."""
+def measure(record: Record, deadline: float, stand_in: bool) -> bool:
+    """Compares all cases that have not been compared, until the deadline (of `time.monotonic`), several at once: most of the
+    time goes into compiling. Returns whether all are compared."""
+    if "repeat_difference" not in record.figures:
+        record.add("repeat_difference", repeat_difference(*(REPEATED_BY_STAND_IN if stand_in else REPEATED)))
     waiting, missing = dict[Future[dict[str, Any]], tuple[str, Case]](), dict[str, int]()
+    compared = {name for name, case in record.figures.get("cases", {}).items() if "error" not in case}
     pool = ThreadPoolExecutor(max(len(os.sched_getaffinity(0)) // 2, 1))
     reference, device = jax.devices("cpu")[0], jax.devices()[0]
-    for room in NEEDED if quick else ORDER:
+    for room in NEEDED_OF_STAND_IN if stand_in else ORDER:
+        if room in record.figures.get("rooms", {}):
+            continue
         with jax.default_device(reference):
-            cases = [case for case in ROOMS[room]() if not (quick and case.costly)]
+            found = SMALL_ROOMS[room]() if stand_in else ROOMS[room]()
+            cases = [case for case in found if case.name not in compared]
         missing[room] = len(cases)
         waiting |= {pool.submit(compare, case, reference, device): (room, case) for case in cases}
     try:
         for future in as_completed(waiting, timeout=max(deadline - time.monotonic(), 0.0)):
             room, case = waiting.pop(future)
-            record.add(case.name, said_by(future))
+            record.add("cases", {case.name: found_by(future)})
             missing[room] -= 1
             if not missing[room]:
-                record.set_state("running", rooms={room: "compared"})
+                record.add("rooms", {room: "compared"})
     except TimeoutError:
         for future, (_, case) in waiting.items():
             future.cancel()
             record.leave_out(case.name, "the time was up")
+    return not waiting
 
 
-def said_by(future: Future[dict[str, Any]]) -> dict[str, Any]:
-    """Returns what was found of a case; a case that cannot be computed does not hold."""
+def repeat_difference(n: int, b: int) -> float:
+    """Returns how far gradients of the renderer, computed several times by one program, are from the first at most."""
+    scene = random_scene(n, b, 0)
+    gradient = scene.lower_gradient(scene.tiled, b).compile()
+    first, *others = (jax.device_get(gradient(*scene.inputs(b))) for _ in range(REPEATS))
+    return max(_farthest(first, other) for other in others)
+
+
+def found_by(future: Future[dict[str, Any]]) -> dict[str, Any]:
+    """Returns the result of a comparison; a case that cannot be computed does not hold."""
     try:
         return future.result()
     except Exception as error:  # whatever it is, the other cases are worth knowing
@@ -111,7 +133,8 @@ def for_cuda(case: Case) -> Any:
         return values
 
     anywhere = [export.DisabledSafetyCheck.platform()]
-    program = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=anywhere)(*leaves)
+    with gpu_arithmetic.interpreted():
+        program = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=anywhere)(*leaves)
     return jax.device_get(jax.tree.unflatten(shape[0], program.call(*leaves)))
 
 

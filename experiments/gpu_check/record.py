@@ -1,4 +1,4 @@
-"""The one JSON of a check: every figure is in the file as soon as it is known, whatever ends the process afterwards."""
+"""The JSON file of a piece: every figure is in the file as soon as it is known, whatever ends the process afterwards."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,43 +6,91 @@ from typing import Any, Literal
 
 from wbgs_jax._util.files import read_json, write_json
 
-State = Literal["running", "done", "cut", "failed", "left out"]
-
+MEASUREMENTS = ("parity", "renderer")
+TRAININGS = ("paper_scene1", "paper_scene4", "wrfgs_scene1", "wrfgs_scene4", "default_scene1", "default_scene4")
+PIECES = (*MEASUREMENTS, *TRAININGS)
+"""In their order."""
+Name = Literal[
+    "parity",
+    "renderer",
+    "paper_scene1",
+    "paper_scene4",
+    "wrfgs_scene1",
+    "wrfgs_scene4",
+    "default_scene1",
+    "default_scene4",
+]
+PART = 75
+"""Exit code of a piece that another call continues."""
+State = Literal["running", "done", "part", "failed"]
+"""`part`: another call continues it. A process that was killed leaves `running`, which means the same."""
 NEEDED = ("splatting", "arrays", "images", "wideband", "wave")
 """Rooms of `cases.py`: parity holds if it holds wherever it was tried, and all of these were."""
+NEEDED_OF_STAND_IN = ("splatting", "arrays")
+"""The same without a GPU; tests/gpu/test_lowering.py compares the others."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """A section of the file. One process writes at a time: that of the section while it runs, else the one that started it."""
+    """The file of a piece. One process writes at a time: that of the piece while it runs, else the one that started it."""
 
     path: Path
-    section: str
 
-    def _update(self, **changes: Any) -> None:
-        whole = read_json(self.path)
-        own = whole["sections"].setdefault(self.section, {"state": "running", "figures": {}, "left_out": {}})
-        for name, value in changes.items():
-            own[name] = own.get(name, {}) | value if isinstance(value, dict) else value
-        write_json(self.path, whole)
+    def read(self) -> dict[str, Any]:
+        """Returns all of it."""
+        return read_json(self.path)
 
-    def begin(self, commit: str | None) -> None:
-        """Starts the section anew: nothing stays of an earlier run."""
-        whole = read_json(self.path)
-        whole["sections"][self.section] = {"state": "running", "commit": commit, "figures": {}, "left_out": {}}
-        write_json(self.path, whole)
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What is known."""
+        return self.read()["figures"]
 
     def add(self, name: str, figures: Any) -> None:
-        """Keeps a figure, or a row of them by name."""
-        self._update(figures={name: figures})
+        """Keeps a figure; of a group of figures those that were there already stay."""
+        whole = self.read()
+        own = whole["figures"]
+        own[name] = own.get(name, {}) | figures if isinstance(figures, dict) else figures
+        write_json(self.path, whole)
 
     def leave_out(self, name: str, reason: str) -> None:
         """Keeps what was not done, and why."""
-        self._update(left_out={name: reason})
+        whole = self.read()
+        whole["left_out"][name] = reason
+        write_json(self.path, whole)
 
-    def set_state(self, state: State, **more: Any) -> None:
-        """Keeps how the section stands; `more` are its reason and its seconds."""
-        self._update(state=state, **more)
+    def describe_call(self, **more: Any) -> None:
+        """Keeps what belongs to the present call alone."""
+        whole = self.read()
+        whole["calls"][-1] |= more
+        write_json(self.path, whole)
+
+    def finish(self, state: State, seconds: float, reason: str = "") -> None:
+        """Keeps how the piece stands after a call, and what the call took."""
+        whole = self.read()
+        whole["calls"][-1] |= {"state": state, "seconds": round(seconds, 1)}
+        whole["seconds"] = round(sum(call["seconds"] for call in whole["calls"]), 1)
+        write_json(self.path, whole | {"state": state, "reason": reason})
+
+
+def begin(path: Path, name: str, device: dict[str, Any], earlier: dict[str, Any] | None) -> Record:
+    """Starts a call of a piece: one that continues an earlier call keeps its figures and adds to the list of calls."""
+    environment = device["environment"]
+    kept = earlier or {"calls": [], "figures": {}, "seconds": 0.0}
+    whole = {
+        "piece": name,
+        "command": f"python -m experiments.gpu_check --only {name}",
+        "stand_in": device["platform"] == "cpu",
+        "state": "running",
+        "reason": "",
+        "device": {key: value for key, value in device.items() if key != "environment"},
+        "provenance": environment,
+        "seconds": kept["seconds"],
+        "calls": [*kept["calls"], {**environment, "state": "running", "seconds": 0.0}],
+        "figures": kept["figures"],
+        "left_out": {},
+    }
+    write_json(path, whole)
+    return Record(path)
 
 
 def rounded(value: float, digits: int = 4) -> float:
@@ -50,17 +98,9 @@ def rounded(value: float, digits: int = 4) -> float:
     return float(f"{value:.{digits}g}")
 
 
-def not_done(sections: dict[str, Any]) -> list[str]:
-    """Returns a line for everything that was cut, failed or left out."""
-    lines = []
-    for name, section in sections.items():
-        if section["state"] != "done":
-            lines.append(f"{name}: {section['state']}, {section.get('reason', '')}")
-        lines += [f"{name}, {what}: {reason}" for what, reason in section["left_out"].items()]
-    return lines
-
-
-def parity_holds(sections: dict[str, Any]) -> bool:
+def parity_holds(result: dict[str, Any]) -> bool:
     """Whether values and gradients agree wherever that was tried, and it was tried where it must be."""
-    parity = sections.get("parity", {"figures": {}})
-    return all(case["holds"] for case in parity["figures"].values()) and set(NEEDED) <= set(parity.get("rooms", {}))
+    needed = NEEDED_OF_STAND_IN if result["stand_in"] else NEEDED
+    figures = result["figures"]
+    compared = set(needed) <= set(figures.get("rooms", {}))
+    return compared and all(case["holds"] for case in figures.get("cases", {}).values())

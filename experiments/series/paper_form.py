@@ -3,7 +3,7 @@
 from experiments.jobs import Job
 from experiments.results import Results
 from experiments.series.series import Series, jobs_of_all, render_all
-from experiments.variants import TO_OURS
+from experiments.variants import PRECISIONS, TO_OURS
 
 TITLE = "The paper's form"
 SERIES = (
@@ -14,6 +14,13 @@ SERIES = (
         ("", *TO_OURS),
         "to_ours",
         scenes=("4",),
+    ),
+    Series(
+        "What the networks multiply, by 2,000 spectra, scores of validation",
+        "wideband",
+        PRECISIONS,
+        "precision",
+        seeds=(0, 1),
     ),
 )
 

@@ -12,6 +12,7 @@ from wbgs_jax.fields.networks import (
     PartwiseDense,
     RadianceNetwork,
     attenuation_activation,
+    product,
     signal_activation,
 )
 
@@ -169,3 +170,23 @@ def test_activations_keep_their_bounds_for_any_logit():
     assert not np.asarray(activation(jnp.array([-jnp.inf]), logits, 0.99)).any()  # an empty slot attenuates nothing
     squashed = activation(jnp.array([-1.5]), jnp.array([[0.7, 0, 0, 0, 0]]), 0.99)[0, 0]
     assert float(squashed) == pytest.approx(0.99 / (1 + np.exp(0.8)))
+
+
+@pytest.mark.parametrize(("precision", "bits"), [("float32", 23), ("tf32", 10), ("bfloat16", 7)])
+def test_layers_multiply_what_their_precision_leaves(precision, bits, rng):
+    """On any device, forwards and backwards: numbers are rounded, sums are not."""
+    a, b = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((40, 30), (30, 20)))
+    cotangent = jnp.asarray(rng.normal(size=(40, 20)), jnp.float32)
+
+    def rounded(array):
+        step = 2.0 ** (np.floor(np.log2(np.abs(np.float64(array)))) - bits)
+        return np.round(np.float64(array) / step) * step
+
+    multiply = partial(product, dimension_numbers=(((1,), (0,)), ((), ())), precision=precision)
+    found, back = jax.vjp(multiply, a, b)
+    np.testing.assert_allclose(found, rounded(a) @ rounded(b), atol=3e-6)
+    d_a, d_b = back(cotangent)
+    away = 2.0 ** -(bits + 1) * 30  # gradients may be rounded once more on their way out
+    np.testing.assert_allclose(d_a, rounded(cotangent) @ rounded(b).T, atol=max(away, 1e-5))
+    np.testing.assert_allclose(d_b, rounded(a).T @ rounded(cotangent), atol=max(away, 1e-5))
+    assert found.dtype == jnp.float32

@@ -12,6 +12,7 @@ import wbgs_jax as wb
 from experiments.gpu_check import cases as cases_module
 from experiments.gpu_check import compiled, parity
 from experiments.gpu_check.cases import AIMS, ON_THE_HOST, ROOMS
+from experiments.profiles import TINY
 
 FREE = {"wbgs_jax/fields/networks.py"}
 """Files whose matrix products may leave their precision to the device."""
@@ -58,7 +59,7 @@ def test_every_public_function_is_a_case_or_belongs_to_the_host():
 @pytest.mark.skipif(not parity.STANDS_IN, reason="the compiler of this jaxlib ends the process at programs for CUDA on a CPU")
 @pytest.mark.parametrize("room", [*RUN, *SLOW])
 def test_the_program_for_cuda_says_on_this_cpu_what_its_own_says(room):
-    """The renderer's form by jobs, which devices other than CPUs have, among them."""
+    """The renderer's fused kernels, interpreted, among them."""
     cpu = jax.devices("cpu")[0]
     for case in ROOMS[room]():
         found = parity.compare(case, cpu, cpu)
@@ -76,9 +77,12 @@ def test_differences_are_seen(rng):
 
 
 @pytest.mark.skipif(importlib.util.find_spec(compiled.PLUGIN) is None, reason="the CUDA plugin (extra `cuda`) is not installed")
-def test_the_renderer_compiles_for_a_gpu_that_is_not_there():
-    found = compiled.renderer(compiled.gpu_on_paper(), 500)
-    assert 0 < found["h100_gb"] < 0.1
+@pytest.mark.parametrize("name", compiled.GPUS)
+def test_renderer_and_epoch_compile_for_gpus_that_are_not_there(name):
+    place = compiled.gpu_on_paper(name)
+    assert 0 < compiled.renderer(place, 500)["temporaries_gb"] < 0.1
+    tiny = {"field": TINY, "loop": {"epoch_steps": 2}}
+    assert 0 < compiled.epoch(place, 64, tiny)["temporaries_gb"] < 0.1
 
 
 def test_without_the_plugin_the_check_says_so(monkeypatch):

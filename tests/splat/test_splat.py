@@ -24,13 +24,14 @@ from wbgs_jax.splat import (
     composite,
     fit_limits,
     geometry_plan,
+    grown_slots,
     measure_limits,
     project,
     render_dense,
     render_splats,
     slots_for,
 )
-from wbgs_jax.splat.tiles import CHUNK, build_tile_jobs
+from wbgs_jax.splat.tiles import CHUNK, CPU_TILING, GPU_TILING, build_tile_jobs
 from wbgs_jax.types import Gaussians, Receiver, make_receiver
 
 EXACT = 1e-12
@@ -133,29 +134,24 @@ def test_tiles_equal_the_dense_reference_in_value_and_every_gradient(rng, x64, p
     assert all(np.abs(g).max() > 0 for g in (*reached, gradients[1].position, gradients[1].orientation))
 
 
-def test_both_forms_draw_the_reference_whatever_the_spare_room(rng, x64):
-    """The form by jobs is what devices other than CPUs run. Wide Gaussians give a tile several jobs, which are chained."""
+@pytest.mark.parametrize("tiling", [CPU_TILING, GPU_TILING])
+def test_tiles_of_any_size_draw_the_reference_whatever_the_spare_room(tiling, rng, x64):
+    """Wide Gaussians give a tile several jobs. The last row of a GPU's tiles reaches beyond the image."""
     gaussians, receiver, attenuation, signal = random_case(rng)
     gaussians = dataclasses.replace(gaussians, log_scales=gaussians.log_scales + np.log(4))
     attenuation = attenuation / 3  # so that what is behind is seen
     cotangent = rng.normal(size=(B, 90, 360))
-    spare = geometry_plan(gaussians, receiver, TileLimits(entries=65_536, jobs=8192))
-    assert not spare.jobs.overflow and int(spare.jobs.count.max()) >= 4
-    fitting = build_tile_jobs(spare.splats, fit_limits(int(spare.jobs.required_entries), int(spare.jobs.required_jobs), 1.0))
-    assert not fitting.overflow and len(fitting.gaussian) < len(spare.jobs.gaussian)
-
-    @partial(jax.jit, static_argnums=0)
-    @partial(jax.value_and_grad, argnums=range(1, 4))
-    def image_and_gradients(form, splats, attenuation, signal, jobs):
-        tiles = form(jnp.concatenate([splats.means2d, splats.conics], -1), attenuation, signal, jobs)
-        image = tiles.reshape(10, 45, B, 9, 8).transpose(2, 0, 3, 1, 4).reshape(B, 90, 360)
-        return jnp.sum(image * cotangent)
-
-    expected = tiled(spare.splats, attenuation, signal, spare.jobs, cotangent)  # on a CPU: by tiles, with spare room
-    splats = expected[1][0]
-    assert all(np.abs(leaf).max() > 0 for leaf in (expected[0], splats.means2d, splats.conics, *expected[1][1:]))
-    for form, jobs in ((composite._by_tiles, fitting), (composite._by_jobs, fitting), (composite._by_jobs, spare.jobs)):
-        found = image_and_gradients(form, spare.splats, attenuation, signal, jobs)
+    splats = project(gaussians, receiver)
+    spare = build_tile_jobs(splats, TileLimits(65_536, 8192, tiling.height, tiling.width))
+    assert not spare.overflow and int(spare.count.max()) >= 4
+    fitting = build_tile_jobs(splats, fit_limits(int(spare.required_entries), int(spare.required_jobs), 1.0, tiling))
+    assert not fitting.overflow and len(fitting.gaussian) < len(spare.gaussian)
+    expected = dense(splats, attenuation, signal, cotangent)
+    assert all(
+        np.abs(leaf).max() > 0 for leaf in (expected[0], expected[1][0].means2d, expected[1][0].conics, *expected[1][1:])
+    )
+    for jobs in (spare, fitting):
+        found = tiled(splats, attenuation, signal, jobs, cotangent)
         for got, want in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             assert relative(got, want) < EXACT
 
@@ -166,9 +162,9 @@ def test_what_runs_the_code_chooses_the_form(rng):
     plan = geometry_plan(gaussians, receiver, LIMITS)
     traced = jax.jit(jax.grad(lambda a: jnp.sum(render_splats(plan, a, signal)))).trace(attenuation)
     cpu, cuda = (traced.lower(lowering_platforms=(platform,)).as_text() for platform in ("cpu", "cuda"))
-    tiles, jobs = (f"tensor<{n}x{B}x72xf32>" for n in (composite.TILE_GROUP, LIMITS.jobs // composite.JOB_GROUPS))
-    assert (tiles in cpu, jobs in cpu) == (True, False)
-    assert (tiles in cuda, jobs in cuda) == (False, True)
+    by_tiles, by_jobs = f"tensor<{composite.TILE_GROUP}x{B}x72xf32>", "splat_blend"
+    assert (by_tiles in cpu, by_jobs in cpu) == (True, False)
+    assert (by_tiles in cuda, by_jobs in cuda) == (False, True)
 
 
 def test_plans_can_be_mapped_over(rng, x64):
@@ -355,15 +351,26 @@ def test_limits_hold_what_is_measured_and_come_from_buckets(rng):
     assert limits == fit_limits(int(jobs.required_entries), int(jobs.required_jobs))
     assert limits.entries >= 1.25 * jobs.required_entries and limits.jobs >= 1.25 * jobs.required_jobs
     counts = np.geomspace(1, 1e6, 500).astype(int)
-    sizes = np.array([dataclasses.astuple(fit_limits(n, n)) for n in counts.tolist()])
+    sizes = np.array([[limits.entries, limits.jobs] for limits in (fit_limits(n, n) for n in counts.tolist())])
     assert (np.diff(sizes, axis=0) >= 0).all() and len(np.unique(sizes[:, 0])) < 25
-    assert (sizes % composite.JOB_GROUPS == 0).all()
 
 
 def test_slots_hold_the_gaussians_and_change_rarely():
     slots = [slots_for(n) for n in range(1, 5000)]
     assert all(n <= size <= max(64, 1.25 * n + 16) for n, size in enumerate(slots, 1))
     assert len(set(slots)) < 30
+
+
+def test_slots_double_where_gaussians_outgrow_them_and_never_exceed_the_most(rng):
+    """A field of any size is compiled once for each doubling."""
+    assert [grown_slots(64, n, 10_000) for n in (10, 64, 65, 128)] == [64, 64, 128, 128]
+    for most in rng.integers(100, 90_000, 20).tolist():
+        slots, sizes = slots_for(64), []
+        for gaussians in [*sorted(rng.integers(64, most, 300).tolist()), most]:
+            slots = grown_slots(slots, gaussians, most)
+            assert gaussians <= slots <= max(64, most + 15)
+            sizes.append(slots)
+        assert len(set(sizes)) <= np.ceil(np.log2(most / 64)) + 1 and sizes == sorted(sizes)
 
 
 def test_limits_cannot_be_measured_under_jit(rng):

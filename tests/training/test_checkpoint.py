@@ -177,3 +177,13 @@ def test_what_a_killed_process_had_begun_to_remove_is_removed_and_a_number_is_a_
     checkpoint.tidy(tmp_path, 1)
     assert [path.name for path in tmp_path.iterdir()] == ["3"]
     checkpoint.tidy(tmp_path / "none", 2)
+
+
+def test_files_of_a_large_checkpoint_are_small_enough_to_be_sent(tmp_path, rng):
+    """No more than 16 MB each, whatever the checkpoint holds."""
+    large = {f"part{i}": rng.normal(size=(500_000, 3)).astype(np.float32) for i in range(5)}
+    checkpoint.save(tmp_path, 1, large, {}, METADATA, 1)
+    sizes = [path.stat().st_size for path in (tmp_path / "1").rglob("*") if path.is_file()]
+    assert sum(sizes) > 20e6 and max(sizes) < 16e6
+    found = checkpoint.read(tmp_path, 1).state
+    assert all(np.array_equal(found[f"['{name}']"], values) for name, values in large.items())

@@ -1,6 +1,7 @@
 """A pytree of arrays as one file of a run folder: a compressed .npz, written whole or not at all."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,18 +27,25 @@ def write_tree(path: Path, tree: Any) -> None:
         np.savez_compressed(stream, **arrays)
 
 
-def read_tree(path: Path, cls: type[T], without: str) -> T | None:
+def read_tree(path: Path, classes: Sequence[type[T]], without: str, before: Mapping[str, Any] | None = None) -> T | None:
     """Returns the pytree of a file, in single precision or as small as it was written; None if there is no file.
 
+    Args:
+        path: of the file.
+        classes: that it may be of; it is of the first whose fields it has, else damaged.
+        without: what removing the file means.
+        before: arrays that earlier files lack.
+
     Raises:
-        UserError: the file is damaged; `without` says what removing it means.
+        UserError: the file is damaged.
     """
     if not path.exists():
         return None
     advice = f"remove it to {without}, or train again"
-    arrays = read_arrays(path, "", advice)
+    arrays = {name: np.asarray(value) for name, value in (before or {}).items()} | read_arrays(path, "", advice)
+    fits = (cls for cls in classes if {f.name for f in dataclasses.fields(cls)} == arrays.keys())  # type: ignore[arg-type]
     with told(str(path), advice):
-        return cls(**{name: _in_memory(value) for name, value in arrays.items()})
+        return next(fits, classes[-1])(**{name: _in_memory(value) for name, value in arrays.items()})
 
 
 def _in_memory(value: np.ndarray) -> jax.Array:

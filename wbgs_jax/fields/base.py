@@ -99,7 +99,7 @@ class Field(ABC):
     gives: ClassVar[tuple[Quantity, ...]] = ("pas",)
     """What it knows of a link."""
     controls: ClassVar[tuple[str, ...]] = ()
-    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`, "part.name" for one of a part alone."""
+    """Host controls between epochs that it asks for: names in `training.run.CONTROLS`, "part.name" for one of a part alone."""
     seconds: ClassVar[Mapping[str, float]] = {}
     """How long trainings take on two cores of an AMD EPYC, by preset, search and compilation included (scenes 1 to 6)."""
     config: Any
@@ -161,7 +161,7 @@ class Field(ABC):
 
     def limits(self, params: Any, receivers: Receiver) -> Any:
         """Returns the static sizes that planning needs under jit, with room to grow (host): a frozen dataclass of numbers, kept
-        in checkpoints; None if it needs none."""
+        in checkpoints, with a method `scaled(factor)` if host controls add to the field; None if it needs none."""
         return None
 
     def grow(self, limits: Any, required: Int[np.ndarray, " k"]) -> Any:

@@ -69,8 +69,8 @@ class GaussianFeatures:
 def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork, PowerNetwork]:
     """Returns the EM feature networks, and that of the received power."""
     heads = 1 + config.frequency_heads
-    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion, heads)
-    return attenuation, RadianceNetwork(config.radiance_widths, heads), PowerNetwork(config.width)
+    attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion, heads, config.precision)
+    return attenuation, RadianceNetwork(config.radiance_widths, heads, config.precision), PowerNetwork(config.width)
 
 
 @partial(jax.jit, static_argnames="config")

@@ -195,10 +195,10 @@ def _best(scores: Float[np.ndarray, "n shares"]) -> float:
 
 
 def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
-    return np.asarray(_between(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
+    return np.asarray(score_at(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
 
 
-def _between(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
+def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
     """Returns the score at a share between those that were tried."""
     place = share * (len(SHARES) - 1)
     low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
@@ -227,7 +227,7 @@ def _ascend(
         return Share(learned[0], learned[1] * used, start.mean, start.scale)
 
     def loss(learned: tuple[Array, Array]) -> Float[Array, ""]:
-        worth = _between(scores, share_of(with_learned(learned), features))
+        worth = score_at(scores, share_of(with_learned(learned), features))
         return RIDGE * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
 
     def step(i: Int[Array, ""], carry: Any) -> Any:

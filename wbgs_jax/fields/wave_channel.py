@@ -116,12 +116,13 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
         slope=jnp.full(materials, config.slope, jnp.float32),
         log_thickness=jnp.full(materials, np.log(config.thickness), jnp.float32),
     )
-    amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]])
-    corrections = jnp.zeros((facets, 2)), -jnp.log(amplitude), jnp.zeros(())
+    amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]], jnp.float32)
+    nothing = jnp.zeros((), jnp.float32)
+    corrections = jnp.zeros((facets, 2), jnp.float32), -jnp.log(amplitude), jnp.zeros_like(nothing)
     # Training gives every array away once.
     transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))
     placement, clutter = jax.tree.map(jnp.array, (placement, clutter))
-    return WaveParams(m, *corrections, transmitter, element, placement, jnp.zeros(()), jnp.zeros(()), clutter)
+    return WaveParams(m, *corrections, transmitter, element, placement, nothing, jnp.zeros_like(nothing), clutter)
 
 
 @jax.jit

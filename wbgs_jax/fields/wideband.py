@@ -48,6 +48,8 @@ from wbgs_jax.types import (
     check_surface,
 )
 
+FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM = 500, 16
+"""How many start, at most, where spectra are few."""
 INITIAL_ATTENUATION = 0.3
 TILE_SLACK = 1.4
 """Room in the tile lists for footprints that grow during training."""
@@ -107,7 +109,8 @@ class WidebandField(Field):
     @classmethod
     def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field whose Gaussians start on the surfaces of a scene."""
-        return make_field(scene.surface(config.gaussians, seed, config.sampling), config, cls)
+        count = min(config.gaussians, max(FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM * scene.spectra))
+        return make_field(scene.surface(count, seed, config.sampling), config, cls)
 
     def init(self, key: Key[Array, ""], given: bool = False) -> WidebandParams:
         """Returns isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest
@@ -195,8 +198,7 @@ class WidebandField(Field):
 
     def grow(self, limits: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
         """Returns limits that hold the required entries and jobs, and no less than before."""
-        grown = fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
-        return TileLimits(max(grown.entries, limits.entries), max(grown.jobs, limits.jobs))
+        return limits.grown_to(fit_limits(int(required[0]), int(required[1]), TILE_SLACK, limits.tiling))
 
     def splatted(
         self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None

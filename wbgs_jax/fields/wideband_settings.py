@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
-from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings
+from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings, setting
 from wbgs_jax.fields.base import Optimizer
 from wbgs_jax.fields.encoding import FrequencyScale
+from wbgs_jax.fields.networks import Precision
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.types import SurfaceSampling
 
@@ -14,7 +15,8 @@ class WidebandConfig:
     """Settings of the paper's field."""
 
     gaussians: int = 2000
-    """How many Gaussians start on the scene's surface; 0: one for every vertex of the mesh."""
+    """How many Gaussians start on the scene's surface, at most 16 for every training spectrum (but 500); 0: one for every
+    vertex of the mesh."""
     sampling: SurfaceSampling = "solid_angle"
     """Spread them evenly over the receiver's directions, or over the area of the surface."""
     features: int = 16
@@ -59,6 +61,8 @@ class WidebandConfig:
     power_weight: float = 0.01
     """Weight of the mean absolute error (dB) of the received power, where the data say what it was. It moves nothing that the
     spectra are made of. Not in the paper."""
+    precision: Precision = setting("device", before="device")
+    """What the networks multiply: "device" (TF32 on GPUs that have it, else float32), "float32", "tf32" or "bfloat16"."""
     features_lr: float = 1e-2
     """Learning rate of the Gaussians' features."""
     network_optimizer: Optimizer = "muon"
@@ -119,7 +123,7 @@ PAPER = Settings(
         network_weight_decay=5e-5,
         means_lr=0.0,
     ),
-    optim=OptimConfig(steps=200_000, max_epochs=1e6, batch=1, final_fraction=1.25e-3),
+    optim=OptimConfig(steps=200_000, max_epochs=1e6, batch=1, final_fraction=1.25e-3, virtual=0.0),
     density=DensityConfig(
         every=100,
         start=500,

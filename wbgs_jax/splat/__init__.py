@@ -6,7 +6,7 @@
 from wbgs_jax.splat.project import Splats, project
 from wbgs_jax.splat.reference import render_dense
 from wbgs_jax.splat.render import GeometryPlan, geometry_plan, measure_limits, render_splats
-from wbgs_jax.splat.tiles import TileLimits, fit_limits, slots_for
+from wbgs_jax.splat.tiles import TileLimits, fit_limits, grown_slots, slots_for
 
 __all__ = [
     "GeometryPlan",
@@ -14,6 +14,7 @@ __all__ = [
     "TileLimits",
     "fit_limits",
     "geometry_plan",
+    "grown_slots",
     "measure_limits",
     "project",
     "render_dense",

@@ -14,8 +14,10 @@ from wbgs_jax.splat.project import SUPPORT
 
 CUT = SUPPORT**2
 """Mahalanobis distance squared at which a footprint ends."""
-_EDGE = math.exp(-CUT / 2)
-GAIN = 1 / (1 - _EDGE)
+EDGE = math.exp(-CUT / 2)
+"""What a plain Gaussian has there ..."""
+GAIN = 1 / (1 - EDGE)
+"""... and what makes up for it at the centre."""
 
 
 def mahalanobis2(dx: Float[Array, "*#n"], dy: Float[Array, "*#n"], conic: Float[Array, "*#n 3"]) -> Float[Array, "*n"]:
@@ -25,7 +27,7 @@ def mahalanobis2(dx: Float[Array, "*#n"], dy: Float[Array, "*#n"], conic: Float[
 
 def footprint(q: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Returns G(q) in 0..1."""
-    return jnp.maximum(jnp.exp(-0.5 * q) - _EDGE, 0) * GAIN
+    return jnp.maximum(jnp.exp(-0.5 * q) - EDGE, 0) * GAIN
 
 
 def windowed_exponential(q: Float[Array, "*n"]) -> Float[Array, "*n"]:

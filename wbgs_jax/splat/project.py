@@ -32,8 +32,10 @@ SUPPORT = 3.0
 """Footprints end at this many standard deviations: part of the image's definition, not of the tiling."""
 LOW_PASS = 0.3
 """Pixels squared."""
-MAX_AZIMUTH_SIGMA = (AZIMUTH_PERIOD / 2 - 12) / SUPPORT
-"""Pixels. The 12 leave room for one tile, so that wrapping to a tile's centre equals wrapping to a pixel."""
+TILE_ROOM = 12
+"""Pixels left and right of a tile's centre ..."""
+MAX_AZIMUTH_SIGMA = (AZIMUTH_PERIOD / 2 - TILE_ROOM) / SUPPORT
+"""... that are kept free, so that wrapping to the centre of a tile equals wrapping to a pixel of it."""
 MIN_RANGE = 1e-3
 """Metres. Distances to the receiver and to its zenith axis are bounded from below by this, for finite Jacobians."""
 

@@ -13,7 +13,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.splat.composite import composite
 from wbgs_jax.splat.project import Splats, project
-from wbgs_jax.splat.tiles import TileJobs, TileLimits, build_tile_jobs, fit_limits
+from wbgs_jax.splat.tiles import TileJobs, TileLimits, Tiling, build_tile_jobs, fit_limits
 from wbgs_jax.types import Gaussians, Receiver
 
 
@@ -44,17 +44,18 @@ def geometry_plan(
     return GeometryPlan(splats, build_tile_jobs(splats, limits))
 
 
-def measure_limits(splats: Splats, slack: float = 1.25) -> TileLimits:
-    """Returns the limits that splats need, found on the host by building the lists until they fit."""
+def measure_limits(splats: Splats, slack: float = 1.25, tiling: Tiling | None = None) -> TileLimits:
+    """Returns the limits that splats need, found on the host by building the lists until they fit; in the tiles that are
+    fastest on the device which computes here, or in others."""
     if isinstance(splats.depths, jax.core.Tracer):
         raise ValueError("the tile lists cannot be sized under jit: pass limits=..., found outside with measure_limits")
-    limits = fit_limits(0, 0)
+    limits = fit_limits(0, 0, tiling=tiling)
     while True:
         jobs = build_tile_jobs(splats, limits)
-        fitted = fit_limits(int(jobs.required_entries), int(jobs.required_jobs), slack)
+        fitted = fit_limits(int(jobs.required_entries), int(jobs.required_jobs), slack, limits.tiling)
         if not jobs.overflow:
             return fitted
-        limits = TileLimits(max(limits.entries, fitted.entries), max(limits.jobs, fitted.jobs))
+        limits = limits.grown_to(fitted)
 
 
 def render_splats(

@@ -6,26 +6,81 @@ required counts and an overflow flag, the caller throws the result away and repe
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.per_platform import per_platform
+from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.footprint import CUT
-from wbgs_jax.splat.project import Splats
+from wbgs_jax.splat.project import TILE_ROOM, Splats
 
-TILE_HEIGHT, TILE_WIDTH = 9, 8
-TILE_ROWS, TILE_COLUMNS = PAS_HEIGHT // TILE_HEIGHT, PAS_WIDTH // TILE_WIDTH
-N_TILES = TILE_ROWS * TILE_COLUMNS
 CHUNK = 16
 """Gaussians in a job."""
 NO_ENTRY = np.uint32(0xFFFFFFFF)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How an image is cut into tiles of equal size: the last row of tiles may reach beyond it."""
+
+    height: int
+    """Pixels."""
+    width: int
+    """Pixels; divides the image's width, and is no more than twice `TILE_ROOM`."""
+
+    def __post_init__(self) -> None:
+        if self.height < 1 or self.width < 1 or PAS_WIDTH % self.width or self.width > 2 * TILE_ROOM:
+            raise ValueError(
+                f"tiles of {self.height} x {self.width} pixels: the width must divide {PAS_WIDTH}, {2 * TILE_ROOM} at most"
+            )
+
+    @property
+    def rows(self) -> int:
+        """Rows of tiles."""
+        return -(-PAS_HEIGHT // self.height)
+
+    @property
+    def columns(self) -> int:
+        """Columns of tiles."""
+        return PAS_WIDTH // self.width
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of an image."""
+        return self.rows * self.columns
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of a tile."""
+        return self.height * self.width
+
+    @property
+    def lanes(self) -> int:
+        """Lanes of a GPU that hold a tile's pixels: a power of two."""
+        return 1 << (self.pixels - 1).bit_length()
+
+    def offsets(self) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]:
+        """Returns the offsets (x, y) of a tile's pixels from its centre."""
+        y, x = np.divmod(np.arange(self.pixels), self.width)
+        return x - (self.width - 1) / 2, y - (self.height - 1) / 2
+
+    def monomials(self) -> Float[np.ndarray, "pixels 6"]:
+        """Returns 1, x, y, x^2, xy, y^2 of the offsets: a product with them takes the moments of a footprint."""
+        x, y = self.offsets()
+        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
+
+
+CPU_TILING, GPU_TILING = Tiling(9, 8), Tiling(8, 8)
+"""Vectors of eight pixels, nine of which cut an image evenly; and two pixels for each thread of a GPU's warp."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +91,37 @@ class TileLimits:
     """(Gaussian, tile) pairs before culling."""
     jobs: int
     """Jobs of `CHUNK` Gaussians."""
+    tile_height: int = CPU_TILING.height
+    """Pixels; every size draws the same image, at another speed (`device_tiling`)."""
+    tile_width: int = CPU_TILING.width
+    """Pixels."""
+
+    @property
+    def tiling(self) -> Tiling:
+        """Returns the tiles of these limits."""
+        return Tiling(self.tile_height, self.tile_width)
+
+    def scaled(self, factor: float) -> "TileLimits":
+        """Returns limits that hold so many times as much."""
+        entries, jobs = (-(-math.ceil(size * factor) // 256) * 256 for size in (self.entries, self.jobs))
+        return replace(self, entries=entries, jobs=jobs)
+
+    def grown_to(self, others: "TileLimits") -> "TileLimits":
+        """Returns limits that hold what these and others do, in tiles of the same size."""
+        return replace(self, entries=max(self.entries, others.entries), jobs=max(self.jobs, others.jobs))
+
+
+@pytree
+class SlotLists:
+    """Where Gaussians stand in the jobs: what sums over their slots need to go Gaussian by Gaussian, in the same order always.
+    Only NVIDIA GPUs do so; elsewhere the slots are zeros that nothing reads."""
+
+    gaussian: Int[Array, " n"]
+    """Whose entries come first, second, ...: near to far."""
+    end: Int[Array, " n"]
+    """Where their entries end; those of the next begin there."""
+    slot: Int[Array, " entries"]
+    """Job times `CHUNK` plus place in the job, of every entry; -1: in no job."""
 
 
 @pytree
@@ -53,7 +139,9 @@ class TileJobs:
     required_entries: Int[Array, ""]
     required_jobs: Int[Array, ""]
     overflow: Bool[Array, ""]
-    """True: some entries did not fit and the lists must not be used."""
+    """True: some entries did not fit; the lists are empty and must not be used."""
+    slots: SlotLists
+    tiling: Tiling = static(default=CPU_TILING)
 
 
 @dataclass(frozen=True)
@@ -73,17 +161,33 @@ class _Boxes:
 @partial(jax.jit, static_argnames="limits")
 def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
     """Returns splats sorted into tiles. Works under jit; carries no gradient."""
-    n = splats.depths.shape[0]
-    if n * N_TILES >= 2**32 - 1:
-        raise ValueError(f"{n} Gaussians are too many for a 32-bit (tile, depth) key; the most is {(2**32 - 2) // N_TILES}")
-    splats = jax.lax.stop_gradient(splats)
-    order = jnp.argsort(splats.depths).astype(jnp.int32)
+    n, tiling = splats.depths.shape[0], limits.tiling
+    most = (2**32 - 2) // tiling.tiles
+    if n > most:
+        raise ValueError(f"{n} Gaussians are too many for a 32-bit (tile, depth) key; the most is {most}")
+    splats = lax.stop_gradient(splats)
+    order = _near_to_far(splats.depths)
     means, conics, radii = splats.means2d[order], splats.conics[order], splats.radii[order]
-    boxes = _tile_boxes(means, radii)
-    keys, required_entries = _sorted_keys(means, conics, boxes, limits.entries)
-    starts = jnp.searchsorted(keys, jnp.arange(N_TILES + 1, dtype=jnp.uint32) * jnp.uint32(n)).astype(jnp.int32)
-    ranked = order[jnp.minimum(keys % jnp.uint32(n), n - 1).astype(jnp.int32)]
-    return _cut_into_jobs(ranked, starts, required_entries, limits)
+    boxes = _tile_boxes(means, radii, tiling)
+    keys, ends = _keys(means, conics, boxes, limits)
+    listed = jnp.sort(keys)
+    (starts,) = _places(listed, jnp.arange(tiling.tiles + 1, dtype=jnp.uint32) * jnp.uint32(n))
+    ranked = order[jnp.minimum(listed % jnp.uint32(n), n - 1).astype(jnp.int32)]
+    gaussian, tile, first, count = _cut_into_jobs(ranked, starts, limits)
+    (slot,) = _slots(keys, listed, starts, first, order)
+    required_jobs = first[-1] + count[-1]
+    overflow = (ends[-1] > limits.entries) | (required_jobs > limits.jobs)
+    # Nothing must follow lists that do not fit: a GPU would read and write past their end.
+    first, count = (jnp.where(overflow, 0, own) for own in (first, count))
+    slots = SlotLists(order, ends, jnp.where(overflow, -1, slot))
+    return TileJobs(gaussian, tile, first, count, ends[-1], required_jobs, overflow, slots, tiling)
+
+
+def _near_to_far(depths: Float[Array, " n"]) -> Int[Array, " n"]:
+    """Returns the Gaussians in the order of their distance, which is no less than zero: its bits, read as an integer, have the
+    same order, and are sorted several times faster than floats are."""
+    bits = lax.bitcast_convert_type(depths, {4: jnp.uint32, 8: jnp.uint64}[depths.dtype.itemsize])
+    return lax.sort((bits, jnp.arange(len(depths), dtype=jnp.int32)), num_keys=1)[1]
 
 
 def _tile_range(
@@ -95,21 +199,22 @@ def _tile_range(
     return first.astype(jnp.int32), jnp.maximum(last - first + 1, 0).astype(jnp.int32)
 
 
-def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"]) -> _Boxes:
+def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"], tiling: Tiling) -> _Boxes:
     x, y = means[:, 0], means[:, 1]
-    row0, rows = _tile_range(y - radii[:, 1], y + radii[:, 1], TILE_HEIGHT, TILE_ROWS)
-    column0, columns = _tile_range(x - radii[:, 0], x + radii[:, 0], TILE_WIDTH, TILE_COLUMNS)
+    row0, rows = _tile_range(y - radii[:, 1], y + radii[:, 1], tiling.height, tiling.rows)
+    column0, columns = _tile_range(x - radii[:, 0], x + radii[:, 0], tiling.width, tiling.columns)
     alias = jnp.where(x < AZIMUTH_PERIOD / 2, AZIMUTH_PERIOD, -AZIMUTH_PERIOD).astype(x.dtype)
-    alias_column0, alias_columns = _tile_range(x + alias - radii[:, 0], x + alias + radii[:, 0], TILE_WIDTH, TILE_COLUMNS)
+    alias_column0, alias_columns = _tile_range(x + alias - radii[:, 0], x + alias + radii[:, 0], tiling.width, tiling.columns)
     rows = jnp.where(radii[:, 0] > 0, rows, 0)
     return _Boxes(row0, rows, column0, columns, alias, alias_column0, alias_columns)
 
 
-def _sorted_keys(
-    means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, entries: int
-) -> tuple[UInt32[Array, " entries"], Int[Array, ""]]:
-    """Returns sorted keys tile * n + depth rank of all (splat, tile) pairs whose footprints overlap; `NO_ENTRY` in the rest."""
-    n = means.shape[0]
+def _keys(
+    means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, limits: TileLimits
+) -> tuple[UInt32[Array, " entries"], Int[Array, " n"]]:
+    """Returns keys tile * n + depth rank of all (splat, tile) pairs, splat by splat, and where those of every splat end;
+    `NO_ENTRY` where footprint and tile do not overlap, and in the rest."""
+    n, entries, tiling = means.shape[0], limits.entries, limits.tiling
     width = boxes.columns + boxes.alias_columns
     count = width * boxes.rows
     end = jnp.cumsum(count)
@@ -121,16 +226,18 @@ def _sorted_keys(
     is_alias = step >= boxes.columns[rank]
     column = jnp.where(is_alias, boxes.alias_column0[rank] + step - boxes.columns[rank], boxes.column0[rank] + step)
     centre_x = means[rank, 0] + jnp.where(is_alias, boxes.alias[rank], 0)
-    q = _nearest_mahalanobis2(column * TILE_WIDTH - centre_x, row * TILE_HEIGHT - means[rank, 1], conics[rank])
+    q = _nearest_mahalanobis2(column * tiling.width - centre_x, row * tiling.height - means[rank, 1], conics[rank], tiling)
     # The margin covers rounding: a wrongly kept entry costs time, a wrongly dropped one would be an error.
     keep = (entry < end[-1]) & (q < CUT * 1.001)
-    tile = (row * TILE_COLUMNS + column).astype(jnp.uint32)
-    return jnp.sort(jnp.where(keep, tile * jnp.uint32(n) + rank.astype(jnp.uint32), NO_ENTRY)), end[-1]
+    tile = (row * tiling.columns + column).astype(jnp.uint32)
+    return jnp.where(keep, tile * jnp.uint32(n) + rank.astype(jnp.uint32), NO_ENTRY), end
 
 
-def _nearest_mahalanobis2(left: Float[Array, " e"], top: Float[Array, " e"], conic: Float[Array, "e 3"]) -> Float[Array, " e"]:
+def _nearest_mahalanobis2(
+    left: Float[Array, " e"], top: Float[Array, " e"], conic: Float[Array, "e 3"], tiling: Tiling
+) -> Float[Array, " e"]:
     """Returns the smallest q over a tile's pixels (a continuous rectangle), given the offset of the first from the centre."""
-    right, bottom = left + TILE_WIDTH - 1, top + TILE_HEIGHT - 1
+    right, bottom = left + tiling.width - 1, top + tiling.height - 1
     a, b, c = jnp.moveaxis(jnp.where(conic[:, :1] > 0, conic, jnp.array([1, 0, 1], conic.dtype)), -1, 0)
 
     def on_column(x):
@@ -147,31 +254,76 @@ def _nearest_mahalanobis2(left: Float[Array, " e"], top: Float[Array, " e"], con
 
 
 def _cut_into_jobs(
-    ranked: Int[Array, " entries"], starts: Int[Array, " tiles_1"], required_entries: Int[Array, ""], limits: TileLimits
-) -> TileJobs:
+    ranked: Int[Array, " entries"], starts: Int[Array, " tiles_1"], limits: TileLimits
+) -> tuple[Int[Array, "jobs chunk"], Int[Array, " jobs"], Int[Array, " tiles"], Int[Array, " tiles"]]:
+    """Returns the Gaussians and the tile of every job, the first job of every tile and their number."""
     count = -(-(starts[1:] - starts[:-1]) // CHUNK)
     end = jnp.cumsum(count)
     job = jnp.arange(limits.jobs, dtype=jnp.int32)
-    tile = jnp.repeat(jnp.arange(N_TILES, dtype=jnp.int32), count, total_repeat_length=limits.jobs)
+    tile = jnp.repeat(jnp.arange(limits.tiling.tiles, dtype=jnp.int32), count, total_repeat_length=limits.jobs)
     index_in_tile = job - (end - count)[tile]
     entry = starts[tile][:, None] + index_in_tile[:, None] * CHUNK + jnp.arange(CHUNK)
     live = (job < end[-1])[:, None] & (entry < starts[tile + 1][:, None])
-    gaussian = jnp.where(live, ranked[jnp.minimum(entry, ranked.shape[0] - 1)], -1)
-    overflow = (required_entries > limits.entries) | (end[-1] > limits.jobs)
-    return TileJobs(gaussian, tile, end - count, count, required_entries, end[-1], overflow)
+    return jnp.where(live, ranked[jnp.minimum(entry, ranked.shape[0] - 1)], -1), tile, end - count, count
 
 
-def fit_limits(required_entries: int, required_jobs: int, slack: float = 1.25) -> TileLimits:
-    """Returns limits from geometric buckets that hold the counts with some slack, so that small changes do not recompile."""
+def _slots_of_entries(keys: Any, listed: Any, starts: Any, first: Any, order: Any) -> list[Any]:
+    """Returns the slots of `SlotLists`: a key is looked up in the list, which has it once."""
+    (place,) = _places_unrolled(listed, keys)
+    tile = jnp.minimum(keys // jnp.uint32(len(order)), len(first) - 1).astype(jnp.int32)
+    return [jnp.where(keys < NO_ENTRY, first[tile] * CHUNK + place - starts[tile], -1)]
+
+
+def _no_slots(keys: Any, *_: Any) -> list[Any]:
+    return [jnp.zeros(keys.shape, jnp.int32)]
+
+
+def _places_in_a_loop(listed: Any, keys: Any) -> list[Any]:
+    """Returns where keys stand in a sorted list, or would."""
+    return [jnp.searchsorted(listed, keys).astype(jnp.int32)]
+
+
+def _places_unrolled(listed: Any, keys: Any) -> list[Any]:
+    """Returns the same, by one kernel: of a loop every step would wait for the host of a GPU, some 20 times."""
+    return [jnp.searchsorted(listed, keys, method="scan_unrolled").astype(jnp.int32)]
+
+
+_places = per_platform(
+    "splat_places", lambda _, keys: [jax.ShapeDtypeStruct(keys.shape, jnp.int32)], _places_in_a_loop, cuda=_places_unrolled
+)
+_slots = per_platform(
+    "splat_slots", lambda keys, *_: [jax.ShapeDtypeStruct(keys.shape, jnp.int32)], _no_slots, cuda=_slots_of_entries
+)
+
+
+def device_tiling() -> Tiling:
+    """Returns the tiles that are fastest on the device which computes here."""
+    return CPU_TILING if jax.default_backend() == "cpu" else GPU_TILING
+
+
+def fit_limits(required_entries: int, required_jobs: int, slack: float = 1.25, tiling: Tiling | None = None) -> TileLimits:
+    """Returns limits from geometric buckets that hold the counts with some slack, so that small changes do not recompile.
+
+    The counts are those of `tiling`, by default `device_tiling()`.
+    """
 
     def bucket(count: int, smallest: int) -> int:
         steps = math.ceil(math.log2(max(count * slack, smallest) / smallest) * 2)
         return -(-int(smallest * 2 ** (steps / 2)) // 256) * 256
 
-    return TileLimits(entries=bucket(required_entries, 4096), jobs=bucket(required_jobs, 1024))
+    tiling = tiling or device_tiling()
+    return TileLimits(bucket(required_entries, 4096), bucket(required_jobs, 1024), tiling.height, tiling.width)
 
 
 def slots_for(gaussians: int) -> int:
     """Returns the number of slots that hold so many Gaussians; it grows by 2^(1/4) from 64, so that few changes recompile."""
     sizes = (-(-int(64 * 2 ** (step / 4)) // 16) * 16 for step in itertools.count())
     return next(size for size in sizes if size >= gaussians)
+
+
+def grown_slots(slots: int, gaussians: int, most: int) -> int:
+    """Returns the number of slots for Gaussians that have become so many: as many as before where they suffice, else twice as
+    many, and never more than the most that there may be need. A field compiles once for each doubling."""
+    if gaussians <= slots:
+        return slots
+    return max(min(2 * slots, -(-most // 16) * 16), slots_for(gaussians) if gaussians > min(2 * slots, most) else 0)

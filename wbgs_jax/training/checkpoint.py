@@ -26,6 +26,8 @@ from wbgs_jax._util.processes import is_first
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16
 """Bytes that a checkpoint takes beside its arrays."""
+FILE_BYTES = 8 * 2**20
+"""Of a checkpoint's files, about: they can be sent where large ones cannot."""
 STATE = "state"
 """Folder of the arrays in a checkpoint."""
 REMOVED = ".removed"
@@ -81,7 +83,8 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
             metadata = metadata | {EMPTY: empty}
             metadata |= {DIGEST: digest(host, metadata)}
             _demand_room(folder, full)
-            ocp.save(target, full, custom_metadata=metadata, overwrite=True)
+            with _small_files():
+                ocp.save(target, full, custom_metadata=metadata, overwrite=True)
     except (OSError, ValueError) as error:  # ValueError: what TensorStore makes of a full disk
         for unfinished in folder.glob(f"{step}.*tmp*"):
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -165,6 +168,15 @@ def fill_like(saved: Saved, like: Any, prefix: str = "") -> Any:
 def _demand(fits: bool, saved: Saved) -> None:
     if not fits:
         raise UserError(f"checkpoint {saved.path} does not fit this configuration; start a new run in another OUT")
+
+
+def _small_files() -> contextlib.AbstractContextManager[Any]:
+    """Lets Orbax write files of no more than about `FILE_BYTES`, in the format of arrays that allows it."""
+    from orbax.checkpoint import v1 as ocp
+
+    saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=FILE_BYTES)
+    context: contextlib.AbstractContextManager[Any] = ocp.Context(array_options=ocp.options.ArrayOptions(saving=saving))
+    return context
 
 
 def _alone() -> contextlib.AbstractContextManager[Any]:

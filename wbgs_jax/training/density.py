@@ -21,7 +21,7 @@ from wbgs_jax.config import DensityConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import rotation_matrix
-from wbgs_jax.splat import slots_for
+from wbgs_jax.splat import grown_slots
 from wbgs_jax.training.controls import Context, Edit
 from wbgs_jax.types import Gaussians
 
@@ -29,6 +29,8 @@ SPLIT_SHRINK = 1.6
 """Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting)."""
 CLONE_STEP = 0.5
 """How far a clone moves, in its smallest standard deviations."""
+NEARLY_FULL = 0.7
+"""Share of the slots from which on the next size is made ready."""
 
 
 @pytree
@@ -99,15 +101,28 @@ class DensityControl:
             edit = edit._replace(statistics=self.statistics(edit.params))
         return reset_attenuation(edit, self.config) if self._resets(step) else edit
 
+    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+        """Returns the shapes of the parameters with more slots, where few are left and Gaussians may still be added."""
+        slots, most = len(params.gaussians.means), self.config.max_gaussians
+        alive = int(np.asarray(params.gaussians.alive).sum())
+        every, last = max(self.config.every, 1), self.config.stop_fraction * steps
+        over = not self.config.every or (step // every + 1) * every > last
+        if over or slots >= most or alive < NEARLY_FULL * slots:
+            return None
+        grown, shapes = grown_slots(slots, slots + 1, most), jax.eval_shape(lambda tree: tree, params)
+        gaussians = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((grown, *leaf.shape[1:]), leaf.dtype), shapes.gaussians)
+        return replaced(shapes, gaussians=gaussians), grown / slots
+
 
 def control_density(params: Any, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator) -> Edit:
-    """Returns parameters with Gaussians cloned, split and pruned; the number of slots may change."""
+    """Returns parameters with Gaussians cloned, split and pruned; the number of slots may grow."""
     gaussians = jax.tree.map(np.asarray, params.gaussians)
     statistics = jax.tree.map(np.asarray, statistics)
     keep, clone, split = choose(gaussians, statistics, config)
     source, fresh = _sources(keep, clone, split)
     edited = _edit(gaussians, statistics, source, clone, split, int(keep.sum()), rng)
-    pad = slots_for(len(source)) - len(source)
+    slots = len(gaussians.means)
+    pad = grown_slots(slots, len(source), config.max_gaussians) - len(source)
     source, fresh = np.pad(source, (0, pad)), np.pad(fresh, (0, pad), constant_values=True)
     edited = jax.tree.map(lambda a: jnp.asarray(np.pad(a, [(0, pad)] + [(0, 0)] * (a.ndim - 1))), edited)
     empty = jnp.arange(len(source)) >= len(source) - pad
@@ -122,7 +137,8 @@ def control_density(params: Any, statistics: DensityStatistics, config: DensityC
     before, alive = int(np.asarray(gaussians.alive).sum()), int(keep.sum() + clone.sum() + split.sum() * 2)
     report = DensityReport(int(clone.sum()), int(split.sum()), before - int(keep.sum()) - int(split.sum()), alive)
     params = dataclasses.replace(params, gaussians=edited)
-    return Edit(params, statistics, gather_moments, {"density": dataclasses.asdict(report)})
+    growth = len(edited.means) / slots
+    return Edit(params, statistics, gather_moments, {"density": dataclasses.asdict(report)}, growth=growth)
 
 
 def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:

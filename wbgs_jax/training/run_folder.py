@@ -21,6 +21,7 @@ from wbgs_jax._util.pytree import replaced
 from wbgs_jax._util.typed import misfit
 from wbgs_jax.config import Settings, check, from_dict, sections, to_dict
 from wbgs_jax.data.checksum import check_data
+from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset, source_paths
 from wbgs_jax.data.splits import (
@@ -34,7 +35,7 @@ from wbgs_jax.data.splits import (
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.inference import confidence, neighbours
 from wbgs_jax.inference.confidence import Confidence, PowerConfidence, read_confidence, read_power_confidence
-from wbgs_jax.inference.neighbours import Neighbours, read_neighbours
+from wbgs_jax.inference.neighbours import Beside, read_neighbours
 from wbgs_jax.training import checkpoint
 
 FIRST_PRESET = "cpu"
@@ -67,15 +68,17 @@ class RunConfig:
     """Number of the only receiver that is looked at; None: all."""
     neighbours: bool = True
     """Whether known spectra are asked beside the field, where that gains on validation."""
+    convention: ConventionName | None = None
+    """In which the pixels of a folder are ordered; None where there is no folder, or as it is not known yet."""
 
-    def other_data(self, source: str) -> Dataset:
+    def other_data(self, source: str, convention: ConventionName | None = None) -> Dataset:
         """Returns data of any name, read as those that the run was trained on."""
         frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
-        return load_dataset(source, frequency_hz=frequency, seed=self.seed)
+        return load_dataset(source, frequency_hz=frequency, seed=self.seed, convention=convention)
 
     def dataset(self) -> Dataset:
         """Returns the data that the run was trained on."""
-        dataset = self.other_data(self.source)
+        dataset = self.other_data(self.source, self.convention)
         if self.receiver is not None:
             dataset = select_receivers(dataset, [self.receiver])
         if self.test_box:
@@ -97,7 +100,7 @@ class TrainedField:
     step: int
     seconds: float
     """Training time."""
-    neighbours: Neighbours | None = None
+    neighbours: Beside = None
     """Known spectra that are asked beside it."""
     confidence: Confidence | None = None
     """How sure its answers are."""

@@ -26,6 +26,8 @@ POWER_MARGIN_DB = 1.0
 """What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
 RAREST = 1e-4
 """Chance that SciPy's 9,999 random flips can tell from none."""
+FEWEST_SURE = 5
+"""Transmitters of which less proves nothing: the signs of three agree by chance once in eight times."""
 ALIKE = 1e-6
 """Mean absolute error of spectra below which none is better than another."""
 Compared = Literal["snapshots", "covariances", "spectra", "powers"]
@@ -160,11 +162,11 @@ def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"
 
     Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
     t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
-    three errors. Gains that are not finite are not sure. Where so many errors mean less than one chance in ten thousand, which
-    is as few as random flips can tell, the errors themselves are counted.
+    three errors, fewer than `FEWEST_SURE` at none. Gains that are not finite are not sure. Where so many errors mean less than
+    one chance in ten thousand, which is as few as random flips can tell, the errors themselves are counted.
     """
     by_tx = by_transmitter(gains, tx_index)
-    if len(by_tx) < 2 or not np.isfinite(by_tx).all():  # signs of one are flipped with even odds
+    if len(by_tx) < FEWEST_SURE or not np.isfinite(by_tx).all():
         return False
     if norm.sf(errors) < RAREST:
         gain, error = standard_error(gains, tx_index)

@@ -81,6 +81,9 @@ class Search:
         """Returns whether it is before the first step."""
         return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
 
+    def next_size(self, params: Any, step: int, steps: int) -> None:
+        """Returns None: the search is over before an epoch is compiled."""
+
     def apply(
         self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:

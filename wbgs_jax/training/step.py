@@ -81,14 +81,15 @@ def loss_and_gradients(
 
 
 def _all_finite(tree: Any) -> Bool[Array, ""]:
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+    """Returns whether all numbers are finite: looked at together, since a GPU takes as long for a leaf as for all of them."""
+    return jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])).all()
 
 
 def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-@partial(jax.jit, static_argnames=("optimizer", "controls", "limits", "mesh"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("optimizer", "controls", "limits", "mesh", "branches"), donate_argnames="state")
 def run_epoch(
     state: TrainState,
     field: Field,
@@ -102,9 +103,15 @@ def run_epoch(
     controls: tuple[Control, ...] = (),
     limits: Any = None,
     mesh: Mesh | None = None,
+    stopped: Bool[Array, ""] | None = None,
+    branches: bool = True,
 ) -> tuple[TrainState, EpochReport]:
     """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away. With a mesh all
-    arguments are on all of its devices, and so are the results."""
+    arguments are on all of its devices, and so are the results. Where `stopped`, the epoch before ended early: no step runs.
+
+    Without `branches` steps that are passed by are computed in vain: of a branch a GPU waits for the host in every step, and
+    they are rare.
+    """
 
     def run(state: TrainState, index: Int[Array, " b"]):
         (loss, aux), (gradients, probe) = loss_and_gradients(
@@ -130,12 +137,16 @@ def run_epoch(
             return state, jnp.full((), jnp.nan), nothing._replace(overflow=overflow), jnp.zeros((), bool)
 
         active = (position >= first) & ~stopped
-        state, loss, aux, ok = jax.lax.cond(active, lambda state: run(state, index), pass_by, state)
+        if branches:
+            state, loss, aux, ok = jax.lax.cond(active, lambda state: run(state, index), pass_by, state)
+        else:
+            state, loss, aux, ok = _where(active, run(state, index), pass_by(state))
         required = jax.tree.map(jnp.maximum, required, aux.required)
         carry = (state, good + ok, stopped | (active & ~ok), aux.overflow, required)
         return carry, (jnp.where(ok, loss, jnp.nan), aux.metrics)
 
-    carry = (state, jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros((), bool), nothing.required)
+    before = jnp.zeros((), bool) if stopped is None else stopped
+    carry = (state, jnp.zeros((), jnp.int32), before, jnp.zeros((), bool), nothing.required)
     (state, good, stopped, overflow, required), (loss, metrics) = jax.lax.scan(
         step, carry, (batches, jnp.arange(batches.shape[0]))
     )
