@@ -12,6 +12,7 @@ from experiments.results import Results
 from experiments.tables import (
     baselines,
     default_field,
+    few,
     figure4,
     figure6,
     figure7,
@@ -22,7 +23,7 @@ from experiments.tables import (
     table3,
 )
 
-PAGES = (headline, default_field, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
+PAGES = (headline, default_field, few, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
 """In the order of the paper, for readers."""
 
 

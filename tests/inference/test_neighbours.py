@@ -13,7 +13,7 @@ from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.inference import neighbours as asked
 from wbgs_jax.inference.neighbours import NEAREST, NOISE, correct, for_receiver, read_neighbours, write_neighbours
-from wbgs_jax.training.neighbours import Choice, choices, eight_bit, images_of, make_neighbours
+from wbgs_jax.training.neighbours import Choice, choices, images_of, make_neighbours
 from wbgs_jax.types import make_query, make_receiver
 
 
@@ -28,7 +28,7 @@ def known(rng):
 
 def made(choice, dataset, index, predicted):
     """Neighbours of known links."""
-    return make_neighbours(choice, dataset, index, images_of(choice.kind, eight_bit(dataset, index), predicted))
+    return make_neighbours(choice, dataset, index, images_of(choice.kind, dataset.eight_bit(index), predicted))
 
 
 def by_the_equations(dataset, index, choice, values, position, frequency):

@@ -49,7 +49,8 @@ def test_intervals_hold_nine_of_ten_new_scores(rng):
     inside, ratios = [], []
     for _ in range(10):  # one draw of the 300 that are learned from moves the share by 0.02
         mean, scale, weights, rest = fit(*drawn(rng, 60), SETS)
-        quantiles, surplus = interval(rest, np.arange(len(rest))), np.exp(rest).mean()
+        (quantiles, level), surplus = interval(rest, np.arange(len(rest))), np.exp(rest).mean()
+        assert level == 0.9
         again, truth, _ = drawn(rng, 400)
         predicted = (again - mean) / scale @ weights[:-1] + weights[-1]
         inside.append(np.mean((predicted + quantiles[0] <= truth) & (truth <= predicted + quantiles[1])))
@@ -84,18 +85,19 @@ def test_a_transmitter_is_not_judged_by_itself(rng):
     assert np.isfinite(left_out(known, error, np.zeros(len(tx), int))).all()
 
 
-def test_few_scores_give_a_wide_interval(rng):
-    """And no narrower one than what was seen, or than Student's t says: nine of ten further ones lie in it."""
-    low, high = interval(np.array([0.3, -1.0, 2.0]), np.arange(3))
-    assert low < -1 and high > 2
-    held = []
-    for _ in range(2000):
-        *rest, new = rng.normal(size=9)
-        low, high = interval(np.array(rest), np.arange(8))
-        held.append(low <= new <= high)
-    assert 0.85 < np.mean(held) < 0.96
-    many = np.arange(199.0)
-    np.testing.assert_array_equal(interval(many, np.arange(199)), [9, 189])
+def test_few_transmitters_have_the_level_that_exists(rng):
+    """Of three the highest holds three of four, and there is no lower end; from 9 on there is one of 90 %, from 19 on two."""
+    (low, high), level = interval(np.array([0.3, -1.0, 2.0]), np.arange(3))
+    assert (low, high, level) == (-np.inf, 2.0, 0.75)
+    assert interval(np.arange(8.0), np.arange(8))[1] == pytest.approx(8 / 9)
+    (low, high), level = interval(np.arange(9.0), np.arange(9))
+    assert (low, high, level) == (-np.inf, 8.0, 0.9)
+    assert interval(np.arange(18.0), np.arange(18))[0][0] == -np.inf
+    for count, ends in ((19, [0, 18]), (199, [9, 189])):
+        quantiles, level = interval(np.arange(float(count)), np.arange(count))
+        np.testing.assert_array_equal(quantiles, ends)
+        assert level == 0.9
+    assert upper_end(np.arange(5.0), np.arange(5)) == np.inf
 
 
 @pytest.mark.parametrize("n_tx", [8, 12, 30])
@@ -107,9 +109,9 @@ def test_intervals_of_links_that_are_alike_hold_for_other_transmitters(n_tx, own
         tx = np.repeat(np.arange(n_tx + 40), 10)
         rest = rng.normal(size=n_tx + 40)[tx] + own * rng.normal(size=len(tx))
         seen = tx < n_tx
-        low, high = interval(rest[seen], tx[seen])
-        held.append(np.mean((low <= rest[~seen]) & (rest[~seen] <= high)))
-    assert 0.86 < np.mean(held) < 0.94
+        (low, high), level = interval(rest[seen], tx[seen])
+        held.append(np.mean((low <= rest[~seen]) & (rest[~seen] <= high)) - level)
+    assert -0.03 < np.mean(held) < 0.03
 
 
 @pytest.mark.parametrize("n_tx", [2, 3, 5, 7])
@@ -119,10 +121,10 @@ def test_intervals_of_few_transmitters_hold_for_another_one(n_tx, rng):
     for _ in range(1000):
         tx = np.repeat(np.arange(n_tx), 20)
         error = rng.normal(size=n_tx)[tx] + 0.3 * rng.normal(size=len(tx))
-        low, high = interval(left_out(np.zeros((len(tx), 0)), error, tx), tx)
+        (low, high), level = interval(left_out(np.zeros((len(tx), 0)), error, tx), tx)
         new = rng.normal() + 0.3 * rng.normal() - error.mean()
-        held.append(low <= new <= high)
-    assert np.mean(held) > 0.86
+        held.append((low <= new <= high) - level)
+    assert -0.05 < np.mean(held) < 0.15  # what is left out is further from the others than a new one is
 
 
 def test_of_one_validation_transmitter_nothing_is_said():
@@ -136,10 +138,10 @@ def test_answers_of_one_expectation_are_in_no_order(rng):
     """Whatever the order of the links; two expectations are two groups."""
     scores = np.sort(rng.uniform(0.3, 0.9, 40))
     for truth in (scores, scores[::-1]):
-        report = calibration(Expected(*np.full((3, 40), 0.6)), truth)
+        report = calibration(Expected(*np.full((3, 40), 0.6)), truth, 0.9)
         assert report["correlation"] == 0
         np.testing.assert_allclose(list(report["risk_coverage"].values()), truth.mean())
-    two = calibration(Expected(*np.repeat([[0.4, 0.8]], 3, 0).repeat(20, 1)), scores)
+    two = calibration(Expected(*np.repeat([[0.4, 0.8]], 3, 0).repeat(20, 1)), scores, 0.9)
     assert two["risk_coverage"]["0.25"] == pytest.approx(scores[20:].mean())
     assert two["risk_coverage"]["1"] == pytest.approx(scores.mean()) and 0.8 < two["correlation"] < 1
 
@@ -147,13 +149,13 @@ def test_answers_of_one_expectation_are_in_no_order(rng):
 def test_calibration_reports_what_it_says(rng):
     scores = rng.uniform(0.3, 0.9, 100)
     exact = Expected(*(jnp.asarray(scores + d) for d in (0, -0.1, 0.1)))
-    report = calibration(exact, scores)
+    report = calibration(exact, scores, 0.9)
     assert report["coverage"] == 1 and report["correlation"] == pytest.approx(1)
     assert report["width"] == pytest.approx(0.2, abs=0.01) and report["expected"] == pytest.approx(report["scored"])
     assert report["risk_coverage"]["1"] == pytest.approx(scores.mean())
     assert report["risk_coverage"]["0.5"] == pytest.approx(np.sort(scores)[50:].mean())
     wrong = Expected(*(jnp.asarray(1 - scores + d) for d in (0, -0.01, 0.01)))
-    assert calibration(wrong, scores)["coverage"] < 0.2 and calibration(wrong, scores)["risk_coverage"]["0.1"] < 0.5
+    assert calibration(wrong, scores, 0.9)["coverage"] < 0.2 and calibration(wrong, scores, 0.9)["risk_coverage"]["0.1"] < 0.5
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +177,7 @@ def test_it_is_learned_from_the_validation_part_alone(dataset):
     expected = expect_many(learned, pas, dataset.tx_positions[index], dataset.frequencies_hz[index])
     scores = ssim(pas, np.asarray(dataset.pas(index)))
     assert abs(expected.ssim.mean() - scores.mean()) < 0.15
-    assert calibration(expected, scores)["coverage"] > 0.6
+    assert calibration(expected, scores, 0.9)["coverage"] > 0.6
 
 
 def test_answers_are_judged_as_they_would_be_observed(dataset):
@@ -224,7 +226,7 @@ def confidence():
     return Confidence(
         *(
             jnp.asarray(a, jnp.float32)
-            for a in (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2)
+            for a in (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9)
         )
     )
 
@@ -276,7 +278,7 @@ def test_powers_stay_as_near_as_they_should_nine_times_of_ten(rng):
         ratios.append(np.mean(np.exp(predicted)) * np.exp(rest).mean() / np.exp(truth).mean())
     assert 0.85 < np.mean(held) < 0.95
     assert np.mean(ratios) == pytest.approx(1, rel=0.1)
-    assert upper_end(np.array([0.3, -1.0, 2.0]), np.arange(3)) > 2
+    assert upper_end(np.array([0.3, -1.0, 2.0]), np.arange(3), 0.25) == 2
     assert upper_end(np.arange(199.0), np.arange(199)) == 179
 
 
@@ -313,7 +315,7 @@ def test_confidence_of_powers_is_learned_over_all_receivers(rng):
 
 def power_confidence(weights):
     k = POWER_SETS[-1]
-    arrays = np.eye(3), np.zeros(k), np.ones(k), weights, 1.0, 1.5
+    arrays = np.eye(3), np.zeros(k), np.ones(k), weights, 1.0, 1.5, 0.9
     return PowerConfidence(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 

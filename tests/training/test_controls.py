@@ -72,6 +72,9 @@ class Watching:
     def due(self, step, steps):
         return False
 
+    def next_size(self, params, step, steps):
+        return None
+
     def apply(self, field, params, statistics, context, step, rng):
         raise AssertionError("it is never due")
 
@@ -293,7 +296,7 @@ def test_long_work_before_the_first_step_is_shown_and_kept(dataset, tmp_path, mo
     """It is killed in the first epoch; resumed, it goes on with what was found, and seeks nothing."""
     use(monkeypatch, Watching, Seeking)
 
-    def killed(run):
+    def killed(run, go_on=False):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

@@ -17,9 +17,11 @@ from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.wideband import WidebandField
+from wbgs_jax.splat import TileLimits
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.data import check_data
 from wbgs_jax.training.loop import Interrupted, Run, train
+from wbgs_jax.training.step import run_epoch as epoch_programs
 
 STEPS = 8
 PLAIN = ("ripple", toy_settings())
@@ -56,8 +58,8 @@ def interrupt_after(monkeypatch, epochs, signals=(signal.SIGINT,)):
     """Send signals to this process during the given epoch."""
     original, done = Run.epoch, []
 
-    def epoch(run):
-        result = original(run)
+    def epoch(run, go_on=False):
+        result = original(run, go_on)
         done.append(run.step)
         if len(done) == epochs:
             for number in signals:
@@ -133,15 +135,15 @@ def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninter
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_saves_and_says_how_to_go_on(dataset, tmp_path, monkeypatch, uninterrupted, number):
-    """Here the density control comes after the interrupt."""
+    """The device has been given the next epoch already, which is waited for; the density control is due after it."""
     before = signal.getsignal(number)
     with monkeypatch.context() as patch:
         interrupt_after(patch, 1, [number])
-        with pytest.raises(Interrupted, match=r"step 2 of 8.*--resume") as stopped:
+        with pytest.raises(Interrupted, match=r"step 4 of 8.*--resume") as stopped:
             train(dataset, *CROWDED, 0, tmp_path)
     assert isinstance(stopped.value, UserError) and "\n" not in str(stopped.value)
     assert signal.getsignal(number) == before
-    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [2]
+    assert checkpoint.checkpoint_steps(tmp_path / "checkpoints") == [4]
     train(dataset, *CROWDED, 0, tmp_path, resume=True)
     assert_same_run(dataset, tmp_path, uninterrupted(CROWDED), CROWDED)
 
@@ -193,6 +195,50 @@ def test_density_controls_are_reported_and_keep_their_schedule(uninterrupted):
     assert control["density"]["alive"] == 90
     assert [entry["gaussians"] for entry in entries if "loss" in entry] == [60, 90, 90, 90]
     assert not any("density" in entry for entry in metrics_of(uninterrupted(PLAIN)))
+
+
+def test_the_next_size_is_compiled_before_it_is_needed(dataset, tmp_path, monkeypatch):
+    """By a call that runs no step; the epoch that needs it compiles nothing, and the limits have grown in proportion."""
+    run, called = Run(dataset, *CROWDED, 0, tmp_path), []
+    original = Run._run_epoch
+
+    def run_epoch(run, state, cache, batches, first, limits, stopped):
+        called.append((len(state.params.gaussians.means), first, limits))
+        return original(run, state, cache, batches, first, limits, stopped)
+
+    monkeypatch.setattr(Run, "_run_epoch", run_epoch)
+    before = run.limits
+    run.epoch()
+    run.precompilation.wait(next(iter(run.precompilation._threads)))
+    assert called == [(64, 0, before), (96, 2, before.scaled(1.5))] and run.precompilation.seconds > 0
+    run.epoch()
+    run.control()
+    compiled = epoch_programs._cache_size()
+    assert len(run.state.params.gaussians.means) == 96 and run.limits == before.scaled(1.5) and run.compilations == 2
+    seconds = run.compile_seconds
+    run.epoch()
+    assert epoch_programs._cache_size() == compiled and run.compile_seconds == seconds
+
+
+def test_a_device_that_goes_on_trains_what_one_does_that_waits(dataset, tmp_path, monkeypatch):
+    """Also where the first of two epochs that were given ends early: the second does nothing until limits hold."""
+    states, figures = [], []
+    for ahead in (False, True):
+        run = Run(dataset, *CROWDED, 0, tmp_path / str(ahead))
+        run.limits = TileLimits(entries=1024, jobs=1024)
+        figures.append([run.epoch(go_on=ahead), run.epoch()])
+        assert not run.launched and run.step == 4 and run.compilations > 1
+        states.append(run.state)
+    assert figures[0] == figures[1]
+    for x, y in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_steps_are_counted_as_far_as_their_figures_are_known(dataset, tmp_path):
+    run = Run(dataset, *PLAIN, 0, tmp_path)
+    run.epoch(go_on=True)
+    assert run.step == 2 and len(run.launched) == 1 and int(run.state.step) == 4
+    assert [run.due(step) for step in (2, 4, 6, 8)] == [False, True, False, True]  # checkpoints, and the end
 
 
 def test_a_reset_of_the_attenuation_happens_at_its_step(dataset, tmp_path, uninterrupted):

@@ -7,27 +7,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import rankdata
 
-from wbgs_jax.inference.confidence import LEVEL, Expected, ExpectedPower
+from wbgs_jax.inference.confidence import Expected, ExpectedPower
 
 COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
 """Shares of the answers, the surest ones, whose mean score is reported."""
 
 
-def calibration(expected: Expected, scores: Float[np.ndarray, " n"]) -> dict[str, Any]:
+def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
     """Returns how the expected SSIM of answers compares with what they scored: `coverage` of the intervals and their mean
     `width`, the mean `expected` and true `scored` SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the
     mean SSIM of the surest share."""
     expectation, low, high = (np.asarray(values, np.float64) for values in expected)
     held = (low <= scores) & (scores <= high)
-    return _figures(expectation, scores, -expectation, held) | {"width": float(np.mean(np.minimum(high, 1) - low))}
+    return _figures(expectation, scores, -expectation, held, level) | {"width": float(np.mean(np.minimum(high, 1) - low))}
 
 
-def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"]) -> dict[str, Any]:
+def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
     """Returns how the expected errors of received powers compare with the true absolute ones (dB): `coverage` of what they were
     to stay within, its mean `within_db`, the mean `expected` and true `scored` error, their rank `correlation`, and the
     `risk_coverage` curve: the mean error of the surest share."""
     expectation, within = (np.asarray(values, np.float64) for values in expected)
-    return _figures(expectation, errors_db, expectation, errors_db <= within) | {"within_db": float(within.mean())}
+    return _figures(expectation, errors_db, expectation, errors_db <= within, level) | {"within_db": float(within.mean())}
 
 
 def _figures(
@@ -35,6 +35,7 @@ def _figures(
     truth: Float[np.ndarray, " n"],
     doubt: Float[np.ndarray, " n"],
     held: Bool[np.ndarray, " n"],
+    level: float,
 ) -> dict[str, Any]:
     """Returns what both have in common; `doubt` orders the answers, the surest first, and those of equal doubt count as their
     mean."""
@@ -42,7 +43,7 @@ def _figures(
     means = np.bincount(equal, truth, len(ranks)) / np.bincount(equal, minlength=len(ranks))
     surest = means[np.sort(equal)]
     return {
-        "level": LEVEL,
+        "level": round(level, 4),
         "coverage": float(held.mean()),
         "expected": float(expectation.mean()),
         "scored": float(truth.mean()),

@@ -75,7 +75,7 @@ def calibrate_power(
     heard = truth > NOT_HEARD_DB
     receivers = jnp.asarray(dataset.rx_positions(index[heard]), jnp.float32)
     expected = _expected_power(confidence, jnp.asarray(predicted[heard], jnp.float32), dataset.query(index[heard]), receivers)
-    return power_calibration(expected, np.abs(predicted[heard].astype(np.float64) - truth[heard]))
+    return power_calibration(expected, np.abs(predicted[heard].astype(np.float64) - truth[heard]), float(confidence.level))
 
 
 _expected_power = jax.jit(expected_power)

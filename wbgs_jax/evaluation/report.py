@@ -54,6 +54,8 @@ def _training_arguments(config: Any) -> list[str]:
     data = ["--data" if sources[0].is_dir() else "--scene", ",".join(path.name for path in sources)]
     if config.frequency_ghz is not None:
         data += ["--frequency-ghz", f"{config.frequency_ghz:g}"]
+    if config.convention is not None:
+        data += ["--convention", config.convention]
     if config.train_ghz:
         data += ["--train-ghz", *(f"{f:g}" for f in config.train_ghz)]
     if config.train_tx:

@@ -62,8 +62,9 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     if seen.snapshots is not None and dataset.snapshots is not None:
         report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
     report |= {"power": power} if power else {}
-    if tested and (expected := expectations(trained.confidence, dataset, index, np.asarray(seen.pas), said)):
-        report["confidence"] = calibration(expected, alike)  # as it was learned
+    sure = trained.confidence
+    if tested and sure is not None and (expected := expectations(sure, dataset, index, np.asarray(seen.pas), said)):
+        report["confidence"] = calibration(expected, alike, float(sure.level))  # as it was learned
     report |= time_queries(trained, dataset)
     beside = baselines(others_know) if can_lend(others_know, index) else {}
     report["baselines"] = {

@@ -13,6 +13,7 @@ import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.places import closed_bodies
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.bounds import ROUNDED, Bounds, frequencies, link_words, point_words
@@ -73,7 +74,9 @@ def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> N
 
 def bounds_of(dataset: Dataset) -> Bounds:
     """Returns where a field knows something by training."""
-    return Bounds(dataset.name, DatasetScene(dataset).box, trained_band(dataset))
+    box = np.asarray(DatasetScene(dataset).box, np.float64)
+    beyond = 0.0 if len(dataset.faces) else 0.5 * float(np.linalg.norm(box[1] - box[0]))
+    return Bounds(dataset.name, box, trained_band(dataset), beyond, closed_bodies(dataset))
 
 
 def doubts(
@@ -94,7 +97,10 @@ def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> 
 
 
 def source_of(trained: Trained, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
-    """Returns where an answer comes from: scene, field, step, version, and the receiver that was asked."""
+    """Returns where an answer comes from: scene, field, step, version, and the receiver that was asked; and the chance that
+    true values lie in the intervals beside it, where there are any."""
     asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
     origin = {name: value for name, value in trained.origin().items() if name in ("field", "step")}
-    return {"scene": dataset.name, "version": wbgs_jax.__version__, "receiver": asked} | origin
+    learned = {"interval_level": trained.confidence, "power_interval_level": trained.power_confidence}
+    levels = {name: round(float(own.level), 4) for name, own in learned.items() if own is not None}
+    return {"scene": dataset.name, "version": wbgs_jax.__version__, "receiver": asked} | origin | levels

@@ -56,6 +56,8 @@ class Confidence:
     """Lowest and highest r of the interval."""
     surplus: Float[Array, ""]
     """Mean of exp(r)."""
+    level: Float[Array, ""]
+    """Chance that a score lies within the interval: `LEVEL`, or what exists of the transmitters that were held out."""
 
 
 @pytree
@@ -71,9 +73,11 @@ class PowerConfidence:
     weights: Float[Array, " k+1"]
     """Of the scaled features and of 1; zero for those that do not help."""
     highest: Float[Array, ""]
-    """What r is at most, nine times out of ten."""
+    """What r is at most."""
     surplus: Float[Array, ""]
     """Mean of exp(r)."""
+    level: Float[Array, ""]
+    """Chance that it is: `LEVEL`, or what exists of the transmitters that were held out."""
 
 
 C = TypeVar("C", Confidence, PowerConfidence)
@@ -216,7 +220,7 @@ def read_power_confidence(folder: Path) -> PowerConfidence | None:
 
 
 def _read(path: Path, cls: type[C], count: int) -> C | None:
-    found = read_tree(path, cls, "do without")
+    found = read_tree(path, (cls,), "do without", {"level": LEVEL})
     if found is not None and found.mean.shape != (count,):
         raise UserError(f"{path} is of another version; remove it to do without, or train again")
     return found

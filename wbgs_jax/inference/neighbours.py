@@ -17,20 +17,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Num
 
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.inference.mixture import NEAREST, SAME_FREQUENCY, Mixture, answer, solve
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.types import Query, Receiver
 
-SAME_FREQUENCY = 1e-4
-"""Relative difference of two frequencies that are the same."""
 SAME_PLACE_M = 1e-3
 """Distance of two receivers that are the same."""
-NEAREST = 32
-"""Known spectra that a query asks."""
 NOISE = 1e-2
 """Variance of what is no function of the position, beside 1."""
 FILE = "neighbours.npz"
@@ -56,7 +52,11 @@ class Neighbours:
     """L in metres."""
 
 
-def without_asked(neighbours: Neighbours | None, query: Query) -> Neighbours | None:
+Beside = Neighbours | Mixture | None
+"""Known spectra beside a field: those of many data correct it, those of few share its answers."""
+
+
+def without_asked(neighbours: Beside, query: Query) -> Beside:
     """Returns neighbours that do not know the spectra that are asked for (host); None where nothing is left."""
     if neighbours is None:
         return None
@@ -65,6 +65,8 @@ def without_asked(neighbours: Neighbours | None, query: Query) -> Neighbours | N
     if not len(kept):
         return None
     taken = {name: getattr(neighbours, name)[kept] for name in ("tx_position", "frequency_hz", "images")}
+    if isinstance(neighbours, Mixture):
+        taken["mean"] = jnp.asarray(np.asarray(taken["images"]).mean(0) / 255, jnp.float32)
     return dataclasses.replace(neighbours, **taken)
 
 
@@ -82,10 +84,12 @@ def nearness(
     return jnp.where(same, jnp.exp(-distance / length), 0)
 
 
-def correct(neighbours: Neighbours | None, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
-    """Returns a field's spectra with what the neighbours say; at frequencies or places far from all of them they stay."""
+def correct(neighbours: Beside, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
+    """Returns a field's spectra with what known ones add to them; at frequencies or places far from all of them they stay."""
     if neighbours is None:
         return pas
+    if isinstance(neighbours, Mixture):
+        return answer(neighbours, pas, query)
     asked = query.tx_position, query.frequency_hz, pas
     return jax.lax.map(lambda one: _corrected(neighbours, *one), asked)
 
@@ -97,10 +101,8 @@ def _corrected(
     near = nearness(position[None], frequency_hz[None], *known, length)[0]
     k, index = jax.lax.top_k(near, min(NEAREST, len(near)))
     places = known[0][index], known[1][index]
-    kernel = nearness(*places, *places, length) + NOISE * jnp.eye(len(k))
-    # Conjugate gradients: exported for any platform, unlike a factorisation; as many steps as there are unknowns are enough.
-    shares, _ = cg(lambda v: jnp.matmul(kernel, v, precision=EXACT), k, tol=1e-7, maxiter=2 * NEAREST)
-    shares = neighbours.weight * shares
+    kernel = nearness(*places, *places, length) + NOISE * jnp.eye(len(k), dtype=k.dtype)
+    shares = neighbours.weight * solve(kernel, k)
     said = jnp.tensordot(shares, neighbours.scale * neighbours.images[index].astype(own.dtype), 1, precision=EXACT)
     corrected = own + said - neighbours.own * jnp.sum(shares) * own
     return jnp.where(k[0] > 0, jnp.clip(corrected, 0, 1), own)
@@ -118,11 +120,12 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
     return learned if learned.rx_position.ndim == 1 else dataclasses.replace(learned, rx_position=learned.rx_position[near])
 
 
-def write_neighbours(folder: Path, neighbours: Neighbours | None) -> None:
+def write_neighbours(folder: Path, neighbours: Beside) -> None:
     """Leaves them in a run folder, or nothing."""
     write_tree(folder / FILE, neighbours)
 
 
-def read_neighbours(folder: Path) -> Neighbours | None:
+def read_neighbours(folder: Path) -> Beside:
     """Returns those of a run folder; None if it has none. A damaged file is a `UserError`."""
-    return read_tree(folder / FILE, Neighbours, "ask the field alone")
+    classes: tuple[type[Mixture | Neighbours], ...] = (Mixture, Neighbours)
+    return read_tree(folder / FILE, classes, "ask the field alone")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from wbgs_jax.inference.bounds import Bounds
+from wbgs_jax.inference.bounds import CONFIDENCES, Bounds
 from wbgs_jax.inference.queries import Product, Queries
 from wbgs_jax.inference.ready import MOST, QUANTITIES, Ready, load_ready, make_ready
 
@@ -70,8 +70,23 @@ def _knows(ready: Ready, what: str, lowest_hz: float) -> bool:
 
 
 def _opened_ready(ready: Ready, what: str, queries: Queries) -> Opened:
-    answer = ready(what, *queries.flat())
-    return Opened(lambda block: answer, Bounds.from_json(ready.meta["bounds"]), ready.meta["source"])
+    bounds = Bounds.from_json(ready.meta["bounds"])
+    positions, frequencies_hz = queries.flat()
+    answer = _masked(ready(what, positions, frequencies_hz), bounds, positions)
+    return Opened(lambda block: answer, bounds, ready.meta["source"])
+
+
+def _masked(answer: dict[str, np.ndarray], bounds: Bounds, positions: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+    """Returns an answer without confidence where there is none (NaN)."""
+    if not set(CONFIDENCES) & set(answer):
+        return answer
+    nowhere = bounds.without_confidence(positions)
+    return {
+        name: np.where(nowhere.reshape(-1, *[1] * (values.ndim - 1)), np.nan, values).astype(values.dtype)
+        if name in CONFIDENCES
+        else values
+        for name, values in answer.items()
+    }
 
 
 def _opened_run(
@@ -99,4 +114,11 @@ def _opened_run(
         }
         if ready := make_ready(run, rx, len(queries), trained, receiver, watched, meta):
             return _opened_ready(ready, what, queries)
-    return Opened(lambda block: asking.answer_block(what, trained, dataset, receiver, options, block), bounds, source)
+
+    def answer(block: list[Product]) -> dict[str, np.ndarray]:
+        found = asking.answer_block(what, trained, dataset, receiver, options, block)
+        rows = np.concatenate([product.rows for product in block])
+        positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])
+        return _masked(found, bounds, positions[np.argsort(rows)])
+
+    return Opened(answer, bounds, source)

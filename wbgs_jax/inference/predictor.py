@@ -17,7 +17,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.confidence import Confidence, PowerConfidence
-from wbgs_jax.inference.neighbours import SAME_PLACE_M, Neighbours, correct, for_receiver
+from wbgs_jax.inference.neighbours import SAME_PLACE_M, Beside, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
@@ -46,7 +46,7 @@ class Trained(Protocol):
         ...
 
     @property
-    def neighbours(self) -> Neighbours | None:
+    def neighbours(self) -> Beside:
         """Known spectra that are asked beside it."""
         ...
 
@@ -182,9 +182,7 @@ def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[A
 
 
 @jax.jit
-def render_pas(
-    field: Field, params: Any, plan: Any, query: Query, neighbours: Neighbours | None = None
-) -> Float[Array, "b 90 360"]:
+def render_pas(field: Field, params: Any, plan: Any, query: Query, neighbours: Beside = None) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
     return correct(neighbours, field.render(params, plan, query).pas, query)
 
@@ -195,12 +193,12 @@ def _observe(
     params: Any,
     plan: Any,
     cache: Any,
-    neighbours: Neighbours | None,
+    neighbours: Beside,
     links: Links,
     quantity: str | None,
     mesh: Mesh | None,
 ) -> Any:
-    def own(links: Links, field: Field, params: Any, plan: Any, cache: Any, neighbours: Neighbours | None) -> Any:
+    def own(links: Links, field: Field, params: Any, plan: Any, cache: Any, neighbours: Beside) -> Any:
         seen = field.render_links(params, plan, cache, links)
         seen = seen._replace(pas=correct(neighbours, seen.pas, links.query))
         return getattr(seen, quantity) if quantity else seen
@@ -310,7 +308,7 @@ def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, " n"]) ->
 
 
 def corrected(
-    neighbours: Neighbours | None, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"]
+    neighbours: Beside, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 90 360"]:
     """Returns predicted spectra of some of a dataset's links with what the neighbours say."""
     if neighbours is None:

@@ -70,25 +70,31 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
                 yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
 
 
-def lines(what: str, answers: Answers, queries: Queries) -> list[str]:
-    """Returns how good some of the answers are expected to be, where that is known: one line each."""
+NO_CONFIDENCE = "no confidence: it lies outside of what was trained, or where no antenna can stand"
+
+
+def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
+    """Returns how good some of the answers are expected to be, where that is known: one line each. `source` holds the level of
+    their intervals (`answers.source_of`)."""
     from wbgs_jax.inference.bounds import link_words
-    from wbgs_jax.inference.confidence import LEVEL
 
     if what == PATHS or not {"expected", "within_db"} & set(answers.names()):
         return []
     shown = shown_rows(len(queries))
     positions, frequencies = (part[shown] for part in queries.flat())
     where = [link_words(position, float(frequency)) for position, frequency in zip(positions, frequencies, strict=True)]
-    sure = f"{100 * LEVEL:.0f} %"
+    sure = f"{100 * source['interval_level' if what == 'spectra' else 'power_interval_level']:.0f} %"
     if what == "spectra":
         expected = zip(where, answers.rows("expected", shown), strict=True)
         return [
-            f"{link}: expected SSIM {ssim:.2f}, {sure} between {low:.2f} and {min(high, 1):.2f}"
+            f"{link}: {NO_CONFIDENCE}"
+            if np.isnan(ssim)
+            else f"{link}: expected SSIM {ssim:.2f}, {sure} between {low:.2f} and {min(high, 1):.2f}"
             for link, (ssim, low, high) in expected
         ]
     columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))
     return [
-        f"{link}: {power:.1f} dB of the transmitted power; expected {error:.1f} dB off, {sure} within {within:.1f} dB"
+        f"{link}: {power:.1f} dB of the transmitted power; "
+        + (NO_CONFIDENCE if np.isnan(error) else f"expected {error:.1f} dB off, {sure} within {within:.1f} dB")
         for link, power, error, within in zip(where, *columns, strict=True)
     ]

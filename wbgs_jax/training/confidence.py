@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.stats import t as student_t
 
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
@@ -34,10 +33,8 @@ from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 FEWEST, MOST = 8, 1000
 """Validation spectra below which nothing is said; those that are looked at, at most."""
-FEW, FEW_TX = 20, 8
-"""Rests, and transmitters, below which their own quantiles do not reach `LEVEL`."""
-ALIKE = 0.3
-"""Share of a transmitter by which quantiles reach further than links that are no more alike than others would need."""
+DRAWS = 400
+"""Of one link of every transmitter."""
 SETS = (0, 1, 3, 5, FEATURES)
 """Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
 POWER_SETS = (0, 1, 2, POWER_FEATURES)
@@ -75,11 +72,30 @@ def _of_spectra(
     power = None if seen.power_db is None else jnp.asarray(seen.power_db)
     known = np.asarray(_features(jnp.asarray(pas), query, receivers, trained, power), np.float64)
     alike = ssim(as_observed(field, params, pas), np.asarray(dataset.pas(index)))
-    error = np.log(1 + MARGIN - np.minimum(alike, 1))
-    *learned, rest = fit(known, error, dataset.tx_index[index], SETS)
-    arrays = *learned, interval(rest, dataset.tx_index[index]), np.exp(rest).mean()
     places = dataset.receivers.position if dataset.n_receivers > 1 else dataset.receiver().position
-    return Confidence(places, trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
+    return confidence_of(known, alike, dataset.tx_index[index], places, trained)
+
+
+def confidence_of(
+    known: Float[np.ndarray, "n k"],
+    scores: Float[np.ndarray, " n"],
+    tx_index: Int[np.ndarray, " n"],
+    rx_position: Float[Array, "*r 3"],
+    tx_position: Float[Array, "m 3"],
+) -> Confidence:
+    """Returns how sure answers are, from the features and scores (SSIM) of some of them.
+
+    Args:
+        known: features of the answers (`inference.confidence.features`).
+        scores: what they scored.
+        tx_index: their transmitters.
+        rx_position: of the receivers, metres.
+        tx_position: of the transmitters that are known, metres.
+    """
+    *learned, rest = fit(known, np.log(1 + MARGIN - np.minimum(scores, 1)), tx_index, SETS)
+    quantiles, level = interval(rest, tx_index)
+    arrays = *learned, quantiles, np.exp(rest).mean(), level
+    return Confidence(rx_position, tx_position, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
 def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]) -> PowerConfidence | None:
@@ -95,7 +111,8 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     known = np.asarray(_power_features(jnp.asarray(said), dataset.query(index), receivers, trained), np.float64)
     error = np.log(POWER_MARGIN_DB + np.abs(said.astype(np.float64) - truth[heard]))
     *learned, rest = fit(known, error, dataset.tx_index[index], POWER_SETS)
-    arrays = *learned, upper_end(rest, dataset.tx_index[index]), np.exp(rest).mean()
+    level = exact_level(dataset.tx_index[index])
+    arrays = *learned, upper_end(rest, dataset.tx_index[index], 1 - level), np.exp(rest).mean(), level
     return PowerConfidence(trained, *(jnp.asarray(array, jnp.float32) for array in arrays))
 
 
@@ -143,24 +160,37 @@ def left_out(
     return rest
 
 
-def interval(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "2"]:
-    """Returns the ends between which `LEVEL` of further rests lie."""
+def interval(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "2"], float]:
+    """Returns the ends between which further rests lie, and how surely: with the chance `LEVEL`, where there are transmitters
+    enough for two tails; with fewer there is no lower end (scores as high as they may be), and with fewer still the level is
+    the highest that exists."""
     tail = (1 - LEVEL) / 2
-    return np.array([-upper_end(-rest, tx_index, tail), upper_end(rest, tx_index, tail)])
+    if tail * (len(np.unique(tx_index)) + 1) >= 1 - 1e-9:
+        return np.array([-upper_end(-rest, tx_index, tail), upper_end(rest, tx_index, tail)]), LEVEL
+    level = exact_level(tx_index)
+    return np.array([-np.inf, upper_end(rest, tx_index, 1 - level)]), level
+
+
+def exact_level(tx_index: Int[np.ndarray, " n"]) -> float:
+    """Returns the level of one-sided intervals: `LEVEL`, or what n transmitters allow, n / (n + 1)."""
+    count = len(np.unique(tx_index))
+    return min(LEVEL, count / (count + 1))
 
 
 def upper_end(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], tail: float = 1 - LEVEL) -> float:
-    """Returns what all but a share `tail` of further rests lie below, with the correction for the number of those seen.
+    """Returns what all but a share `tail` of further rests lie below.
 
-    Rests of one transmitter are alike, so that quantiles vary with the number of transmitters rather than that of rests: they
-    reach further by 0.3 / transmitters, which holds `LEVEL` within 4 % from 8 transmitters on, however alike they are. A few
-    rests, or those of a few transmitters, cannot have such a quantile: there it is that of Student's t, no lower than what was
-    seen, which counts transmitters.
+    A new transmitter is exchangeable with those that were seen, its links are not with each other. Of one link of each of n
+    transmitters the rank (1 - tail) (n + 1) is exact (split conformal prediction, Lei et al. 2018), whatever the distribution;
+    between ranks it is interpolated, and it is the mean over many draws of these links (Dunn, Wasserman and Ramdas 2023). Of
+    too few transmitters it is infinite.
     """
-    n, n_tx, tail = len(rest), len(np.unique(tx_index)), round(tail, 9)  # binary fractions would lose a place
-    if n_tx < FEW_TX:
-        n = n_tx
-    elif n >= FEW:
-        below = max(n - int(np.floor(tail * (n + 1))), int(np.ceil((1 - tail + ALIKE / n_tx) * n)) - 1)
-        return float(np.sort(rest)[min(below, n - 1)])
-    return float(max(rest.max(), rest.mean() + rest.std(ddof=1) * np.sqrt(1 + 1 / n) * student_t.ppf(1 - tail, n - 1)))
+    owns = [rest[tx_index == tx] for tx in np.unique(tx_index)]
+    rank = round((1 - tail) * (len(owns) + 1), 9)  # binary fractions would lose a place
+    if rank > len(owns):
+        return np.inf
+    rng = np.random.default_rng(5)
+    drawn = np.sort([rng.choice(own, DRAWS) for own in owns], axis=0)
+    below = max(int(rank), 1)
+    share, above = rank - below, min(below, len(owns) - 1)
+    return float(np.mean((1 - share) * drawn[below - 1] + share * drawn[above]))

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import numpy as np
 
 from wbgs_jax._util.pytree import replaced
@@ -37,6 +38,8 @@ class Edit(NamedTuple):
     """The field where it is another one now, ..."""
     cache: Any = None
     """... and what it knows of the links."""
+    growth: float = 1.0
+    """How much more room the field needs than before."""
 
 
 class Context(NamedTuple):
@@ -73,6 +76,11 @@ class Control(Protocol):
 
     def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
         """Returns the changed parameters."""
+        ...
+
+    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+        """Returns parameters of the shapes that the control may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
+        None where nothing is near after this step of so many."""
         ...
 
 
@@ -116,3 +124,11 @@ class OfPart:
         moments = None if follow is None else lambda tree: put(tree, follow(getattr(tree, self.part)))
         whole = None if edit.field is None else put(field, edit.field)
         return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
+
+    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+        """Returns the shapes of all parameters that the control may soon change to, and that growth."""
+        own = getattr(params, self.part)
+        found = None if own is None else self.inner.next_size(own, step, steps)
+        if found is None:
+            return None
+        return replaced(jax.eval_shape(lambda tree: tree, params), **{self.part: found[0]}), found[1]

@@ -10,6 +10,7 @@ from jaxtyping import Array, Complex, Float, Int, Key, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.radio.array import cbf, normalise, pas_directions, snapshot_to_pas, steering_vector
@@ -85,6 +86,16 @@ def training_data(dataset: Dataset) -> TrainingData:
         images=None if dataset.images is None else jnp.asarray(dataset.images),
         power_db=None if dataset.power_db is None else jnp.asarray(dataset.power_db, jnp.float32),
     )
+
+
+def knows_no_paths(dataset: Dataset, field: type[Field]) -> bool:
+    """Returns whether all that a field can know of data are their observations: it follows no paths, or there is no mesh."""
+    return "paths" not in field.gives or not len(dataset.faces)
+
+
+def limited(settings: Settings, dataset: Dataset, field: type[Field]) -> Settings:
+    """Returns settings with the steps that a field gets on a data set (`config.limit_steps`)."""
+    return limit_steps(settings, len(dataset.train), knows_no_paths(dataset, field))
 
 
 def check_data(dataset: Dataset, field: type[Field]) -> None:

@@ -36,8 +36,6 @@ SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
 WEIGHTS = (0.5, 1.0)
 SURE, WORTH = 2.0, 0.005
 """Standard errors, and SSIM, that the best of them has to gain."""
-AT_ONCE = 1024
-"""Spectra that are made of snapshots."""
 
 
 @dataclass(frozen=True)
@@ -110,20 +108,12 @@ class _Known:
     def neighbours(self, choice: Choice) -> Neighbours:
         """Returns them as neighbours."""
         if choice.kind not in self._made:
-            spectra = eight_bit(self.dataset, self.index)
+            spectra = self.dataset.eight_bit(self.index)
             self._made[choice.kind] = images_of(choice.kind, spectra, self._predicted() if choice.kind == "residuals" else None)
         return make_neighbours(choice, self.dataset, self.index, self._made[choice.kind])
 
     def _predicted(self) -> Float[np.ndarray, "m 90 360"]:
         return as_observed(*self._asked, predict_spectra(*self._asked, self.dataset, self.index))
-
-
-def eight_bit(dataset: Dataset, index: Int[np.ndarray, " m"]) -> UInt8[np.ndarray, "m 90 360"]:
-    """Returns observed spectra in bytes, as published data have them."""
-    if dataset.images is not None:
-        return dataset.images[index]
-    blocks = [index[start : start + AT_ONCE] for start in range(0, len(index), AT_ONCE)]
-    return np.concatenate([np.asarray(255 * dataset.pas(block)).round().astype(np.uint8) for block in blocks])
 
 
 def images_of(
@@ -141,9 +131,14 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
     positions = np.unique(dataset.tx_positions[known], axis=0)
     if len(positions) < 2:
         return []
-    spacing = float(np.median(cKDTree(positions).query(positions, 2)[0][:, 1]))
+    metres = spacing(positions)
     kinds: tuple[Kind, ...] = ("residuals", "spectra") if len(known) <= MOST_RESIDUALS else ("spectra",)
-    return [Choice(kind, scale * spacing, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
+    return [Choice(kind, scale * metres, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
+
+
+def spacing(places: Float[np.ndarray, "n 3"]) -> float:
+    """Returns the median distance (metres) of a place to the next one, of two or more different ones."""
+    return float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
 
 
 def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarray, " n"]) -> tuple[Choice | None, float]:
