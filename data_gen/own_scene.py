@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float
 
-from data_gen.materials import ITU, THICKNESS, Law, check_material_frequencies, own_law, own_material
+from data_gen.materials import ITU, THICKNESS, Law, check_material_frequencies, own_material
 from data_gen.mesh_checks import is_solid, kind, outward, place, surface_flaws
-from data_gen.scene_files import FileObject, read_objects
 from data_gen.scenes.base import FREQUENCIES_HZ, RX_CLEARANCE, Part, SceneSpec, grid_3d
 from data_gen.scenes.geometry import Vec3, distance, winding_number
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.interchange.room_files import FileObject, read_objects
 
 EXTENT = (0.5, 200.0)
 """Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody says so, ..."""
@@ -31,6 +32,8 @@ MAX_THICKNESS = 2.0
 """Metres: a thicker slab is one given in millimetres."""
 MAX_TRIANGLES = 2_000_000
 MAX_TX = 1_000_000
+MAX_WALL, THIN, FULL = 0.6, 0.25, 0.95
+"""Metres: a box that is no thicker, thinner than this share of its height, and as full as this, is a wall."""
 SHOWN = 40
 """Objects that are described."""
 HELP = "see docs/own_scene.md"
@@ -116,10 +119,23 @@ def describe(spec: SceneSpec) -> str:
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     if len(shown) < len(spec.parts):
         lines.append(f"... and {len(spec.parts) - len(shown)} smaller objects")
+    if walls := {p.name: depth for p in spec.parts if p.closed and (depth := _depth(p.mesh)) <= MAX_WALL}:
+        deep = next(iter(walls.values()))
+        lines.append(
+            f"warning: {_list(list(walls), 4)} are closed boxes as thin as walls ({deep:.2g} m): a wave passes two "
+            f"faces, and each counts as a slab of its material's thickness; give {deep / 2:.2g} m, or one sheet a wall"
+        )
     flaws = spec.flaws if isinstance(spec, OwnScene) else ()
     if flaws:
         lines.append(f"warning: {flaws[0]}" + (f" ({len(flaws) - 1} more of such places)" if len(flaws) > 1 else ""))
     return "\n".join(lines)
+
+
+def _depth(mesh: trimesh.Trimesh) -> float:
+    """Returns how thick a closed box is that is thin against its length and height; infinity for any other body."""
+    low, middle, _ = sorted(mesh.extents)
+    box = mesh.volume > FULL * np.prod(mesh.extents)
+    return float(low) if box and low < THIN * middle else np.inf
 
 
 def _span(spec: SceneSpec) -> str:
@@ -181,9 +197,13 @@ def _choose(found: FileObject, chosen: dict[str, Slab], where: str) -> Slab | No
     for pattern, slab in chosen.items():
         if fnmatch.fnmatchcase(found.name, pattern):
             return slab
-    if found.material is None or own_law(found.material) is not None:
-        return None if found.material is None else Slab(found.material, _thickness(found.thickness, where))
-    return _slab({"material": found.material, "thickness": found.thickness}, {}, where)
+    if found.material is None:
+        return None
+    name, thickness, properties = found.material
+    if properties is not None:
+        permittivity, conductivity = properties
+        return Slab(own_material(name, Law(permittivity, 0.0, conductivity, 0.0)), _thickness(thickness, where))
+    return _slab({"material": name, "thickness": thickness}, {}, where)
 
 
 def _read_toml(file: Path) -> dict[str, dict[str, Any]]:

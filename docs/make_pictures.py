@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/concepts.md from the library itself: python docs/make_pictures.py [NAME ...].
+"""Draws the pictures of docs/concepts.md and docs/formats.md from the library itself: python docs/make_pictures.py [NAME ...].
 
 Colours are viridis and cividis, and lines differ in style as well, so that nothing depends on telling red from green.
 """
@@ -14,6 +14,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 import wbgs_jax as wb
+from wbgs_jax.data.conventions import CONVENTIONS, array_of
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.geometry import angles_to_direction, direction_to_angles
 
@@ -65,6 +66,34 @@ def draw_arc(axis, azimuth, zenith, radius: float, name: str) -> None:
     arc = radius * np.asarray(direction(*np.broadcast_arrays(azimuth, zenith)))
     axis.plot(*arc.T, ":", color="black")
     axis.text(*(1.2 * arc[len(arc) // 2]), name, fontsize=12)
+
+
+def draw_conventions() -> Figure:
+    """Returns, for both orders of a folder's pixels, the plane of the array and the same wave as the folder's image."""
+    figure = Figure(figsize=(10, 6.4), layout="constrained")
+    towards = np.asarray(direction(60.0, 50.0))
+    for row, name in enumerate(CONVENTIONS):
+        elements = np.asarray(array_of(name))
+        axis = figure.add_subplot(2, 2, 2 * row + 1, projection="3d")
+        axis.scatter(*elements.T, color=colormaps["viridis"](0.3), s=24, depthshade=False)
+        for vector, label in zip(np.eye(3), ("x, azimuth 0°", "y, azimuth 90°", "z, zenith"), strict=True):
+            axis.quiver(0, 0, 0, *(1.5 * vector), color="black", arrow_length_ratio=0.07)
+            axis.text(*(1.7 * vector), label, ha="center")
+        axis.quiver(0, 0, 0, *(1.5 * towards), color=colormaps["viridis"](0.65), linewidth=2.5, arrow_length_ratio=0.08)
+        axis.set(xlim=(-0.8, 1.6), ylim=(-0.8, 1.6), zlim=(-0.8, 1.6), title=f"convention: {name}")
+        axis.set_box_aspect((1, 1, 1), zoom=1.15)
+        axis.set_axis_off()
+        axis.view_init(20, 40)
+        flat = figure.add_subplot(2, 2, 2 * row + 2)
+        wave = wb.steering_vector(jnp.asarray(elements), jnp.asarray(towards, jnp.float32))
+        pas = np.asarray(wb.snapshot_to_pas(wave, jnp.asarray(elements)))
+        if name == "zenith":
+            show_pas(flat, pas, "image in the folder")
+            continue
+        flat.imshow(np.roll(pas, -180, 1)[::-1], vmin=0, vmax=1, extent=(0, 359, 89, 0), aspect="auto")
+        flat.set(title="image in the folder", xticks=range(0, 360, 90), yticks=(0, 45, 89))
+        flat.set(xlabel="azimuth φ [deg]", ylabel="elevation 90° - θ [deg]")
+    return figure
 
 
 def draw_plane_wave() -> Figure:
@@ -190,6 +219,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "splatting": draw_splatting,
     "coherent": draw_coherent,
     "paths": draw_paths,
+    "conventions": draw_conventions,
 }
 
 

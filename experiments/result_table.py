@@ -29,12 +29,14 @@ OF_RUN = ("models", "steps", "samples", "gaussians", "training_seconds", "versio
 """Of the whole job."""
 COLUMNS = OF_JOB + OF_FREQUENCY + OF_RUN
 DIGITS = 4
+NO_JOBS = {"smoke", "gpu", "few"}
+"""Folders whose files are no results of jobs: what proves that everything works, what was measured on GPUs, few spectra."""
 
 
 def rows(folder: Path = FOLDER) -> Iterator[dict[str, Any]]:
-    """Yields the rows of all results but those of the profile `smoke`, which mean nothing; what is not known is missing."""
+    """Yields the rows of all results of jobs; what is not known is missing."""
     for path in sorted(folder.glob("*/*.json")):
-        if path.parent.name != "smoke":
+        if path.parent.name not in NO_JOBS:
             yield from rows_of(path)
 
 

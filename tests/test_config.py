@@ -110,6 +110,15 @@ def test_settings_of_another_version_are_refused():
         from_dict(to_dict(SETTINGS, "wideband"), get_field("wave").presets["cpu"], "wave")
 
 
+def test_a_setting_that_files_did_not_have_has_the_value_of_then():
+    """A run from before there was a precision was trained in that of its device."""
+    values = to_dict(SETTINGS, "wideband")
+    del values["wideband"]["precision"]
+    assert from_dict(values, SETTINGS, "wideband") == SETTINGS and SETTINGS.field.precision == "device"
+    values["wideband"]["precision"] = "bfloat16"
+    assert from_dict(values, SETTINGS, "wideband").field.precision == "bfloat16"
+
+
 def test_settings_survive_a_dictionary():
     settings = tiny_settings(field={"relative": False, "means_lr": 1 / 3})
     assert from_dict(json.loads(json.dumps(to_dict(settings, "wideband"))), SETTINGS, "wideband") == settings

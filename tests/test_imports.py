@@ -50,7 +50,7 @@ import wbgs_jax._util.quiet
 
 report["before JAX is loaded"] = changes(before, state())
 report["loaded"] = sorted({"jax", "numpy", "matplotlib", "orbax", "tyro"} & set(sys.modules))
-import jax, matplotlib  # which change a little themselves
+import jax, jax.experimental.pallas, matplotlib  # which change a little themselves
 
 options = list(jax.config.values)  # its modules know more of them
 before = state()

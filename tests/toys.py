@@ -121,7 +121,7 @@ def registered(*fields: type[Field]) -> Iterator[None]:
 def toy_settings(**changes: Any) -> Settings:
     """As `synthetic.tiny_settings`, of a toy field without host controls."""
     loop = LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2)
-    return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0), loop), changes)
+    return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0), loop), changes)
 
 
 def metrics_of(folder):

@@ -55,6 +55,7 @@ from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
 from .interchange.deepmimo import as_deepmimo as as_deepmimo
 from .interchange.deepmimo import from_deepmimo as from_deepmimo
+from .interchange.deepmimo import load_deepmimo as load_deepmimo
 from .interchange.deepmimo import read_deepmimo as read_deepmimo
 from .interchange.deepmimo import write_deepmimo as write_deepmimo
 from .interchange.gaussian_ply import read_gaussians as read_gaussians
@@ -66,6 +67,7 @@ from .interchange.ray_paths import load_paths as load_paths
 from .interchange.ray_paths import save_paths as save_paths
 from .interchange.scenes import scene_of_paths as scene_of_paths
 from .interchange.scenes import scene_of_snapshots as scene_of_snapshots
+from .interchange.sionna_arrays import scene_of_sionna as scene_of_sionna
 from .measured.floor_plan import load_walls as load_walls
 from .measured.power_map import learn_map as learn_map
 from .measured.power_map import received_power as received_power

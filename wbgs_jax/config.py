@@ -12,6 +12,14 @@ from typing import Any
 
 from wbgs_jax._util.errors import UserError
 
+FEWEST_STEPS, STEPS_A_SPECTRUM = 600, 8
+"""What `OptimConfig.min_steps` comes down to where spectra are few."""
+
+
+def setting(default: Any, before: Any) -> Any:
+    """Returns a setting of a dataclass that files from before it was one do not have: what it was then."""
+    return dataclasses.field(default=default, metadata={"before": before})
+
 
 @dataclass(frozen=True)
 class OptimConfig:
@@ -32,6 +40,9 @@ class OptimConfig:
     curriculum: float = 0.0
     """Share of the steps over which the highest frequency of the batches rises from the lowest to the highest of the data. At
     low frequencies the phase behind a slab is no riddle."""
+    virtual: float = setting(0.5, before=0.0)
+    """Share of every batch that are links of transmitters nobody measured, with kriged spectra, where spectra are few and the
+    field knows no paths (training/virtual.py)."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +126,7 @@ class LoopConfig:
     """How the host drives training."""
 
     epoch_steps: int = 50
-    """Steps in one jitted epoch: what an interrupt waits for at most."""
+    """Steps in one jitted epoch; an interrupt waits for two of them at most."""
     evaluate_every: int = 1000
     """Steps between two evaluations on `evaluate_spectra` held-out spectra, for the curves only."""
     evaluate_spectra: int = 60
@@ -191,6 +202,7 @@ def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
     """
 
     def build(cls: Any, values: Any) -> Any:
+        values = {f.name: f.metadata["before"] for f in dataclasses.fields(cls) if "before" in f.metadata} | values
         if missing := {f.name for f in dataclasses.fields(cls)} - set(values):
             raise KeyError(f"{cls.__name__}.{min(missing)}")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
@@ -209,10 +221,12 @@ def changed(settings: Settings, changes: Mapping[str, Mapping[str, Any]]) -> Set
     return dataclasses.replace(settings, **replaced)
 
 
-def limit_steps(settings: Settings, n_train: int) -> Settings:
-    """Returns settings whose `optim.steps` are what a data set of `n_train` spectra gets: a multiple of the epoch block."""
+def limit_steps(settings: Settings, n_train: int, no_paths: bool = False) -> Settings:
+    """Returns settings whose `optim.steps` are what a data set of `n_train` spectra gets: a multiple of the epoch block. A
+    field that knows no paths learns a few spectra by heart, and gets fewer steps for them."""
     optim, block = settings.optim, settings.loop.epoch_steps
-    wanted = max(optim.min_steps, optim.max_epochs * n_train / optim.batch)
+    fewest = min(optim.min_steps, max(FEWEST_STEPS, STEPS_A_SPECTRUM * n_train)) if no_paths else optim.min_steps
+    wanted = max(fewest, optim.max_epochs * n_train / optim.batch)
     steps = min(optim.steps, round(wanted / block) * block)
     return dataclasses.replace(settings, optim=dataclasses.replace(optim, steps=max(steps, block)))
 

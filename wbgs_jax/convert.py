@@ -51,12 +51,22 @@ class Command:
     """Frequency; of --paths where these do not say it."""
     rx: str = ""
     """Of a run: another receiver than the first (`wbgs-jax predict --help`)."""
-    array: str = "4x4"
-    """Of --paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart in the y-z plane."""
+    array: str = ""
+    """Of --paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart; by default the paths' own, else 4x4."""
+    port: int | None = None
+    """Of --paths with two polarisations: which one, 1 or 2."""
+    tx_antenna: int | None = None
+    """Of --paths whose transmitters have several antennas: which one, 1, 2, ..."""
     mesh: Path | None = None
     """Of --paths: the scene's surfaces, a .ply file in metres, which the coherent field needs."""
     swap: bool = False
-    """Of --paths of Sionna RT: train for the transmitters' side; needed where one transmitter is seen by many receivers."""
+    """Of --paths: train for the other side: the transmitters' of Sionna RT, the users' of DeepMIMO."""
+    tx_set: int | None = None
+    """Of a DeepMIMO scenario: the set of base stations, ..."""
+    tx_index: int | None = None
+    """... one of them (0, 1, ...; by default all), ..."""
+    rx_set: int | None = None
+    """... and the set of users."""
 
 
 def check(command: Command) -> None:
@@ -128,30 +138,37 @@ def _write_paths(
     if command.out.suffix == ".npz":
         save_paths(command.out, paths)
         return f"paths: {command.out} ({paths.valid.sum()} of {len(positions)} transmitters)"
-    write_deepmimo(command.out, as_deepmimo(paths.reversed()))
+    write_deepmimo(command.out, as_deepmimo(paths.reversed()), frequency_hz)
     return f"DeepMIMO scenario: {command.out} (the receiver as base station, {len(positions)} transmitters as users)"
 
 
 def take_in(command: Command) -> str:
     """Writes a scene file of other programs' paths, and returns a line about it."""
+    from wbgs_jax.data.other_files import check_kind
     from wbgs_jax.data.ply import read_ply
     from wbgs_jax.data.scene_file import save_scene
-    from wbgs_jax.interchange.deepmimo import from_deepmimo, is_deepmimo, read_deepmimo
-    from wbgs_jax.interchange.ray_paths import load_paths
+    from wbgs_jax.interchange.deepmimo import is_deepmimo, load_deepmimo
+    from wbgs_jax.interchange.plausible_paths import check_paths
+    from wbgs_jax.interchange.ray_paths import read_paths
     from wbgs_jax.interchange.scenes import scene_of_paths
+    from wbgs_jax.interchange.sionna_arrays import DEFAULT, scene_of_sionna
     from wbgs_jax.radio.array import planar_array
 
     assert command.paths is not None, "checked"
     hertz = None if command.ghz is None else 1e9 * command.ghz
-    if is_deepmimo(command.paths):
-        if hertz is None:
-            raise UserError(f"{command.paths} does not say its frequency; give --ghz, as in the scenario's parameters")
-        paths = from_deepmimo(read_deepmimo(command.paths), hertz).reversed()
-    else:
-        paths = load_paths(command.paths, hertz)
-        paths = paths.reversed() if command.swap else paths
+    if command.paths.is_file() and command.paths.suffix.lower() not in (".npz", ".mat"):
+        check_kind(command.paths)
+        raise UserError(f"{command.paths} is of no known kind; give an .npz with Sionna's arrays, or a DeepMIMO scenario")
     vertices, faces = (None, None) if command.mesh is None else read_ply(command.mesh)
-    scene = scene_of_paths([paths], planar_array(*parse_array(command.array, "--array")), command.out.stem, vertices, faces)
+    shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
+    if is_deepmimo(command.paths):
+        paths = load_deepmimo(command.paths, hertz, command.tx_set, command.tx_index, command.rx_set)
+        check_paths(paths, str(command.paths))
+        paths = paths if command.swap else paths.reversed()
+        scene = scene_of_paths([paths], planar_array(*(shape or DEFAULT)), name, vertices, faces)
+    else:
+        choice = shape, command.port, command.tx_antenna, command.swap
+        scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, vertices, faces, str(command.paths))
     save_scene(command.out, scene)
     heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
     count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"

@@ -89,7 +89,8 @@ def plane_of(command: Command, dataset: Any) -> Any:
 
 def make_maps(command: Command) -> None:
     """Asks, and writes what is wanted."""
-    from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at, source_of, write_answer
+    from wbgs_jax.inference.answers import bounds_of, check_frequencies, frequencies, receiver_at, source_of, write_answer
+    from wbgs_jax.inference.bounds import CONFIDENCES
     from wbgs_jax.inference.floor import ask_plane, cut_at, pieces
     from wbgs_jax.inference.predictor import at_receiver
     from wbgs_jax.training.run_folder import open_run
@@ -102,10 +103,15 @@ def make_maps(command: Command) -> None:
     check_frequencies(trained, dataset, float(frequencies_hz.min()))
     rx = np.asarray(receiver.position)
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
-    for line in doubts(dataset, rx, corners, frequencies_hz):
+    bounds = bounds_of(dataset)
+    for line in bounds.doubts(rx, corners, frequencies_hz):
         say(f"warning: {line}")
     with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
         answer = ask_plane(command.what, trained, dataset, receiver, plane, frequencies_hz, progress.advance)
+    nowhere = bounds.without_confidence(plane.positions()).reshape(len(plane.ys), len(plane.xs))
+    for name in answer.keys() & set(CONFIDENCES):
+        answer[name] = np.where(nowhere, np.nan, answer[name])
+    answer["no_confidence"] = nowhere
     size = f"{len(plane.xs)} x {len(plane.ys)} places at {len(frequencies_hz)} frequencies"
     if command.out:
         write_answer(command.out, answer, source_of(trained, dataset, receiver) | {"what": command.what})

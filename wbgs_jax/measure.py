@@ -33,8 +33,9 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.measured.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
 from wbgs_jax.measured.held_out import COMPARED, NINETY, Score, scores
 from wbgs_jax.measured.pictures import draw
+from wbgs_jax.measured.plausible import check_positions
 from wbgs_jax.measured.power_map import MAX_PLACES, PowerMap, learn_map, received_power
-from wbgs_jax.measured.readings import Readings, attribution, cell_means, check_positions, load_readings
+from wbgs_jax.measured.readings import Readings, attribution, cell_means, load_readings
 
 SUFFIXES = {"out": ".json", "picture": ".png", "answers": ".csv", "mesh": ".ply"}
 

@@ -228,7 +228,7 @@ def answer(command: Command, queries: Queries) -> None:
     opened = open_field(command.run, command.rx, command.what, queries, lowest, options, lambda: _load(command.run))
     _warn(opened, queries)
     answers = ask(command, queries, opened)
-    for line in writing.lines(command.what, answers, queries):
+    for line in writing.lines(command.what, answers, queries, opened.source):
         say(line)
     count = f"{len(queries)} queries"
     if not queries.paired:

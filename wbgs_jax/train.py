@@ -19,7 +19,8 @@ from wbgs_jax._util.command import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.processes import by_first, connect, is_first
-from wbgs_jax.config import Settings, check, from_sections, limit_steps, sections
+from wbgs_jax.config import Settings, check, from_sections, sections
+from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import released_scenes, source_names
 from wbgs_jax.data.splits import VALIDATION
@@ -28,8 +29,9 @@ from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.neighbours import write_neighbours
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.confidence import learn_confidence
-from wbgs_jax.training.data import check_data
+from wbgs_jax.training.data import check_data, limited
 from wbgs_jax.training.estimate import duration_words, expected_seconds
+from wbgs_jax.training.few import Training, is_few, learn_few
 from wbgs_jax.training.interrupts import Interrupted
 from wbgs_jax.training.lock import locked
 from wbgs_jax.training.loop import TrainResult, train
@@ -57,11 +59,13 @@ class Command:
     seed: int = 0
     """Seed of everything that is drawn at random."""
     resume: bool = False
-    """Go on where the run folder's newest checkpoint ends; starts anew where there is none."""
+    """Go on from the run folder's newest checkpoint, if any."""
     frequency_ghz: float | None = None
     """Frequency of a folder that says none."""
+    convention: ConventionName | None = None
+    """Of a folder's rows, where it names none."""
     train_ghz: tuple[float, ...] = ()
-    """Train at these frequencies alone; the evaluation asks for the others."""
+    """Train at these frequencies, test at the others."""
     train_tx: int = 0
     """Train with this number of transmitters; 0: all that are not held out."""
     validation: float = VALIDATION
@@ -71,7 +75,7 @@ class Command:
     receiver: int | None = None
     """Look at this receiver alone."""
     neighbours: bool = True
-    """Ask known spectra nearby, where that gains on validation."""
+    """Use known spectra nearby, where that gains."""
     devices: int = 0
     """Devices that share every batch; 0: all (docs/scaling.md)."""
     distributed: bool = False
@@ -135,6 +139,8 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
     names = [str(Path(word).resolve()) if word not in released and Path(word).exists() else word for word in words]
     if command.frequency_ghz is not None and not any(Path(name).is_dir() for name in names):
         raise UserError(f"--frequency-ghz is for folders that do not say; {source} does, or does not exist")
+    if command.convention is not None and not any(Path(name).is_dir() for name in names):
+        raise UserError(f"--convention is for folders of spectra; {source} is none")
     return RunConfig(
         source=",".join(names),
         field=command.field,
@@ -148,6 +154,7 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
         test_box=tuple(command.test_box),
         receiver=command.receiver,
         neighbours=command.neighbours,
+        convention=command.convention,
     )
 
 
@@ -165,6 +172,7 @@ def main(arguments: list[str] | None = None) -> None:
     command, settings = parse(arguments)
     config = run_config(command, settings)
     dataset = config.dataset()
+    config = dataclasses.replace(config, convention=dataset.convention)
     check_data(dataset, get_field(config.field))
     folder = command.out or default_folder(dataset, config)
     by_first(lambda: prepare_folder(folder, config, command.resume))
@@ -176,12 +184,12 @@ def main(arguments: list[str] | None = None) -> None:
         steps = checkpoint_steps(folder / "checkpoints")
         if steps:
             tell(f"going on from the checkpoint of step {steps[-1]}")
-        total = limit_steps(config.settings, len(dataset.train)).optim.steps
+        total = limited(config.settings, dataset, get_field(config.field)).optim.steps
         for line in opening_lines(folder, config, total, steps[-1] if steps else 0):
             tell(line)
         try:
             result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
-            by_first(lambda: learn_beside(result, dataset, config, folder))
+            by_first(lambda: learn_beside(result, dataset, config, folder, command.devices))
         except KeyboardInterrupt:  # in the last epoch or behind it, or a second time
             raise Interrupted("stopped; run the same command with --resume to go on") from None
         by_first(lambda: write_manifest(folder, load_trained(folder)))
@@ -205,9 +213,16 @@ def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> lis
     ]
 
 
-def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path) -> None:
-    """Leaves what the validation part says about a trained field: whom to ask beside it, and how sure it is."""
+def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path, devices: int) -> None:
+    """Leaves what goes with a trained field: known spectra beside it, and how sure it is."""
     trained = result.field, result.params, dataset
+    if config.neighbours and is_few(dataset):
+        few = learn_few(*trained, Training(config.field, config.settings, result.steps, config.seed, folder, devices), say)
+        write_neighbours(folder, few.mixture)
+        say(few.line)
+        of_spectra, of_powers = learn_confidence(*trained, None)
+        write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
+        return
     learned = learn_neighbours(*trained) if config.neighbours else Learned()
     write_neighbours(folder, learned.neighbours)
     if learned.line:

@@ -24,12 +24,10 @@ MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 1e9, 100e9
 """The band of the paper."""
 LOWEST_OF_PATHS_HZ = 0.3e9
 """Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms."""
-LOWEST_FREQUENCY_HZ = 1e6
-"""Smaller numbers are gigahertz or megahertz by mistake."""
-HIGHEST_FREQUENCY_HZ = 1e12
-"""Larger numbers are no radio frequencies."""
-LARGEST_COORDINATE_M = 1e5
-"""Larger numbers are millimetres by mistake, or no indoor scene."""
+LOWEST_FREQUENCY_HZ, HIGHEST_FREQUENCY_HZ = LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
+"""What lies beyond can never be asked for: such data are of another unit, or nothing for this model."""
+LARGEST_COORDINATE_M = 2e3
+"""Larger numbers are millimetres by mistake, or coordinates of a map: there single precision is too coarse for waves."""
 
 
 @pytree
@@ -157,6 +155,11 @@ class Scene(Protocol):
     @property
     def box(self) -> Float[np.ndarray, "2 3"]:
         """Smallest and largest coordinates of surfaces, transmitters and receivers, metres."""
+        ...
+
+    @property
+    def spectra(self) -> int:
+        """Number of links that are trained."""
         ...
 
     def surface(self, count: int, seed: int, sampling: SurfaceSampling) -> Surface:

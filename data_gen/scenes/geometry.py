@@ -13,12 +13,10 @@ import trimesh
 from jaxtyping import Float, Int
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
+from wbgs_jax._util import solids
 from wbgs_jax._util.errors import UserError
 
 Vec3 = tuple[float, float, float]
-
-CHUNK = 1_000_000
-"""Pairs of a point and a triangle whose solid angles are computed together; bounds the memory to some 100 MB."""
 
 
 def box(low: Vec3, high: Vec3) -> trimesh.Trimesh:
@@ -37,18 +35,8 @@ def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns how often a closed mesh goes around every point: 0 outside, 1 or -1 inside (from its triangles' solid angles)."""
-    step = max(1, CHUNK // max(1, len(mesh.faces)))
-    each = [_solid_angles(mesh, points[i : i + step]).sum(1) for i in range(0, len(points), step)]
-    return np.concatenate([np.zeros(0), *each]) / (4 * np.pi)
-
-
-def _solid_angles(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n m"]:
-    a, b, c = (np.asarray(mesh.triangles)[None, :, i] - points[:, None] for i in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-    triple = np.einsum("nmi,nmi->nm", a, np.cross(b, c))
-    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    return 2 * np.arctan2(triple, below)
+    """Returns how often a closed mesh goes around every point: 0 outside, 1 or -1 inside."""
+    return solids.winding_number(np.asarray(mesh.triangles), points)
 
 
 def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, " n"]:

@@ -12,9 +12,11 @@ from untrained import make_coherent_run, make_run
 
 from wbgs_jax import map as map_command
 from wbgs_jax import predict as predict_command
+from wbgs_jax.inference.answers import bounds_of
 from wbgs_jax.inference.floor import BEST_BEAM, cut_at, pieces, plane_over
 from wbgs_jax.inference.map_pictures import LOOKS
 from wbgs_jax.radio.codebook import codebook
+from wbgs_jax.training.run_folder import load_trained
 
 AREA = ["--area", "-1,0:1,1", "--height", "1.3"]
 
@@ -74,6 +76,18 @@ def test_the_picture_shows_maps_and_walls(runs, tmp_path):
     with Image.open(picture) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     assert np.ptp(pixels, -1).max() > 80 and pixels.std() > 20
+
+
+def test_a_map_marks_places_without_confidence(runs, tmp_path):
+    """Those far outside of the mesh, and no others."""
+    out = tmp_path / "wide.npz"
+    assert ask(runs, "wave", "--ghz", 28, "--what", "power", "--area", "-60,-60:60,60", "--step", 20, "--out", out).code == 0
+    with np.load(out) as found:
+        low, high = bounds_of(load_trained(runs["wave"]).dataset()).box[:, :2]
+        x, y = np.meshgrid(found["xs"], found["ys"])
+        within = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+        assert found["no_confidence"].dtype == bool and found["no_confidence"].shape == found["power_db"].shape[1:]
+        np.testing.assert_array_equal(found["no_confidence"][~within], True)
 
 
 def test_another_receiver_has_another_map(runs, tmp_path):

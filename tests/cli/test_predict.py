@@ -182,7 +182,8 @@ def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
 
 
 def test_powers_come_with_how_sure_they_are(tmp_path):
-    sure = PowerConfidence(jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5), jnp.log(4.0), jnp.asarray(2.0))
+    numbers = jnp.log(4.0), jnp.asarray(2.0), jnp.asarray(0.9)
+    sure = PowerConfidence(jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5), *numbers)
     with registered(HearingField):
         run = make_toy_run(tmp_path / "hearing", HearingField(RippleConfig()))
         write_confidence(run, None, sure)

@@ -253,7 +253,7 @@ def test_a_stop_behind_the_last_step_says_how_to_go_on(run, scene, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(train_command, "learn_neighbours", stopped)
+        patch.setattr(train_command, "learn_few", stopped)
         result = call(train_command.main, *arguments)
     assert "0 steps, " in result.err
     assert result.code == 2 and result.err.endswith("\nerror: stopped; run the same command with --resume to go on\n")

@@ -21,7 +21,8 @@ from wbgs_jax.radio.array import planar_array
 
 N = 6
 POSITIONS = [(0.1, 0.2, 0.3), (0.1, 0.2, 0.3), (-1, 2.5, 0), (-1, 2.5, 0), (4, 5, 6), (4, 5, 6)]
-GATEWAY = "dataset_name: den\ngateway1:\n  position: [2, 1, 0.5]\n  orientation: [0.1, 0.2, 0.3, 0.927]  # quaternion\n"
+RECEIVER = "gateway1:\n  position: [2, 1, 0.5]\n  orientation: [0.1, 0.2, 0.3, 0.927]  # quaternion\n"
+GATEWAY = f"dataset_name: den\nconvention: zenith\n{RECEIVER}"
 
 
 @pytest.fixture
@@ -129,7 +130,7 @@ def test_one_frequency_from_the_gateway_or_the_caller(folder, where):
     (folder / "gateway_info.yml").write_text(GATEWAY + where)
     assert set(load_layout(folder).frequencies_hz) == {915e6}
     assert set(load_layout(folder, frequency_hz=868e6).frequencies_hz) == {868e6}
-    with pytest.raises(UserError, match=r"must be 0\.001 to 1000 GHz"):
+    with pytest.raises(UserError, match=r"the model knows 0\.3 to 100 GHz"):
         load_layout(folder, frequency_hz=0.0)
 
 

@@ -148,7 +148,7 @@ def test_what_was_kept_without_frequencies_is_one_row(table):
 
 
 def test_every_result_is_in_the_table_and_says_whether_it_counts(table):
-    files = {(path.parent.name, path.stem) for path in FOLDER.glob("*/*.json") if path.parent.name != "smoke"}
+    files = {(path.parent.name, path.stem) for path in FOLDER.glob("*/*.json") if path.parent.name not in result_table.NO_JOBS}
     assert {(row["profile"], row["job"]) for row in table} == files
     results = Results("quick")
     jobs = {(job.profile, job.name): results.get(job) for job in unique_jobs(tuple(EXPERIMENTS))}
@@ -158,9 +158,11 @@ def test_every_result_is_in_the_table_and_says_whether_it_counts(table):
     assert {row["scene"] for row in table if row["current"] == "False"} == {"example1"}
 
 
-def test_results_that_prove_that_it_works_are_no_rows(tmp_path):
+def test_files_that_are_no_results_of_jobs_are_no_rows(tmp_path):
     for profile in ("smoke", "quick"):
         Results(profile, tmp_path).write(JOB, VALUES | {"tx": [1], "ssim": {"1": [0.5]}, "psnr_db": {"1": 3.0}})
+    (tmp_path / "gpu").mkdir()
+    (tmp_path / "gpu" / "parity_h100.json").write_text('{"environment": {}}')
     assert [row["profile"] for row in result_table.rows(tmp_path)] == ["quick"]
 
 

@@ -48,7 +48,9 @@ def test_an_object_of_the_simulator(rng, synthetic):
     a = np.repeat(one["a"], 3, 1)
     ends = {"sources": paths.sources.T, "targets": paths.targets.T}
     simulated = SimpleNamespace(a=(a.real, a.imag), **given, **ends)
-    assert_same(from_sionna(simulated, 2.4e9), paths)
+    assert_same(from_sionna(simulated, 2.4e9, antennas=(0, 0)), paths)
+    with pytest.raises(UserError, match="between 3 and 1 antennas of a device; choose one of each"):
+        from_sionna(simulated, 2.4e9)
     with pytest.raises(UserError, match="frequency"):
         from_sionna(simulated)
 

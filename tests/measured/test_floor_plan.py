@@ -50,6 +50,17 @@ def test_an_outline_has_two_faces_a_wall(tmp_path):
     np.testing.assert_array_equal(crossings(walls, start, goal), [1, 0, 0])
 
 
+def test_outlines_of_several_rooms_are_told_apart(tmp_path):
+    """Two rooms of 4 m x 5 m and 0.2 m between them."""
+    rows = [f"{name},{x},{y}" for name, left, right in (("A", 0, 4), ("B", 4.2, 8.2)) for x, y in
+            ((left, 0), (right, 0), (right, 5), (left, 5))]  # fmt: skip
+    (tmp_path / "walls.csv").write_text("\n".join(["room,x,y", *rows]))
+    walls = load_walls(tmp_path / "walls.csv")
+    assert len(walls.ends) == 8
+    start, goal = np.array([[1.0, 2.0], [1.0, 2.0], [5.0, 1.0]]), np.array([[3.0, 4.5], [6.0, 2.0], [8.0, 4.0]])
+    np.testing.assert_array_equal(crossings(walls, start, goal), [0, 1, 0])
+
+
 def test_walls_stand_between_floor_and_ceiling(tmp_path):
     write_table(tmp_path / "walls.csv", ["x1", "y1", "x2", "y2"], [[0, 0, 5, 0], [5, 0, 5, 3], [2, 1, 2, 1]])
     mesh = extruded(load_walls(tmp_path / "walls.csv"), 2.5)
@@ -65,6 +76,8 @@ def test_walls_stand_between_floor_and_ceiling(tmp_path):
         ("x1,y1,x2,y2\n1,2,3,\n", "corners must be numbers of metres"),
         ("x,y\n1,1e300\n2,2\n", "corners must be numbers of metres"),
         ("x,y\n", "no rows"),
+        ("floor,x,y\n1,0,0\n1,1,0\n1,1,1\n", "has a column 'floor', of which a floor plan knows nothing"),
+        ("x1,y1,x2,y2,storey\n0,0,1,1,2\n", "has a column 'storey'"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, content, says):

@@ -1,10 +1,15 @@
 """Readings in from folders, and averaged."""
 
+import warnings
+from pathlib import Path
+
 import numpy as np
 import pytest
 from flats import HEIGHT, RECEIVERS, folder, places, powers, write_table
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.measured.columns import match_columns, tokens
+from wbgs_jax.measured.plausible import not_received
 from wbgs_jax.measured.readings import Readings, attribution, cell_means, load_readings
 
 
@@ -51,6 +56,14 @@ def test_the_published_layout_of_channel_state(style, tmp_path, rng):
     assert np.isnan(readings.powers[4, 2]) and np.isfinite(readings.powers).sum() == 35
     mean = sum(abs(complex(value)) ** 2 for value in state[7, 1]) / 26
     assert readings.powers[7, 1] == pytest.approx(10 * np.log10(mean), abs=1e-4)
+    of_band = np.concatenate([state, np.zeros((12, 3, 2))], -1).astype(np.complex64)
+    of_band[:, :, 3] = np.nan
+    of_band[7, 1, 5] = np.nan
+    np.save(tmp_path / "csidata.npy", 1e4 * of_band)  # counts of a converter, without direct current and the band's edges
+    usual = np.delete(state, 3, -1)
+    mean = np.mean([abs(complex(value)) ** 2 for value in usual[6, 1]])
+    assert load_readings(tmp_path, HEIGHT).powers[6, 1] == pytest.approx(10 * np.log10(mean) + 80, abs=1e-4)
+    assert np.isfinite(load_readings(tmp_path, HEIGHT).powers).sum() == 35
     for damaged, said in ((state.real, "complex numbers"), (state[:, :2], "12 transmitters at 2 receivers")):
         np.save(tmp_path / "csidata.npy", damaged)
         with pytest.raises(UserError, match=said):
@@ -96,9 +109,17 @@ def test_the_terms_of_data_are_found(tmp_path):
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,,-50,-60,-70\n", "places must be numbers of metres"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1e9,-50,-60,-70\n", "places must be numbers of metres"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-5000,-60,-70\n", "powers must be dBm"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-inf,-60,-70\n", "powers must be dBm"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,inf,-60,-70\n", "powers must be dBm"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,1e-7,0,3e-9\n", "convert milliwatts"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,55,60,70\n", "give magnitudes their sign"),
+        ("readings.csv", "x,y,floor,rssi_1,rssi_2,rssi_3\n1,1,2,-55,-60,-70\n", "floors but no heights"),
+        ("readings.csv", "x,y,battery,rssi_1,rssi_2,rssi_3\n1,1,2,-55,-60,-70\n", "4 columns of powers"),
+        (
+            "readings.csv",
+            "x,y,kitchen,hall,office\n1,1,-55,-60,-70\n",
+            "kitchen, hall, office.* name them rssi_1",
+        ),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,,,\n", "nothing was received anywhere"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,100,-60,-70\n", "leave cells empty"),
         ("readings.csv", "x;y;rssi_1;rssi_2;rssi_3\n1;1;-50;-60;-70\n", "separate them by commas"),
         ("readings.csv", "x,y,rssi,rssi,rssi\n1,1,-50,-60,-70\n", "names two columns alike"),
     ],
@@ -142,5 +163,107 @@ def test_columns_end_in_ids_that_hold_underscores(tmp_path, rng):
         np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers, first.powers)
     swapped[0][3] = "rssi_ap_4"
     (tmp_path / "readings.csv").write_text("\n".join(",".join(row) for row in swapped))
-    with pytest.raises(UserError, match="ends in the receiver's id 'ap_3'"):
+    with pytest.raises(UserError, match="do not each name one of the receivers"):
         load_readings(tmp_path, HEIGHT)
+
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+
+
+@pytest.mark.parametrize(
+    ("columns", "ids"),
+    [
+        ("ap3,ap1,ap2", "1,2,3"),
+        ("office_rssi,kitchen_rssi,hall_rssi", "kitchen,hall,office"),
+        ("RSSI Office (dBm),RSSI Kitchen (dBm),RSSI Hall (dBm)", "kitchen,hall,office"),
+        ("AA-BB-CC-00-00-03,AA-BB-CC-00-00-01,AA-BB-CC-00-00-02", "aa:bb:cc:00:00:01,aa:bb:cc:00:00:02,aa:bb:cc:00:00:03"),
+        ("rssi_003,rssi_001,rssi_002", "1,2,3"),
+        ("rssi_3,rssi_1,rssi_2", "AP-01,AP-02,AP-03"),
+        ("p2,p0,p1", "gw0,gw1,gw2"),
+        ("rx10,rx1,rx101", "1,101,10"),
+        ("west_hall,west,hall", "west,hall,west_hall"),
+    ],
+)
+def test_columns_name_receivers_in_any_spelling(columns, ids):
+    found = match_columns(Path("t.csv"), columns.split(","), ids.split(","))
+    first = [columns.split(",").index(name) for name in found]
+    assert first == ([1, 2, 0] if "rx101" not in columns and "west" not in columns else first)
+    for column, name in zip(found, ids.split(","), strict=True):
+        assert {tokens(name)[-1]} <= set(tokens(column))
+
+
+@pytest.mark.parametrize("columns", ["p_2,p_0,p_1", "rx3,rx1,rx2"])
+def test_receivers_without_names_are_numbered(columns):
+    assert match_columns(Path("t.csv"), columns.split(","), 3) == sorted(columns.split(","))
+
+
+@pytest.mark.parametrize(
+    ("columns", "ids"), [("a,b,c", "1,2,3"), ("rssi_1,rssi_2,rssi_4", "1,2,3"), ("hall_1,hall_2,hall_3", "hall,office,kitchen")]
+)
+def test_columns_that_name_no_receiver_are_refused(columns, ids):
+    with pytest.raises(UserError, match="do not each name one of the receivers"):
+        match_columns(Path("t.csv"), columns.split(","), ids.split(","))
+
+
+@pytest.mark.parametrize("number", [0.0, 100.0, -100.0, -120.0, -np.inf, -200.0])
+def test_numbers_that_stand_for_nothing_are_recognised(rng, number):
+    heard = np.round(rng.uniform(-80, -40, (60, 3)), 1)
+    nothing = rng.random(heard.shape) < 0.2
+    if np.isfinite(number):
+        with pytest.warns(UserWarning, match="stands for nothing received"):
+            found = not_received(Path("t.csv"), np.where(nothing, number, heard))
+    else:
+        found = not_received(Path("t.csv"), np.where(nothing, number, heard))
+    np.testing.assert_array_equal(np.isnan(found), nothing)
+    np.testing.assert_array_equal(found[~nothing], heard[~nothing])
+
+
+def test_weak_readings_are_readings(rng):
+    heard = np.round(rng.uniform(-101, -40, (200, 3)))
+    np.testing.assert_array_equal(not_received(Path("t.csv"), heard), heard)
+
+
+def test_degrees_are_no_metres(tmp_path, rng):
+    folder(tmp_path, rng, n=20)
+    site = (-0.0664, 39.9929)
+    for file, skip in (("readings.csv", 0), ("receivers.csv", 1)):
+        header, *rows = [line.split(",") for line in (tmp_path / file).read_text().splitlines()]
+        for row in rows:
+            row[skip : skip + 2] = [str(s + 1e-5 * float(v)) for s, v in zip(site, row[skip : skip + 2], strict=True)]
+        (tmp_path / file).write_text("\n".join(",".join(row) for row in [header, *rows]))
+    with pytest.raises(UserError, match="degrees of longitude and latitude; project them to metres"):
+        load_readings(tmp_path, HEIGHT)
+
+
+def test_floors_part_readings_as_rooms_do(tmp_path):
+    (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n2,5,5,2\n")
+    (tmp_path / "readings.csv").write_text("time,x,y,z,floor,room,2,1\nnoon,1,1,1.2,0,a,-50,-60\nnow,1,1,4.2,1,a,-70,-80\n")
+    readings = load_readings(tmp_path, HEIGHT)
+    assert readings.rooms == ("a/0", "a/1")
+    np.testing.assert_array_equal(readings.powers, [[-60, -50], [-80, -70]])
+
+
+def test_gateways_are_found_by_their_names(tmp_path):
+    (tmp_path / "tx_pos.csv").write_text("x,y,z\n1,1,1\n2,2,1\n")
+    (tmp_path / "gateway_position.yml").write_text("gateway1: [0, 0, 2]\ngateway2: [9, 0, 2]\ngateway3: [5, 5, 2]\n")
+    (tmp_path / "gateway_rssi.csv").write_text("gateway3,gateway1,gateway2\n-50,-65,-59\n-60,-100,-55\n")
+    np.testing.assert_array_equal(load_readings(tmp_path, HEIGHT).powers, [[-65, -59, -50], [np.nan, -55, -60]])
+    (tmp_path / "gateway_rssi.csv").write_text("a,b,c\n-50,-65,-59\n-60,-100,-55\n")
+    with pytest.raises(UserError, match="do not each name one of the receivers"):
+        load_readings(tmp_path, HEIGHT)
+
+
+@pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")
+def test_small_inputs_that_were_read_wrongly():
+    right = load_readings(CASES / "readings" / "mac", HEIGHT)
+    for name in ("glued", "prefix", "zero"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = load_readings(CASES / "readings" / name, HEIGHT)
+        known = ~np.isnan(found.powers)
+        np.testing.assert_array_equal(found.powers[known], right.powers[known])
+        np.testing.assert_array_equal(found.receivers, right.receivers)
+        assert known.all() == (name != "zero")
+    for name in ("readings/milliwatt", "degrees"):
+        with pytest.raises(UserError):
+            load_readings(CASES / name, HEIGHT)

@@ -31,10 +31,11 @@ from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.neighbours import read_neighbours
 from wbgs_jax.inference.parts import open_parts
 from wbgs_jax.inference.queries import read_queries
-from wbgs_jax.interchange.deepmimo import as_deepmimo, from_deepmimo, is_deepmimo, read_deepmimo, write_deepmimo
+from wbgs_jax.interchange.deepmimo import as_deepmimo, is_deepmimo, load_deepmimo, write_deepmimo
 from wbgs_jax.interchange.gaussian_ply import read_gaussians, write_gaussians
-from wbgs_jax.interchange.ray_paths import RayPaths, load_paths, save_paths
+from wbgs_jax.interchange.ray_paths import RayPaths, read_paths, save_paths
 from wbgs_jax.interchange.scenes import scene_of_paths
+from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
 from wbgs_jax.measured.floor_plan import load_walls
 from wbgs_jax.measured.readings import cell_means, load_readings
 from wbgs_jax.radio.array import planar_array
@@ -61,14 +62,14 @@ def _paths() -> RayPaths:
     shape, met = (6, 2, 3), draw.choice([0, 1, 4, 8], (2, 6, 2, 3)).astype(np.int32)
     angles = {name: draw.uniform(0.1, 3, shape) for name in ("theta_t", "phi_t", "theta_r", "phi_r")}
     return RayPaths(
-        a=draw.normal(size=shape) + 1j * draw.normal(size=shape),
+        a=0.1 * (draw.normal(size=shape) + 1j * draw.normal(size=shape)),
         tau=draw.uniform(1e-8, 1e-7, shape),
         **angles,
         interactions=met,
         vertices=draw.normal(size=(*met.shape, 3)),
         valid=np.ones(shape, bool),
-        sources=draw.normal(size=(2, 3)),
-        targets=draw.normal(size=(6, 3)),
+        sources=0.3 * draw.normal(size=(2, 3)),
+        targets=0.3 * draw.normal(size=(6, 3)),
         frequency_hz=28e9,
     )
 
@@ -110,7 +111,7 @@ def _scene_of(paths: RayPaths) -> Any:
 
 def _read_sionna(folder: Path) -> Any:
     path = folder / "paths.npz"
-    return None if is_deepmimo(path) else _scene_of(load_paths(path))
+    return None if is_deepmimo(path) else scene_of_sionna(read_paths(path), "x", swap=True)
 
 
 def _make_readings(folder: Path) -> None:
@@ -242,16 +243,14 @@ READABLES: dict[str, Readable] = {
     "text PLY mesh": Readable(lambda f: _make_ply(f, True), lambda f: read_ply(f / "mesh.ply")),
     "Gaussians in PLY": Readable(_make_gaussians, lambda f: read_gaussians(f / "splats.ply")),
     "DeepMIMO folder": Readable(
-        lambda f: write_deepmimo(f / "s", as_deepmimo(_paths())),
-        lambda f: _scene_of(from_deepmimo(read_deepmimo(f / "s"), 28e9)),
+        lambda f: write_deepmimo(f / "s", as_deepmimo(_paths()), 28e9),
+        lambda f: _scene_of(load_deepmimo(f / "s")),
     ),
     "DeepMIMO archive": Readable(
         lambda f: np.savez(f / "s.npz", **as_deepmimo(_paths())),
-        lambda f: _scene_of(from_deepmimo(read_deepmimo(f / "s.npz"), 28e9)),
+        lambda f: _scene_of(load_deepmimo(f / "s.npz", 28e9)),
     ),
-    "DeepMIMO in MATLAB's format": Readable(
-        _make_mat, lambda f: _scene_of(from_deepmimo(read_deepmimo(f / "scenario.mat"), 28e9))
-    ),
+    "DeepMIMO in MATLAB's format": Readable(_make_mat, lambda f: _scene_of(load_deepmimo(f / "scenario.mat", 28e9))),
     "paths of Sionna RT": Readable(lambda f: save_paths(f / "paths.npz", _paths()), _read_sionna),
     "queries": Readable(
         lambda f: (f / "q.csv").write_text("x,y,z,ghz\n1,2,1.5,28\n-1,0.5,1,2.4\n"), lambda f: read_queries(f / "q.csv")

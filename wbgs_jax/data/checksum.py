@@ -9,11 +9,13 @@ import numpy as np
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 
+NAMES = ("name", "convention")
+
 
 def checksum(dataset: Dataset) -> str:
-    """Returns a checksum (SHA-256) of all numbers of a data set, its split included; its name does not count."""
+    """Returns a checksum (SHA-256) of all numbers of a data set, its split included; names do not count."""
     found = hashlib.sha256()
-    parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name != "name"}
+    parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
     parts["materials"] = None if dataset.materials is None else dataclasses.asdict(dataset.materials) | {"names": ()}
     for path, leaf in jax.tree_util.tree_leaves_with_path(parts):
         array = np.ascontiguousarray(leaf)

@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.types import Links, Query, Receiver
 
 Kind = Literal["snapshot", "pas", "power"]
 """Kind of the observations of a data set."""
+AT_ONCE = 1024
+"""Spectra that are made of snapshots."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,8 @@ class Dataset:
     """int32: the part, an object of the scene, that every triangle belongs to; None where parts are not known."""
     materials: Materials | None = None
     """What the triangles are made of; None where it is not known. Parts of one material share it."""
+    convention: ConventionName | None = None
+    """By which the images of a folder were read; None for scene files, which have one alone."""
 
     def __post_init__(self) -> None:
         observed = [values for values in (self.snapshots, self.images, self.power_db) if values is not None]
@@ -126,6 +131,14 @@ class Dataset:
             chosen = which == number
             spectra[chosen] = snapshot_to_pas(jnp.asarray(snapshots[chosen]), element_positions)
         return jnp.asarray(spectra)
+
+    def eight_bit(self, index: Int[np.ndarray, " b"]) -> UInt8[np.ndarray, "b 90 360"]:
+        """Returns the observed spectra of some links in bytes, as published data have them; raises what `pas` raises."""
+        if self.images is not None:
+            return self.images[index]
+        blocks = [index[start : start + AT_ONCE] for start in range(0, len(index), AT_ONCE)]
+        made = [np.asarray(255 * self.pas(block)).round().astype(np.uint8) for block in blocks]
+        return np.concatenate(made) if made else np.zeros((0, *PAS_SHAPE), np.uint8)
 
     def rx_positions(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 3"]:
         """Returns where the receivers of some links stand (float64, world frame, metres)."""

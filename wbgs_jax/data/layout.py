@@ -1,8 +1,9 @@
 """The folder layout in which spectra are published (NeRF2, WRF-GS, Wideband3DGS): in, and out of any scene file.
 
-    spectrum/00001.png ...       8-bit grey PAS, 90 rows (zenith 0..90 degrees) x 360 columns (azimuth -180..180 degrees)
+    spectrum/00001.png ...       8-bit grey PAS, 90 x 360, its pixels in one of two orders (`wbgs_jax.data.conventions`)
     tx_pos.csv                   header x,y,z; row k belongs to image k, both counted from 1; metres
-    gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]
+    gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]; optional:
+                                 frequency (GHz), convention (of the spectra)
     freq.txt                     optional: one frequency (GHz) a spectrum
     train_, test_index.txt       optional: image names without .png, zero-padded or not; beside them validation_index.txt
     point_cloud.ply              optional: the surface
@@ -23,7 +24,6 @@ import warnings
 from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -33,8 +33,9 @@ from PIL import Image
 from wbgs_jax._util.command import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text, safe_name
-from wbgs_jax._util.yaml_files import read_yaml
+from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.gateway import Gateway, ghz_to_hz, read_gateway, vector
 from wbgs_jax.data.load import scene_dataset
 from wbgs_jax.data.ply import read_ply, write_ply
 from wbgs_jax.data.scene_file import SceneFile, load_scene
@@ -42,15 +43,11 @@ from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, t
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.types import (
     HIGHEST_FREQUENCY_HZ,
-    LARGEST_COORDINATE_M,
     LOWEST_FREQUENCY_HZ,
-    Receiver,
     make_receiver,
     stack_receivers,
 )
 
-SHORTEST, LONGEST = 1e-6, 1e6
-"""Of quaternions that have a direction."""
 DIGITS = 9
 """Of the number of an image, at most."""
 NOMINAL_FREQUENCY_HZ = 1e9
@@ -60,21 +57,29 @@ SPECTRA, POSITIONS, GATEWAY, FREQUENCIES, MESH = "spectrum", "tx_pos.csv", "gate
 INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
 
 
-def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2) -> Dataset:
+def load_layout(
+    folder: Path | str,
+    frequency_hz: float | None = None,
+    seed: int = 0,
+    test_fraction: float = 0.2,
+    convention: ConventionName | None = None,
+) -> Dataset:
     """Loads a folder of the published layout; spectrum i is image i + 1.
 
     Without freq.txt all spectra have one frequency: `frequency_hz`, else `frequency` (GHz) in gateway_info.yml, else
     `NOMINAL_FREQUENCY_HZ`. Without index files `test_fraction` of the transmitters, drawn by `seed`, are the test.
+    The pixels are in the order of `convention`, else of `convention` in gateway_info.yml, else of that which the training
+    spectra reveal; a note names what was found.
 
     Raises:
-        UserError: a file is missing, damaged, or at odds with the others.
+        UserError: a file is missing, damaged, or at odds with the others, or the convention cannot be found.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder; give one that holds {SPECTRA}/, {POSITIONS} and {GATEWAY}")
     images = _read_images(folder / SPECTRA)
     positions = _read_positions(folder / POSITIONS, len(images))
-    name, receiver, gateway_hz = _read_gateway(folder / GATEWAY)
+    gateway = read_gateway(folder / GATEWAY)
     tx_index = group_transmitters(positions)
     nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
     vertices, faces = read_ply(folder / MESH) if (folder / MESH).exists() else nothing
@@ -83,19 +88,22 @@ def load_layout(folder: Path | str, frequency_hz: float | None = None, seed: int
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
+    named = _agreed(convention, gateway.convention, folder) or _revealed(folder, images, gateway, positions, tx_index, split)
+    receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
     return Dataset(
-        name=name or safe_name(folder.resolve().name),
+        name=gateway.name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),
         tx_positions=positions,
-        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway_hz, walls=len(faces) > 0),
+        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway.frequency_hz, len(faces) > 0),
         receiver_index=np.zeros(len(images), int),
         tx_index=tx_index,
         train=split["train"],
         validation=split["validation"],
         test=split["test"],
-        images=images,
+        images=to_pas(images, named),
         vertices=mesh_to_world(vertices),
         faces=faces,
+        convention=named,
     )
 
 
@@ -128,7 +136,8 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
                 (target / name).write_text("".join(f"{number:05d}\n" for number in index + 1))
         w, x, y, z = scene.rx_orientation[0].tolist()
         gateway = {"position": scene.rx_position[0].tolist(), "orientation": [x, y, z, w]}
-        (target / GATEWAY).write_text(yaml.safe_dump({"dataset_name": scene.name, "gateway1": gateway}, sort_keys=False))
+        content = {"dataset_name": scene.name, "convention": CONVENTIONS[0], "gateway1": gateway}
+        (target / GATEWAY).write_text(yaml.safe_dump(content, sort_keys=False))
         if len(scene.vertices):
             write_ply(target / MESH, world_to_mesh(scene.vertices), scene.faces)
 
@@ -172,7 +181,7 @@ def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
         raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
     if len(rows) != n:
         raise UserError(f"{path} has {len(rows)} rows for {n} images in {SPECTRA}/; give one for each, row k for image k")
-    return np.array([_vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
+    return np.array([vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
 
 
 def _read_frequencies(
@@ -188,52 +197,47 @@ def _read_frequencies(
             )
         single = NOMINAL_FREQUENCY_HZ if single is None else single
         if not LOWEST_FREQUENCY_HZ <= single <= HIGHEST_FREQUENCY_HZ:
-            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; it must be 0.001 to 1000 GHz")
+            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; the model knows 0.3 to 100 GHz")
         return np.full(n, single, np.float64)
     if wanted_hz is not None:
         raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
     words = read_text(path).split()
     if len(words) != n:
         raise UserError(f"{path} has {len(words)} frequencies for {n} images in {SPECTRA}/; give one (GHz) for each")
-    return np.array([_ghz_to_hz(word, path) for word in words])
+    return np.array([ghz_to_hz(word, path) for word in words])
 
 
-def _read_gateway(path: Path) -> tuple[str | None, Receiver, float | None]:
-    """Returns the data set's name, the first gateway as a `Receiver`, and the frequency (Hz), where the file has them."""
-    wanted = "write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]"
-    if not path.exists():
-        raise UserError(f"{path} is missing, which says where the receiver stands; {wanted}")
-    content = read_yaml(path)
-    entries = content if isinstance(content, dict) else {}
-    gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
-    if not gateways:
-        raise UserError(f"{path} names no gateway; {wanted}")
-    first, gateway = next(iter(gateways.items()))
-    if len(gateways) > 1:
-        warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)
-    position = _vector(gateway.get("position"), 3, f"{path}: position")
-    x, y, z, w = _vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
-    if not SHORTEST < np.linalg.norm(np.array([x, y, z, w]) / LONGEST) * LONGEST < LONGEST:
+def _agreed(wanted: ConventionName | None, named: ConventionName | None, folder: Path) -> ConventionName | None:
+    """Returns the convention that somebody has named, if anybody has."""
+    if wanted is not None and named is not None and wanted != named:
+        raise UserError(f"{folder / GATEWAY} names the convention {named}; leave out {wanted}, or correct that file")
+    return named if wanted is None else wanted
+
+
+def _revealed(
+    folder: Path,
+    images: UInt8[np.ndarray, "n 90 360"],
+    gateway: Gateway,
+    positions: Float[np.ndarray, "n 3"],
+    tx_index: np.ndarray,
+    split: dict[str, np.ndarray],
+) -> ConventionName:
+    """Returns the convention that the spectra reveal that are not for the test."""
+    known = np.sort(np.concatenate([split["train"], split["validation"]]))
+    receiver = make_receiver(gateway.position, gateway.orientation)
+    found = find_convention(images[known], receiver, positions[known], tx_index[known])
+    choices = " or ".join(CONVENTIONS)
+    if found.convention is None:
         raise UserError(
-            f"{path}: orientation is all zeros, or beyond all measure; write the quaternion [0, 0, 0, 1] for no rotation"
+            f"{folder} does not name the order of its pixels, and its spectra do not show it ({found.reason}): give "
+            f"--convention {choices}, or write `convention: ...` in {GATEWAY} (docs/formats.md)"
         )
-    frequency = entries.get("frequency", gateway.get("frequency"))
-    name = entries.get("dataset_name")
-    return (
-        None if name is None else safe_name(str(name)),
-        make_receiver(position, (w, x, y, z)),
-        None if frequency is None else _ghz_to_hz(str(frequency), path),
+    warnings.warn(
+        f"{folder} does not name the order of its pixels: {found.convention} is used, because {found.reason}; "
+        f"`convention: {choices}` in {GATEWAY} settles it",
+        stacklevel=3,
     )
-
-
-def _vector(value: Any, length: int, what: str) -> list[float]:
-    try:
-        vector = [float(v) for v in value] if isinstance(value, list) else []  # YAML gives 1e-3 as text
-    except (TypeError, ValueError, OverflowError):
-        vector = []
-    if len(vector) != length or not (np.abs(vector) <= LARGEST_COORDINATE_M).all():
-        raise UserError(f"{what} is {repr(value)[:80]}; it must be {length} numbers of at most {LARGEST_COORDINATE_M:g}")
-    return vector
+    return found.convention
 
 
 def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
@@ -263,17 +267,6 @@ def _image_number(word: str, where: Path) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= DIGITS):
         raise UserError(f"{where}: {word[:40]!r} is not an image number; images are named by numbers, 00001 for example")
     return int(word)
-
-
-def _ghz_to_hz(word: str, where: Path) -> float:
-    """Returns hertz, through decimals, not by a factor of 1e9: rounding must not part a frequency from itself elsewhere."""
-    try:
-        hertz = float(Decimal(word).scaleb(9))
-    except (ArithmeticError, ValueError):
-        hertz = np.nan
-    if not LOWEST_FREQUENCY_HZ <= hertz <= HIGHEST_FREQUENCY_HZ:
-        raise UserError(f"{where}: the frequency {word[:40]!r} is no number of GHz, 0.001 to 1000; mend it")
-    return hertz
 
 
 def _hz_to_ghz(hertz: float) -> str:

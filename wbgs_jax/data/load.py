@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.join import join
+from wbgs_jax.data.other_files import check_kind
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.radio.channel import NOT_HEARD_DB
@@ -28,13 +30,16 @@ PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 
 
 def load_dataset(
-    source: str | int | Path, frequency_hz: float | None = None, seed: int = 0, test_fraction: float = 0.2
+    source: str | int | Path,
+    frequency_hz: float | None = None,
+    seed: int = 0,
+    test_fraction: float = 0.2,
+    convention: ConventionName | None = None,
 ) -> Dataset:
     """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
     from several of one scene, with commas between them, as one data set of several receivers (`wbgs_jax.data.join`).
 
-    `frequency_hz`, `seed` and `test_fraction` are for folders that do not say (`wbgs_jax.data.layout.load_layout`); scene
-    files know their frequencies and their split.
+    The other arguments are for folders that do not record them (`wbgs_jax.data.layout.load_layout`); scene files do.
 
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.
@@ -45,9 +50,10 @@ def load_dataset(
         return scene_dataset(load_scene(path))
     path = Path(str(source))
     if len(names := source_names(source)) > 1:
-        return join([load_dataset(name, frequency_hz, seed, test_fraction) for name in names])
+        return join([load_dataset(name, frequency_hz, seed, test_fraction, convention) for name in names])
+    check_kind(path)
     if path.is_dir():
-        return load_layout(path, frequency_hz=frequency_hz, seed=seed, test_fraction=test_fraction)
+        return load_layout(path, frequency_hz, seed, test_fraction, convention)
     if path.suffix == ".npz":
         return scene_dataset(load_scene(path))
     known = ", ".join(released_scenes()) or f"none in {_scene_folder()} (make them with `make data`)"

@@ -99,11 +99,12 @@ def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
         _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
     for key in ("tx_positions", "rx_position", "element_positions", "vertices"):
         largest = np.abs(arrays[key]).max(initial=0)
-        _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres")
+        _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres, from a place on the site")
     lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
+    band = f"the model knows {LOWEST_FREQUENCY_HZ:g} to {HIGHEST_FREQUENCY_HZ:g} Hz"
     _demand(lowest > 0, "frequencies_hz must be positive")
-    _demand(lowest >= LOWEST_FREQUENCY_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz")
-    _demand(highest <= HIGHEST_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz")
+    _demand(lowest >= LOWEST_FREQUENCY_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz, and {band}")
+    _demand(highest <= HIGHEST_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz, and {band}")
     _demand((arrays["face_part"] >= 0).all(), "face_part must not be negative")
     split = np.isin(arrays["split"], (TRAIN, TEST, VALIDATION))
     _demand(split.all(), "split must hold 0 (train), 1 (test) and 2 (validation) only")

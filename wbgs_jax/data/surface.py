@@ -37,6 +37,11 @@ class DatasetScene:
         return self.dataset.receivers
 
     @property
+    def spectra(self) -> int:
+        """Number of links that are trained."""
+        return len(self.dataset.train)
+
+    @property
     def box(self) -> Float[np.ndarray, "2 3"]:
         """Smallest and largest coordinates (metres) of surfaces, where they are known, and of all transmitters and receivers.
 

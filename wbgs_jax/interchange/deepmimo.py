@@ -3,27 +3,31 @@
 Arrays by name: `power` (dB) and `phase` (degrees) of every path, `delay` (seconds), `aod_az`, `aod_el`, `aoa_az`, `aoa_el`
 (degrees, el from +z), `inter` (the interactions as the digits of a number, from the transmitter on: 1 reflection,
 2 diffraction, 3 scattering, 4 transmission, 0 none), `inter_pos`, `rx_pos` (N, 3), `tx_pos` (1, 3); NaN where a user has fewer
-paths. A scenario is a folder with a file each, such as power_t001_tx000_r000.npz (or .mat).
+paths. A scenario is a folder with a file each (deepmimo_folder.py).
+
+The channel at the carrier is the sum of sqrt(power) exp(j phase): phases hold the propagation. What DeepMIMO's converter makes
+of Sionna RT lacks it, as Sionna's coefficients do; lines of sight show which it is.
 """
 
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from wbgs_jax._util.archives import read_arrays
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
-from wbgs_jax.interchange.matlab import read_mat
-from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTION, SPECULAR, RayPaths
+from wbgs_jax.interchange.deepmimo_folder import Pair, pairs_of, parameters, read_file, read_pair, write_pair
+from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTION, SPECULAR, RayPaths, carrier, frequency_of
 
 PATHS = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 NEEDED = (*PATHS, "rx_pos", "tx_pos")
 ANGLES = {"theta_t": "aod_el", "phi_t": "aod_az", "theta_r": "aoa_el", "phi_r": "aoa_az"}
 DIGITS = {SPECULAR: 1, DIFFRACTION: 2, DIFFUSE: 3, REFRACTION: 4}
-FILE = re.compile(r"(?P<name>[a-z_]+?)_t(?P<set>\d+)_tx(?P<tx>\d+)_r(?P<rx>\d+)\.(npz|mat)")
 MOST_INTERACTIONS = 10
+WITHOUT_PROPAGATION = ("sionna",)
+"""Ray tracers whose phases DeepMIMO's converters take over without the propagation."""
+ALIKE, DIFFERENT, FEWEST = 0.99, 0.6, 5
+"""Lengths of the mean phasor of lines of sight that have one phase, and many; and how many it takes."""
 
 
 def read_deepmimo(
@@ -33,13 +37,76 @@ def read_deepmimo(
 
     Args:
         path: folder or file.
-        tx_set, tx, rx_set: which of several pairs of a transmitter and a grid of users; by default the first that is there.
+        tx_set, tx, rx_set: which of several pairs of a transmitter and a set of users; by default the first transmitter, and
+            the largest set of users that are no transmitters.
 
     Raises:
         UserError: nothing is there, or an array is missing.
     """
     path = Path(path)
-    arrays = _of_folder(path, (tx_set, tx, rx_set)) if path.is_dir() else _read(path)
+    return _complete(path, read_pair(path, pairs_of(path, tx_set, tx, rx_set)[0]) if path.is_dir() else read_file(path))
+
+
+def load_deepmimo(
+    path: Path | str,
+    frequency_hz: float | None = None,
+    tx_set: int | None = None,
+    tx: int | None = None,
+    rx_set: int | None = None,
+) -> RayPaths:
+    """Returns the paths from all transmitters of a scenario's set to its users, or from one of them.
+
+    Args:
+        path: folder or file.
+        frequency_hz: where no params.json records it.
+        tx_set, tx, rx_set: as in `read_deepmimo`.
+
+    Raises:
+        UserError: nothing is there, an array is missing, or the frequency is not known, or another.
+    """
+    path, known = Path(path), parameters(Path(path)).get("rt_params", {})
+    tracing = known if isinstance(known, dict) else {}
+    found = tracing.get("frequency")
+    recorded = float(found) if isinstance(found, int | float) else None
+    if frequency_hz is None and recorded is None:
+        raise UserError(f"{path} does not record its frequency; give --ghz, as in the scenario's parameters")
+    if frequency_hz is not None and recorded is not None and not np.isclose(recorded, frequency_hz, rtol=1e-3):
+        raise UserError(f"{path} is of {recorded / 1e9:g} GHz, not of {frequency_hz / 1e9:g}; leave out --ghz")
+    frequency = frequency_of(recorded if frequency_hz is None else frequency_hz)
+    pairs = pairs_of(path, tx_set, tx, rx_set) if path.is_dir() else []
+    found_arrays = [read_pair(path, pair) for pair in pairs] if pairs else [read_file(path)]
+    every = [_complete(path, arrays) for arrays in found_arrays]
+    if any(not np.array_equal(one["rx_pos"], every[0]["rx_pos"], equal_nan=True) for one in every[1:]):
+        choices = ", ".join(str(pair.tx) for pair in pairs)
+        raise UserError(f"{path}: its {len(every)} transmitters have different users; choose one, --tx-index {choices}")
+    lacks = any(name in str(tracing.get("raytracer_name", "")).lower() for name in WITHOUT_PROPAGATION)
+    return joined([from_deepmimo(one, frequency, not lacks) for one in every])
+
+
+def joined(every: list[RayPaths]) -> RayPaths:
+    """Returns the paths from several transmitters to the same receivers."""
+    depth, count = (max(one.interactions.shape[axis] for one in every) for axis in (0, 3))
+
+    def together(name: str, fill: Any) -> np.ndarray:
+        axis = int(name in ("interactions", "vertices"))
+        padded = []
+        for one in every:
+            values = getattr(one, name)
+            widths = [(0, 0)] * values.ndim
+            widths[axis + 2] = (0, count - values.shape[axis + 2])
+            if axis:
+                widths[0] = (0, depth - values.shape[0])
+            padded.append(np.pad(values, widths, constant_values=fill))
+        return np.concatenate(padded, axis + 1)
+
+    fills = {"a": 0, "tau": -1, "theta_t": 0, "phi_t": 0, "theta_r": 0, "phi_r": 0, "valid": False}
+    arrays: dict[str, Any] = {name: together(name, fill) for name, fill in fills.items()}
+    arrays |= {"interactions": together("interactions", NONE), "vertices": together("vertices", np.nan)}
+    sources = np.concatenate([one.sources for one in every])
+    return RayPaths(**arrays, sources=sources, targets=every[0].targets, frequency_hz=every[0].frequency_hz)
+
+
+def _complete(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{path} has no {missing[0]}; it must hold a DeepMIMO scenario: {', '.join(NEEDED)}")
     _check_shapes(path, arrays)
@@ -73,23 +140,32 @@ def is_deepmimo(path: Path) -> bool:
     """Returns whether a path is a scenario, and not an archive of Sionna's arrays."""
     if path.suffix != ".npz":
         return True
-    return bool({"power", "phase"} & set(_read(path)))
+    return bool({"power", "phase"} & set(read_file(path)))
 
 
-def write_deepmimo(folder: Path | str, arrays: dict[str, np.ndarray], tx_set: int = 1, tx: int = 0, rx_set: int = 0) -> None:
-    """Writes arrays as a scenario's files, an .npz each, into a folder."""
-    for name, values in arrays.items():
-        one: dict[str, Any] = {name: values}
-        with atomic_write(Path(folder) / f"{name}_t{tx_set:03}_tx{tx:03}_r{rx_set:03}.npz") as stream:
-            np.savez_compressed(stream, **one)
+def write_deepmimo(
+    folder: Path | str, arrays: dict[str, np.ndarray], frequency_hz: float, tx_set: int = 1, tx: int = 0, rx_set: int = 0
+) -> None:
+    """Writes arrays as a scenario's files, an .npz each, into a folder, which DeepMIMO loads; further transmitters of the same
+    users may follow."""
+    write_pair(Path(folder), Pair(tx_set, tx, rx_set), arrays, frequency_hz)
 
 
-def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float) -> RayPaths:
-    """Returns the paths from a scenario's transmitter to its users; the frequency stands in the scenario's parameters."""
+def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagation: bool = True) -> RayPaths:
+    """Returns the paths from a scenario's transmitter to its users.
+
+    Args:
+        arrays: of `read_deepmimo`.
+        frequency_hz: of the carrier, which stands in the scenario's parameters.
+        propagation: whether phases hold it, where lines of sight do not show it.
+    """
     power = np.asarray(arrays["power"], np.float64)
     valid = np.isfinite(power)
     amplitude = np.where(valid, 10 ** (np.where(valid, power, 0) / 20), 0)
-    phase = np.radians(_filled(arrays["phase"], valid))
+    phase, tau = np.radians(_filled(arrays["phase"], valid)), _filled(arrays["delay"], valid)
+    turns = 2 * np.pi * np.mod(frequency_hz * tau, 1)
+    if _holds_propagation(phase, turns, valid & (_filled(arrays.get("inter", power), valid) == 0), propagation):
+        phase = phase + turns
     angles = {own: np.radians(_filled(arrays[name], valid))[:, None] for own, name in ANGLES.items()}
     met = _digits(_filled(arrays["inter"], valid)) if "inter" in arrays else np.zeros((0, *power.shape), np.int32)
     places = np.full((*met.shape, 3), np.nan)
@@ -98,7 +174,7 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float) -> RayPath
         places[: len(given)] = given
     return RayPaths(
         a=(amplitude * np.exp(1j * phase))[:, None],
-        tau=np.where(valid, _filled(arrays["delay"], valid), -1)[:, None],
+        tau=np.where(valid, tau, -1)[:, None],
         **angles,
         interactions=met[:, :, None],
         vertices=places[:, :, None],
@@ -107,6 +183,18 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float) -> RayPath
         targets=np.asarray(arrays["rx_pos"], np.float64).reshape(-1, 3),
         frequency_hz=frequency_hz,
     )
+
+
+def _holds_propagation(
+    phase: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "n k"], direct: Bool[np.ndarray, "n k"], otherwise: bool
+) -> bool:
+    """Returns whether phases hold the propagation: without it, those of lines of sight are one."""
+    if direct.sum() < FEWEST:
+        return otherwise
+    without, with_it = (abs(np.exp(1j * own[direct]).mean()) for own in (phase, phase + turns))
+    if without > ALIKE and with_it < DIFFERENT:
+        return False
+    return True if with_it > ALIKE and without < DIFFERENT else otherwise
 
 
 def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
@@ -124,7 +212,8 @@ def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
     with np.errstate(divide="ignore"):
         power = 20 * np.log10(np.abs(a))
     angles = {name: np.degrees(getattr(paths, own)[:, transmitter]) for own, name in ANGLES.items()}
-    columns = {"power": power, "phase": np.degrees(np.angle(a)), "delay": paths.tau[:, transmitter], **angles}
+    arrived = a * carrier(paths.frequency_hz, paths.tau[:, transmitter])
+    columns = {"power": power, "phase": np.degrees(np.angle(arrived)), "delay": paths.tau[:, transmitter], **angles}
     code = sum((np.where(met == kind, digit, 0) for kind, digit in DIGITS.items()), np.zeros(met.shape, np.int64))
     return {
         **{name: sorted_values(values) for name, values in columns.items()},
@@ -133,28 +222,6 @@ def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
         "rx_pos": paths.targets.astype(np.float32),
         "tx_pos": paths.sources[[transmitter]].astype(np.float32),
     }
-
-
-def _of_folder(folder: Path, wanted: tuple[int | None, ...]) -> dict[str, np.ndarray]:
-    found: dict[tuple[int, ...], dict[str, Path]] = {}
-    for entry in sorted(folder.iterdir()):
-        if match := FILE.fullmatch(entry.name):
-            key = tuple(int(match[part]) for part in ("set", "tx", "rx"))
-            if all(want in (None, have) for want, have in zip(wanted, key, strict=True)):
-                found.setdefault(key, {})[match["name"]] = entry
-    if not found:
-        raise UserError(f"{folder} holds no files such as power_t001_tx000_r000.npz; give the folder of a DeepMIMO scenario")
-    arrays: dict[str, np.ndarray] = {}
-    for name, path in found[min(found)].items():
-        if name in (*NEEDED, "inter", "inter_pos"):
-            content = _read(path)
-            arrays[name] = content.get(name, next(iter(content.values()), np.zeros(0)))
-    return arrays
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """Returns the numbers of an .npz or .mat file by name."""
-    return read_mat(path) if path.suffix == ".mat" else read_arrays(path, "", "check the path; give an .npz or a .mat file")
 
 
 def _filled(values: Any, valid: np.ndarray) -> np.ndarray:

@@ -24,8 +24,9 @@ NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
 """`sionna.rt.InteractionType`."""
 INTERACTION = {TRANSMITTED: REFRACTION, REFLECTED: SPECULAR, DIFFRACTED: DIFFRACTION}
 NEEDED = ("a", "tau", "theta_t", "phi_t", "theta_r", "phi_r")
-SINGLE = 3
-"""Axes of what has none for antennas: receivers, transmitters, paths."""
+OF_PATHS = (*NEEDED, "valid", "interactions", "vertices")
+SINGLE, ARRAYS = 3, 5
+"""Axes: receivers, transmitters, paths; and those of the antennas behind the first two, where they are told apart."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class RayPaths:
         """Returns the channel between single antennas; at other frequencies than the paths' own phases follow the delays, and
         the coefficients stay."""
         frequency = self.frequency_hz if frequency_hz is None else frequency_hz
-        return np.where(self.valid, self.a * np.exp(-2j * np.pi * np.mod(frequency * self.tau, 1)), 0).sum(-1)
+        return np.where(self.valid, self.a * carrier(frequency, self.tau), 0).sum(-1)
 
     def reversed(self) -> "RayPaths":
         """Returns the paths from receivers to transmitters: channels are reciprocal."""
@@ -87,43 +88,34 @@ class RayPaths:
         return arrays | {"a": self.a[:, None, :, None, :]}
 
 
-def from_sionna(paths: Any, frequency_hz: float | None = None) -> RayPaths:
-    """Returns the paths of a `sionna.rt.Paths` object, or of a mapping with its arrays; of antenna arrays those between the
-    first antennas.
+def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[int, int] | None = None) -> RayPaths:
+    """Returns the paths of a `sionna.rt.Paths` object, or of a mapping with its arrays, between single antennas.
+
+    Of antenna arrays `sionna_arrays.scene_of_sionna` makes snapshots.
 
     Args:
         paths: whatever has `a`, `tau`, `theta_t`, `phi_t`, `theta_r`, `phi_r`, and perhaps `valid`, `interactions`, `vertices`,
             `sources` and `targets`, as attributes or keys.
         frequency_hz: of the carrier, which Sionna keeps in its scene; for what does not say it itself.
+        antennas: which of the receivers' and of the transmitters' antennas (0, 1, ...), where devices have several. With a
+            synthetic array the coefficients hold the phase of the antenna's place beside the device's.
 
     Raises:
-        UserError: an array is missing, or has other axes.
+        UserError: an array is missing, or has other axes; or devices have several antennas, and none is chosen.
     """
-    optional = {name: _array(paths, name) for name in (*NEEDED, "valid", "interactions", "vertices", "frequency_hz")}
-    found = {name: values for name, values in optional.items() if values is not None}
-    if missing := [name for name in NEEDED if name not in found]:
-        raise UserError(f"these paths have no {missing[0]}; give a sionna.rt.Paths object or its arrays by name")
-    known = found.pop("frequency_hz", None)
-    frequency = known if frequency_hz is None else frequency_hz
+    found = {name: values for name in OF_PATHS if (values := array_of(paths, name)) is not None}
+    if "interactions" not in found:
+        found.pop("vertices", None)  # places of nobody knows what
+    check_arrays(found, "these paths")
+    frequency = array_of(paths, "frequency_hz") if frequency_hz is None else frequency_hz
     if frequency is None:
         raise UserError("these paths do not say their frequency; give it: that of the scene that they were traced in")
-    single = {name: _first_antennas(name, values) for name, values in found.items()}
+    if found["a"].ndim == ARRAYS:
+        several = found["a"].shape[1], found["a"].shape[3]
+        if antennas is None and several != (1, 1):
+            raise UserError(f"these paths are between {several[0]} and {several[1]} antennas of a device; choose one of each")
+    single = {name: _of_antennas(name, values, antennas or (0, 0)) for name, values in found.items()}
     shape = single["a"].shape
-    if "interactions" not in single:
-        single.pop("vertices", None)  # places of nobody knows what
-    for name, values in single.items():
-        if values.dtype.kind not in ("cfiu" if name == "a" else "fiub"):
-            raise UserError(f"{name} of these paths holds no numbers but {values.dtype}; write them again")
-    if len(shape) != SINGLE:
-        raise UserError(f"a of these paths has shape {found['a'].shape}; expected receivers, transmitters and paths")
-    for name, values in single.items():
-        axes = values.shape[1:] if name == "interactions" else values.shape[1:-1] if name == "vertices" else values.shape
-        if name == "vertices" and (values.shape[-1:] != (3,) or len(values) != len(single.get("interactions", values))):
-            axes = ()
-        if axes != shape:
-            raise UserError(
-                f"{name} of these paths has shape {found[name].shape}, which does not fit a with {found['a'].shape}"
-            )
     real = {name: np.asarray(single[name], np.float64) for name in NEEDED[1:]}
     met = np.asarray(single.get("interactions", np.zeros((0, *shape))), np.int32)
     return RayPaths(
@@ -132,10 +124,29 @@ def from_sionna(paths: Any, frequency_hz: float | None = None) -> RayPaths:
         interactions=met,
         vertices=np.asarray(single.get("vertices", np.full((*met.shape, 3), np.nan)), np.float64),
         valid=np.asarray(single.get("valid", (real["tau"] >= 0) & (single["a"] != 0)), bool),
-        sources=_places(paths, "sources", shape[1]),
-        targets=_places(paths, "targets", shape[0]),
-        frequency_hz=_frequency(frequency),
+        sources=_places(paths, "sources", shape[1], (antennas or (0, 0))[1]),
+        targets=_places(paths, "targets", shape[0], (antennas or (0, 0))[0]),
+        frequency_hz=frequency_of(frequency),
     )
+
+
+def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
+    """Raises a `UserError` for arrays of `OF_PATHS` that are missing, hold no numbers, or are of other receivers, transmitters
+    and paths than `a`, with axes of antennas or without; `what` has them."""
+    if missing := [name for name in NEEDED if name not in arrays]:
+        raise UserError(f"{what} have no {missing[0]}; give a sionna.rt.Paths object or its arrays by name")
+    for name, values in arrays.items():
+        if values.dtype.kind not in ("cfiu" if name == "a" else "fiub"):
+            raise UserError(f"{name} of {what} holds no numbers but {values.dtype}; write them again")
+    of_a = arrays["a"].shape
+    if len(of_a) not in (SINGLE, ARRAYS):
+        raise UserError(f"a of {what} has shape {of_a}; expected receivers, transmitters and paths")
+    for name, values in arrays.items():
+        shape = values.shape[int(name in ("interactions", "vertices")) :][: -1 if name == "vertices" else None]
+        if name == "vertices" and (values.shape[-1:] != (3,) or len(values) != len(arrays.get("interactions", values))):
+            shape = ()
+        if (shape[::2] if len(shape) == ARRAYS else shape) != (of_a[::2] if len(of_a) == ARRAYS else of_a):
+            raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
 
 
 def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
@@ -161,7 +172,7 @@ def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_
     valid = np.abs(amplitude) > 0
     one = {"tau": np.where(valid, tau, -1), "theta_t": theta_t, "phi_t": phi_t, "theta_r": theta_r, "phi_r": phi_r}
     return RayPaths(
-        (amplitude * np.exp(2j * np.pi * np.mod(frequency_hz * tau, 1)))[None],
+        (amplitude / carrier(frequency_hz, tau))[None],
         **{name: values[None] for name, values in one.items()},
         interactions=np.moveaxis(met, -1, 0)[:, None],
         vertices=np.moveaxis(_vertices(own, arrivals.points), -2, 0)[:, None],
@@ -180,19 +191,24 @@ def save_paths(path: Path | str, paths: RayPaths) -> None:
 
 
 def load_paths(path: Path | str, frequency_hz: float | None = None) -> RayPaths:
-    """Returns the paths of an .npz file with the arrays of `sionna.rt.Paths` by name; `a` may be complex, or `a_real` and
-    `a_imag`.
+    """Returns the paths of an .npz file with the arrays of `sionna.rt.Paths` by name, between single antennas; `a` may be
+    complex, or `a_real` and `a_imag`.
 
     Raises:
         UserError: the file is missing, damaged, or holds no paths.
     """
+    return from_sionna(read_paths(path), frequency_hz)
+
+
+def read_paths(path: Path | str) -> dict[str, np.ndarray]:
+    """Returns the arrays of an .npz file by name, `a` as complex numbers; a missing or damaged one is a `UserError`."""
     arrays = read_arrays(Path(path), "", "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
         arrays["a"] = arrays.pop("a_real") + 1j * arrays.pop("a_imag")
-    return from_sionna(arrays, frequency_hz)
+    return arrays
 
 
-def _array(paths: Any, name: str) -> np.ndarray | None:
+def array_of(paths: Any, name: str) -> np.ndarray | None:
     """Returns an array by its name as a key or an attribute; a pair of arrays, as Sionna's `a`, is a complex one."""
     value = paths.get(name) if isinstance(paths, Mapping) else getattr(paths, name, None)
     if value is None:
@@ -202,7 +218,7 @@ def _array(paths: Any, name: str) -> np.ndarray | None:
     return np.asarray(value)
 
 
-def _frequency(value: Any) -> float:
+def frequency_of(value: Any) -> float:
     """Returns hertz, of several the first."""
     try:
         found = float(np.reshape(value, -1)[0])
@@ -213,27 +229,49 @@ def _frequency(value: Any) -> float:
     return found
 
 
-def _first_antennas(name: str, values: np.ndarray) -> np.ndarray:
-    """Returns an array without axes of antennas, which stand behind receivers and transmitters."""
+def _of_antennas(name: str, values: np.ndarray, antennas: tuple[int, int]) -> np.ndarray:
+    """Returns an array without axes of antennas, which stand behind receivers and transmitters; where all antennas share what
+    it holds, there are fewer of them."""
     before, after = (1, 0) if name == "interactions" else (1, 1) if name == "vertices" else (0, 0)
-    if values.ndim == before + after + SINGLE + 2:
-        return values[(slice(None),) * (before + 1) + (0, slice(None), 0)]
+    if values.ndim == before + after + ARRAYS:
+        received, sent = (number % values.shape[before + axis] for number, axis in zip(antennas, (1, 3), strict=True))
+        return values[(slice(None),) * (before + 1) + (received, slice(None), sent)]
     return values
 
 
-def _places(paths: Any, name: str, count: int) -> np.ndarray:
-    """Returns positions (n, 3), of several antennas at a place the first; objects of Sionna have them the other way round."""
-    found = _array(paths, name)
+def _places(paths: Any, name: str, count: int, antenna: int) -> np.ndarray:
+    """Returns positions (n, 3), of several antennas at a place the one that is chosen."""
+    found = array_of(paths, name)
     if found is None:
         return np.full((count, 3), np.nan)
+    places = places_of(found, not isinstance(paths, Mapping), name)
+    if not len(places) or len(places) % count:
+        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected ({count}, 3): a place for each of them")
+    several = len(places) // count
+    return places[antenna % several :: several]
+
+
+def places_of(found: np.ndarray, columns: bool, name: str) -> Float[np.ndarray, "n 3"]:
+    """Returns positions (n, 3); `columns` stand in objects of Sionna, (3, n), and in what was saved from them."""
     if found.dtype.kind not in "fiu":
         raise UserError(f"{name} of these paths holds no numbers but {found.dtype}; write them again")
     places = np.asarray(found, np.float64)
-    if places.ndim == 2 and (places.shape[1] != 3 or (len(places) == 3 and not isinstance(paths, Mapping))):
+    if places.ndim == 2 and (places.shape[1] != 3 or (len(places) == 3 and columns)):
         places = places.T
-    if places.ndim != 2 or places.shape[1] != 3 or not len(places) or len(places) % count:
-        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected ({count}, 3): a place for each of them")
-    return places[:: len(places) // count]
+    if places.ndim != 2 or places.shape[1] != 3:
+        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected (n, 3): a place for each of them")
+    return places
+
+
+def carrier(frequency_hz: float, tau: Float[np.ndarray, "*n"]) -> Complex[np.ndarray, "*n"]:
+    """Returns the phasors of the carrier after some delays (seconds)."""
+    return np.exp(-2j * np.pi * np.mod(frequency_hz * tau, 1))
+
+
+def directions_of(theta: Float[np.ndarray, "*n"], phi: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    """Returns the unit vectors of angles (radians)."""
+    sine = np.sin(theta)
+    return np.stack([sine * np.cos(phi), sine * np.sin(phi), np.cos(theta)], -1)
 
 
 def _angles(directions: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:

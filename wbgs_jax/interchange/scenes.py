@@ -8,7 +8,7 @@ from jaxtyping import Complex, Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile
 from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
-from wbgs_jax.interchange.ray_paths import RayPaths
+from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
 
 TEST_SHARE = 0.2
 FEWEST = 5
@@ -122,9 +122,7 @@ def scene_of_snapshots(
 
 def snapshots_of(paths: RayPaths, element_positions: Float[np.ndarray, "elements 3"]) -> Complex[np.ndarray, "t r elements"]:
     """Returns the voltages of the elements of every receiver's array (wavelengths, world frame), carrier phase included."""
-    turns = np.mod(paths.frequency_hz * paths.tau, 1)
-    voltage = np.where(paths.valid, paths.a * np.exp(-2j * np.pi * turns), 0)
-    sine = np.sin(paths.theta_r)
-    direction = np.stack([sine * np.cos(paths.phi_r), sine * np.sin(paths.phi_r), np.cos(paths.theta_r)], -1)
+    voltage = np.where(paths.valid, paths.a * carrier(paths.frequency_hz, paths.tau), 0)
+    direction = directions_of(paths.theta_r, paths.phi_r)
     steering = np.exp(2j * np.pi * np.nan_to_num(direction) @ np.asarray(element_positions).T)
     return np.einsum("rtk,rtke->tre", voltage, steering)

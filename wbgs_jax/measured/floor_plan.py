@@ -1,7 +1,7 @@
 """Walls of a floor plan: how many of them stand between two points, and what mesh they make.
 
-walls.csv (or layout.csv) holds segments x1,y1,x2,y2, each a wall, or the corners x,y of one outline around all free space, in
-which a wall between rooms has two faces. Metres.
+walls.csv (or layout.csv) holds segments x1,y1,x2,y2, each a wall, or the corners x,y of an outline around free space, in which
+a wall between rooms has two faces; of several outlines if a column room tells them apart. Metres.
 """
 
 from dataclasses import dataclass
@@ -13,11 +13,16 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Float
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.measured.readings import check_positions
+from wbgs_jax.measured.plausible import check_positions
 from wbgs_jax.measured.tables import numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
+OUTLINES = "room"
+"""Column that tells outlines apart."""
+IGNORED = ("id", "name", "material", "thickness", "comment", "note")
+"""Columns that change nothing: the law takes all walls to be alike."""
 PARALLEL = 1e-9
 """Square metres: what is smaller crosses nothing."""
 ON_WALL = 1e-2
@@ -52,7 +57,17 @@ def load_walls(path: Path) -> Walls:
     form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
     values = numbers(path, header, rows, list(form.columns))
     check_positions(f"{path}: corners", values)
-    ends = values.reshape(-1, 2, 2) if form is SEGMENTS else np.stack([values, np.roll(values, -1, 0)], 1)
+    known = (*form.columns, *IGNORED, *([] if form is SEGMENTS else [OUTLINES]))
+    if other := [name for name in header if name not in known]:
+        raise UserError(
+            f"{path} has a column {other[0]!r}, of which a floor plan knows nothing; its columns are {', '.join(form.columns)}"
+            + (f" and, for several outlines, {OUTLINES}" if form is OUTLINE else "")
+        )
+    if form is SEGMENTS:
+        return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
+    room = np.array([row[header.index(OUTLINES)] if OUTLINES in header else "" for row in rows])
+    outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
+    ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
     return Walls(ends, np.full(len(ends), form.share))
 
 

@@ -1,11 +1,11 @@
 """Readings of received power at several fixed receivers from many places, read from folders and averaged over cells.
 
-    readings.csv (or calibration.csv)   x,y[,z][,room], then one column a receiver, dBm: rssi_1,rssi_2,... ; empty: not received
-    receivers.csv (or anchors.csv)      id,x,y,z, in the order of those columns
+    readings.csv (or calibration.csv)   x,y[,z][,room][,floor], and a column of dBm a receiver, named by its id (columns.py);
+                                        empty: not received
+    receivers.csv (or anchors.csv)      id,x,y,z
     walls.csv (or layout.csv)           optional; floor_plan.py
 
-or in a layout of NeRF2 (nerf2.py). Metres and one frame throughout. Headers may be in capitals. Columns of powers that end in
-the receivers' ids may stand in any order; others stand in that of the receivers.
+or in a layout of NeRF2 (nerf2.py). Metres and one frame throughout. Headers may be in capitals.
 """
 
 import dataclasses
@@ -17,14 +17,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.measured.columns import match_columns
 from wbgs_jax.measured.nerf2 import is_nerf2, load_nerf2
+from wbgs_jax.measured.plausible import check_metres, check_positions, check_powers, not_received
 from wbgs_jax.measured.tables import found, numbers, read_table
 
 READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
-POWERS_DBM = (-200.0, 50.0)
-"""Beyond it numbers are no powers; +100 often stands for nothing."""
-FURTHEST = 1e4
-"""Metres."""
+NAMES = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
+"""Columns that may name a receiver."""
+ROOMS = ("room", "floor", "storey", "level")
+"""Columns that part readings; those of floors go with heights alone."""
+IGNORED = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
+"""Columns that change nothing."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +65,8 @@ def load_readings(folder: Path, height: float) -> Readings:
         raise UserError(f"there is no folder {folder}")
     if is_nerf2(folder):
         places, powers, receivers = load_nerf2(folder)
-        rooms = ("",) * len(places)
-        return _checked(Readings(places, powers, np.isfinite(powers).astype(float), rooms, receivers), folder)
+        counts = np.isfinite(powers).astype(float)
+        return _checked(Readings(places, powers, counts, ("",) * len(places), receivers), folder)
     return _checked(_load_tables(folder, height), folder)
 
 
@@ -71,57 +75,34 @@ def _load_tables(folder: Path, height: float) -> Readings:
     names, entries = read_table(of_receivers)
     receivers = numbers(of_receivers, names, entries, ["x", "y", "z"])
     header, rows = read_table(path)
-    powers = [name for name in header if name not in ("x", "y", "z", "room")]
+    powers = [name for name in header if name not in ("x", "y", "z", *ROOMS, *IGNORED)]
     if len(powers) != len(receivers):
         raise UserError(
-            f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} {len(receivers)} receivers"
+            f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} {len(receivers)} receivers; "
+            "name columns by the ids of receivers, and leave out what is no power"
         )
-    if "id" in names:
-        powers = _in_order(path, powers, [entry[names.index("id")].lower() for entry in entries])
+    ids = next((names.index(name) for name in NAMES if name in names), None)
+    powers = match_columns(path, powers, len(receivers) if ids is None else [entry[ids] for entry in entries])
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
+    parts = [header.index(name) for name in ROOMS if name in header]
+    if places.shape[1] == 2 and set(ROOMS[1:]) & set(header):
+        raise UserError(f"{path} has a column of floors but no heights; give the column z, metres in the receivers' frame")
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
-    rooms = tuple(row[header.index("room")] for row in rows) if "room" in header else ("",) * len(rows)
-    values = numbers(path, header, rows, powers)
+    rooms = tuple("/".join(row[part] for part in parts) for row in rows)
+    values = not_received(path, numbers(path, header, rows, powers))
+    check_powers(path, values)
     return Readings(places, values, np.isfinite(values).astype(float), rooms, receivers)
 
 
-def _in_order(where: Path, columns: list[str], ids: list[str]) -> list[str]:
-    """Returns columns in the order of the receivers whose ids they end in; as they are, where none does.
-
-    Raises:
-        UserError: some of them do, and others do not.
-    """
-    by_id: dict[str, str] = {}
-    for name in sorted(ids, key=len, reverse=True):  # a_1 before 1
-        ending = [one for one in columns if one not in by_id.values() and (one == name or one.endswith(f"_{name}"))]
-        by_id |= {name: ending[0]} if len(ending) == 1 else {}
-    if by_id and len(by_id) < len(ids):
-        other = next(name for name in ids if name not in by_id)
-        raise UserError(
-            f"{where}: no column of powers, or more than one, ends in the receiver's id {other!r}, as others end in theirs; "
-            f"name the columns {', '.join('rssi_' + name for name in ids[:3])}, ..."
-        )
-    return [by_id[name] for name in ids] if by_id else columns
-
-
 def _checked(readings: Readings, folder: Path) -> Readings:
-    """Returns readings whose positions and powers are plausible."""
+    """Returns readings whose positions are plausible."""
     check_positions(f"{folder}: places", readings.places)
     check_positions(f"{folder}: receivers", readings.receivers)
-    heard = readings.powers[~np.isnan(readings.powers)]
-    if not len(heard):
+    check_metres(f"{folder}: receivers and places", np.concatenate([readings.receivers, readings.places]))
+    if np.isnan(readings.powers).all():
         raise UserError(f"{folder}: nothing was received anywhere")
-    if not ((heard >= POWERS_DBM[0]) & (heard <= POWERS_DBM[1])).all():
-        span = " to ".join(f"{power:g}" for power in POWERS_DBM)
-        raise UserError(f"{folder}: powers must be dBm, {span}; leave cells empty where nothing was received")
     return readings
-
-
-def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
-    """Raises a `UserError` for positions that are none."""
-    if not (np.abs(positions) < FURTHEST).all():
-        raise UserError(f"{what} must be numbers of metres, each nearer than {FURTHEST:g} m to the origin")
 
 
 def cell_means(readings: Readings, size: float) -> Readings:

@@ -240,7 +240,7 @@ def _through_slabs(
     def through(field, one):
         (across, into, out, te, tm), active = one
         changed = (te * _dot(field, across))[:, None] * across + (tm * _dot(field, into))[:, None] * out
-        return jnp.where(active[:, None], changed, field), None
+        return jnp.where(active[:, None], changed, field).astype(field.dtype), None
 
     # A loop: written out, XLA compiles it twice as long, and the code it makes for a CPU is slower.
     return jax.lax.scan(through, field, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), (interactions, active)))[0]

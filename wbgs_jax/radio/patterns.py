@@ -5,10 +5,13 @@ exponent: the element of 3GPP TR 38.901, which looks along +x, and the short dip
 apart, and those between them can be learned.
 """
 
+import re
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.geometry import rotation_matrix, to_local
@@ -21,6 +24,15 @@ PATTERN_EXPONENTS = {
     "hw_dipole": (0.0, 1.2),  # within 0.41 dB wherever the half-wave dipole is above -10 dB
 }
 """Exponents of the directional element and of the dipole by the name of a pattern."""
+SPELLINGS = {"isotropic": "iso", "tr38901": "tr38901", "38901": "tr38901", "3gpp38901": "tr38901"}
+SPELLINGS |= {
+    "3gpptr38901": "tr38901",
+    "shortdipole": "dipole",
+    "halfwavedipole": "hw_dipole",
+    "halfwavelengthdipole": "hw_dipole",
+}
+SPELLINGS |= {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
+"""Names in small letters, without separators."""
 POLE = 1e-12
 """Squared sine of the zenith angle below which a direction is straight up or down."""
 
@@ -41,8 +53,12 @@ def upright(exponents: Float[Array, "2"]) -> Antenna:
 
 
 def pattern_exponents(pattern: str) -> tuple[float, float]:
-    """Returns the exponents of a named pattern; a pattern without an entry counts as isotropic."""
-    return PATTERN_EXPONENTS.get(pattern, (0.0, 0.0))
+    """Returns the exponents of a named pattern, in any usual spelling; one that is not known is a `UserError`."""
+    plain = re.sub(r"[^a-z0-9]", "", pattern.lower())
+    if plain not in SPELLINGS:
+        known = ", ".join(filter(None, PATTERN_EXPONENTS))
+        raise UserError(f"the antenna pattern {pattern[:40]!r} is not known; choose {known}, or none where it is not known")
+    return PATTERN_EXPONENTS[SPELLINGS[plain]]
 
 
 @jax.jit

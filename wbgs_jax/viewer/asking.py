@@ -15,7 +15,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Electrical, Splatted
-from wbgs_jax.inference.answers import doubts
+from wbgs_jax.inference.answers import bounds_of
 from wbgs_jax.inference.confidence import Expected, expected_ssim
 from wbgs_jax.inference.floor import Plane, ask_plane, pieces
 from wbgs_jax.inference.links import describe_interactions, names_of
@@ -59,7 +59,9 @@ class Answer:
     power_db: float | None
     """Relative to the transmitted power; None where the field knows of none."""
     expected: tuple[float, float, float] | None
-    """Expected SSIM, and the ends of its 90 % interval."""
+    """Expected SSIM, and the ends of its interval ..."""
+    level: float | None
+    """... in which the true one lies with this chance."""
     paths: PathList | None
     doubts: tuple[str, ...]
     """Why the answer should not be trusted, a line each."""
@@ -91,6 +93,7 @@ class Asker:
         self._neighbours, self._confidence = (
             for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence)
         )
+        self._bounds = bounds_of(self.dataset)
         self._spectra = self._links_with_spectra()
         self._samples: dict[int, Sample] = {}
 
@@ -114,11 +117,14 @@ class Asker:
         learned = self._neighbours, self._confidence
         found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
         pas, power, expected, paths = jax.tree.map(np.asarray, found)
-        unsure = doubts(self.dataset, np.asarray(self.receiver.position), np.asarray(position)[None], np.array([frequency_hz]))
+        place = np.asarray(position, np.float64)[None]
+        unsure = self._bounds.doubts(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
+        expected = None if self._bounds.without_confidence(place)[0] else expected
         return Answer(
             pas,
             float(power) if power is not None and self.knows_power else None,
             None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
+            None if self._confidence is None or expected is None else float(self._confidence.level),
             None if paths is None else self._listed(*paths),
             tuple(unsure),
         )

@@ -10,7 +10,6 @@ from viser import uplot
 
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.answers import lowest_answered
-from wbgs_jax.inference.confidence import LEVEL
 from wbgs_jax.types import MAX_FREQUENCY_HZ
 from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.asking import Answer, Asker, PathList, Sample
@@ -192,9 +191,9 @@ def summary_words(answer: Answer, frequency_hz: float) -> str:
     lines = [f"**{frequency_hz / 1e9:.4g} GHz**"]
     if answer.power_db is not None:
         lines[0] += f" · received {answer.power_db:.1f} dB"
-    if answer.expected is not None:
+    if answer.expected is not None and answer.level is not None:
         ssim, low, high = answer.expected
-        lines.append(f"expected SSIM {ssim:.2f}, {100 * LEVEL:.0f} % between {low:.2f} and {min(high, 1):.2f}")
+        lines.append(f"expected SSIM {ssim:.2f}, {100 * answer.level:.0f} % between {low:.2f} and {min(high, 1):.2f}")
     if answer.paths is not None and len(answer.paths.power_db):
         lines.append(channel_words(answer.paths))
     lines += [f"⚠️ **{line}**" for line in answer.doubts]

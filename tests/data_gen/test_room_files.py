@@ -9,7 +9,7 @@ import trimesh
 from own_room import WRITERS, Y_UP, load, meshes, refused, toml, write_glb, write_xml
 
 from data_gen.example.make_room import OBJECTS, obj
-from data_gen.scene_files import read_objects
+from wbgs_jax.interchange.room_files import read_objects
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -125,8 +125,8 @@ def test_vertices_that_are_not_numbers(tmp_path):
 
 
 def test_a_scene_xml_that_cannot_be_used(tmp_path):
-    file = write_xml(tmp_path, kind="sphere")
-    refused("is of type 'sphere'; export it as ply or obj", file, None)
+    file = write_xml(tmp_path, kind="hair")
+    refused("is of type 'hair'; export it as ply or obj", file, None)
     file = write_xml(tmp_path, transform='<transform name="to_world"><lookat origin="0,0,0"/></transform>')
     refused("is moved by <lookat>", file, None)
     file = write_xml(tmp_path, bsdf={"floor": "paint", "door": "missing"})

@@ -1,0 +1,105 @@
+"""Places where no antenna can stand: bodies and rooms, from any side, against a formula."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from synthetic import tiny_dataset
+
+from wbgs_jax._util.solids import ClosedBody, inside
+from wbgs_jax.data.places import closed_bodies
+from wbgs_jax.inference.answers import bounds_of
+from wbgs_jax.inference.bounds import Bounds
+from wbgs_jax.inference.opened import _masked
+
+BESIDE = np.array([3.0, 3, 0])
+
+
+def scene_with(*meshes):
+    """A data set whose surfaces are some meshes, a part each."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return dataclasses.replace(
+        tiny_dataset(),
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32),
+        faces=np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]).astype(np.int32),
+        face_part=np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]).astype(np.int32),
+        materials=None,
+    )
+
+
+def at(mesh, *place):
+    return mesh.copy().apply_translation(place)
+
+
+def test_inside_is_that_of_the_formula(rng):
+    """A sphere, and a ring that a point can be in the middle of without being in it."""
+    points = rng.uniform(-2, 2, (500, 3))
+    ball = trimesh.creation.icosphere(3)
+    found = inside(ClosedBody("ball", ball.triangles), points)
+    radius = np.linalg.norm(points, axis=1)
+    sure = np.abs(radius - 1) > 0.03
+    np.testing.assert_array_equal(found[sure], radius[sure] < 1)
+    ring = trimesh.creation.torus(1.2, 0.5, major_sections=128, minor_sections=64)
+    away = np.hypot(np.hypot(points[:, 0], points[:, 1]) - 1.2, points[:, 2])
+    sure = np.abs(away - 0.5) > 0.03
+    turned_inwards = ring.triangles[:, ::-1]
+    for triangles in (ring.triangles, turned_inwards):
+        np.testing.assert_array_equal(inside(ClosedBody("ring", triangles), points)[sure], away[sure] < 0.5)
+
+
+def test_cabinets_are_bodies_and_rooms_and_sheets_are_none():
+    dataset = tiny_dataset()
+    receiver, transmitters = np.asarray(dataset.receivers.position[0], float), dataset.tx_positions
+    room = at(trimesh.creation.box((50, 50, 50)), *transmitters.mean(0))
+    cabinet = at(trimesh.creation.box((0.5, 0.5, 0.5)), *(receiver + BESIDE))
+    box = trimesh.creation.box((0.5, 0.5, 0.5))
+    open_box = at(trimesh.Trimesh(box.vertices, box.faces[:-1], process=False), *(receiver - BESIDE))
+    scene = scene_with(room, cabinet, open_box)
+    (found,) = closed_bodies(scene)
+    assert found.name == "part 1" and inside(found, (receiver + BESIDE)[None])[0]
+    soup = cabinet.copy()
+    soup = trimesh.Trimesh(
+        soup.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
+    )  # a vertex for every corner
+    assert len(closed_bodies(scene_with(soup))) == 1
+    assert closed_bodies(dataclasses.replace(scene, faces=scene.faces[:0], face_part=scene.face_part[:0])) == ()
+
+
+def test_an_answer_from_within_a_body_or_from_far_away_has_no_confidence():
+    dataset = tiny_dataset()
+    receiver = np.asarray(dataset.receivers.position[0], float)
+    centre = receiver + BESIDE
+    bounds = bounds_of(scene_with(at(trimesh.creation.box((0.5, 0.5, 0.5)), *centre)))
+    bounds = Bounds.from_json(bounds.as_json())
+    places = np.array([centre, centre + np.array([0, 0, 0.4]), dataset.tx_positions[0], [500.0, 0, 1]])
+    low, high = bounds.box
+    within = ((places >= low) & (places <= high)).all(1)
+    np.testing.assert_array_equal(bounds.without_confidence(places), [True, not within[1], False, True])
+    (line,) = bounds.doubts(receiver, centre[None], np.array([bounds.band[0]]))
+    assert "is inside a closed body (part 0 of" in line and "where no antenna can stand" in line
+
+
+def test_without_surfaces_places_nearby_keep_their_confidence():
+    """Transmitters alone do not close a room."""
+    dataset = dataclasses.replace(tiny_dataset(), faces=np.zeros((0, 3), np.int32), face_part=None, materials=None)
+    bounds = bounds_of(dataset)
+    size = np.linalg.norm(bounds.box[1] - bounds.box[0])
+    places = bounds.box[1] + np.array([[0.1, 0, 0], [size, 0, 0]])
+    np.testing.assert_array_equal(bounds.without_confidence(places), [False, True])
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_place_is_none(n):
+    body = ClosedBody("box", trimesh.creation.box((1, 1, 1)).triangles)
+    assert inside(body, np.zeros((n, 3))).shape == (n,)
+
+
+def test_arrays_of_an_answer_lose_their_confidence_there_alone():
+    bounds = Bounds("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11))
+    answer = {"pas": np.ones((2, 90, 360), np.float32), "expected": np.full((2, 3), 0.9, np.float32)}
+    found = _masked(answer, bounds, np.array([[1.0, 1, 1], [500, 0, 1]]))
+    np.testing.assert_array_equal(found["pas"], answer["pas"])
+    np.testing.assert_array_equal(found["expected"], np.array([[0.9] * 3, [np.nan] * 3], np.float32))
+    assert found["expected"].dtype == np.float32
+    assert _masked({"pas": answer["pas"]}, bounds, np.zeros((2, 3))).keys() == {"pas"}

@@ -1,0 +1,294 @@
+"""Rooms as other programs write them: every triangle that a file declares, or a refusal that names the object."""
+
+import base64
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.interchange.room_files import read_objects
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+BOX = trimesh.creation.box((1, 1, 1))
+FLOOR = "o floor\nv 0 0 0\nv 6 0 0\nv 6 5 0\nv 0 5 0\nf 1 2 3 4\n"
+
+
+def found(path, **options):
+    """Areas, and centres of the bounding boxes, by name."""
+    return {o.name: (float(o.mesh.area), tuple(np.round(o.mesh.bounds.mean(0), 4))) for o in read_objects(path, **options)}
+
+
+# OBJ
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        (lambda text: text, ["floor", "wall"]),
+        (lambda text: text.replace(" ", "\t"), ["floor", "wall"]),
+        (lambda text: "\ufeff" + text, ["floor", "wall"]),
+        (lambda text: text.replace("\n", "\r\n"), ["floor", "wall"]),
+        (lambda text: text.replace("f 1 2 3 4", "f -4 -3 -2 -1").replace("f 1 2 6 5", "f -6 -5 -1 -2"), ["floor", "wall"]),
+        (lambda text: text.replace("f 1 2 3 4", "f 1/1/1 2//1 \\\n3/3 4"), ["floor", "wall"]),
+        (lambda text: text.replace("o ", "g "), ["floor", "wall"]),
+        (lambda text: text.replace("floor", "Fußboden # beneath"), ["Fußboden", "wall"]),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+def test_obj_in_every_spelling(tmp_path, change, names, encoding):
+    text = change(FLOOR + "o wall\nv 0 0 3\nv 6 0 3\nf 1 2 6 5\n")
+    if encoding == "latin-1":
+        text = text.removeprefix("\ufeff")
+    (tmp_path / "a.obj").write_bytes(text.encode(encoding))
+    objects = found(tmp_path / "a.obj")
+    assert sorted(objects) == sorted(names)
+    assert {area for area, _ in objects.values()} == {30.0, 18.0}
+
+
+def test_obj_names_of_an_unknown_encoding_stay_apart(tmp_path):
+    text = b"o \xb5\xd8\xb0\xe5\nv 0 0 0\nv 6 0 0\nv 6 5 0\nf 1 2 3\no \xb7\xe7\xc9\xc8\nf 3 2 1\n"
+    (tmp_path / "a.obj").write_bytes(text)
+    assert len(read_objects(tmp_path / "a.obj")) == 2
+
+
+def test_obj_with_curved_surfaces_is_refused(tmp_path):
+    (tmp_path / "a.obj").write_text(FLOOR + "o vase\ncstype bspline\nsurf 0 1 0 1 1 2 3 4\n")
+    with pytest.raises(UserError, match=r"object 'vase' .* curved surface"):
+        read_objects(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("corner", ["0", "-9"])
+def test_obj_with_corners_that_are_none(tmp_path, corner):
+    (tmp_path / "a.obj").write_text(FLOOR + f"f 1 2 {corner}\n")
+    with pytest.raises(UserError, match="which does not exist"):
+        read_objects(tmp_path / "a.obj")
+
+
+# glTF
+
+
+class Gltf:
+    """A document with one box, to be changed."""
+
+    def __init__(self):
+        self.bytes = b""
+        self.document = {
+            "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": "cabinet"}], "meshes": [], "accessors": [], "bufferViews": [],
+        }  # fmt: skip
+
+    def add(self, values, kind="VEC3", **more):
+        values = np.ascontiguousarray(values)
+        component = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}[values.dtype.str[1:]]
+        self.bytes += b"\0" * (-len(self.bytes) % 4)
+        self.document["bufferViews"].append({"buffer": 0, "byteOffset": len(self.bytes), "byteLength": values.nbytes})
+        self.bytes += values.tobytes()
+        entry = {"bufferView": len(self.document["bufferViews"]) - 1, "componentType": component, "count": len(values)}
+        self.document["accessors"].append(entry | {"type": kind} | more)
+        return len(self.document["accessors"]) - 1
+
+    def mesh(self, vertices, index=None, mode=4, **more):
+        primitive = {"attributes": {"POSITION": self.add(vertices)}, "mode": mode} | more
+        if index is not None:
+            primitive["indices"] = self.add(np.ravel(index).astype("<u2"), "SCALAR")
+        self.document["meshes"].append({"primitives": [primitive]})
+        return self
+
+    def write(self, path):
+        data = "data:application/octet-stream;base64," + base64.b64encode(self.bytes).decode()
+        self.document["buffers"] = [{"byteLength": len(self.bytes), "uri": data}]
+        path.write_text(json.dumps(self.document))
+        return path
+
+
+VERTICES, FACES = BOX.vertices.astype("<f4"), BOX.faces
+STRIP = np.array([3, 2, 6, 7, 4, 2, 0, 3, 1, 6, 5, 4, 1, 0])
+"""A cube by one strip of its corners, numbered as below."""
+CORNERS = np.array(
+    [[0.5, 0.5, 0.5], [-0.5, 0.5, 0.5], [0.5, 0.5, -0.5], [-0.5, 0.5, -0.5], [0.5, -0.5, 0.5], [-0.5, -0.5, 0.5],
+     [-0.5, -0.5, -0.5], [0.5, -0.5, -0.5]], "<f4")  # fmt: skip
+
+
+def cabinet(gltf, tmp_path):
+    """Area and centre, y up as in the file."""
+    return found(gltf.write(tmp_path / "a.gltf"), up="z")["cabinet"]
+
+
+def test_gltf_lists_strips_and_fans(tmp_path):
+    assert cabinet(Gltf().mesh(VERTICES, FACES), tmp_path) == (pytest.approx(6), (0, 0, 0))
+    assert cabinet(Gltf().mesh(VERTICES[FACES.ravel()]), tmp_path)[0] == pytest.approx(6)  # without indices
+    assert cabinet(Gltf().mesh(CORNERS, STRIP, 5), tmp_path)[0] == pytest.approx(6)
+    fan = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [1, 3, 0], [0, 2, 0]], "<f4")
+    assert cabinet(Gltf().mesh(fan, None, 6), tmp_path)[0] == pytest.approx(5)
+
+
+def test_gltf_accessors_of_every_kind(tmp_path):
+    """Integers, normalised or not; interleaved; sparse ones, with or without a base."""
+    signed = Gltf().mesh((VERTICES * 2 * 32767).astype("<i2"), FACES)
+    signed.document["accessors"][0]["normalized"] = True
+    assert cabinet(signed, tmp_path) == (pytest.approx(24, rel=1e-3), (0, 0, 0))
+    plain = Gltf().mesh((VERTICES * 200).astype("<i2"), FACES)
+    plain.document["nodes"][0] |= {"scale": [0.01, 0.01, 0.01], "translation": [1, 2, 3]}
+    assert cabinet(plain, tmp_path) == (pytest.approx(24), (1, 2, 3))
+    wide = Gltf().mesh(np.column_stack([VERTICES, VERTICES * 9]).astype("<f4"), FACES)
+    wide.document["bufferViews"][0]["byteStride"] = 24
+    assert cabinet(wide, tmp_path) == (pytest.approx(6), (0, 0, 0))
+    moved = VERTICES.copy()
+    top = np.flatnonzero(VERTICES[:, 1] > 0)
+    moved[top, 1] = -0.5  # flat, but for what is sparse
+    sparse = Gltf().mesh(moved, FACES)
+    index, values = sparse.add(top.astype("<u2"), "SCALAR"), sparse.add(VERTICES[top])
+    views = [sparse.document["accessors"][number] for number in (index, values)]
+    sparse.document["accessors"][0]["sparse"] = {
+        "count": len(top),
+        "indices": {"bufferView": views[0]["bufferView"], "componentType": 5123},
+        "values": {"bufferView": views[1]["bufferView"]},
+    }
+    assert cabinet(sparse, tmp_path)[0] == pytest.approx(6)
+    del sparse.document["accessors"][0]["bufferView"]  # from zeros
+    assert cabinet(sparse, tmp_path)[0] < 6
+
+
+def test_gltf_instances_and_morph_targets(tmp_path):
+    many = Gltf().mesh(VERTICES, FACES)
+    places = many.add(np.array([[0, 0, 0], [4, 0, 0], [0, 0, 6]], "<f4"))
+    many.document["nodes"][0] |= {
+        "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places}}}, "translation": [1, 0, 0]
+    }  # fmt: skip
+    many.document |= {"extensionsUsed": ["EXT_mesh_gpu_instancing"], "extensionsRequired": ["EXT_mesh_gpu_instancing"]}
+    assert cabinet(many, tmp_path) == (pytest.approx(18), (3, 0, 3))
+    grown = Gltf().mesh(VERTICES, FACES)
+    grown.document["meshes"][0] |= {"weights": [0.5]}
+    grown.document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": grown.add(2 * VERTICES)}]
+    assert cabinet(grown, tmp_path)[0] == pytest.approx(24)
+
+
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "VENDOR_walls"])
+def test_gltf_that_requires_more_is_refused(tmp_path, name):
+    gltf = Gltf().mesh(VERTICES, FACES, extensions={name: {"bufferView": 0}})
+    gltf.document |= {"extensionsUsed": [name], "extensionsRequired": [name]}
+    with pytest.raises(UserError, match=rf"requires the extension {name} \(object 'cabinet'\), which is not read"):
+        read_objects(gltf.write(tmp_path / "a.gltf"))
+    del gltf.document["extensionsRequired"]
+    if "VENDOR" not in name:
+        with pytest.raises(UserError, match=f"object 'cabinet' .* is compressed by {name}"):
+            read_objects(gltf.write(tmp_path / "a.gltf"))
+
+
+def test_gltf_with_a_skin_is_refused(tmp_path):
+    gltf = Gltf().mesh(VERTICES, FACES)
+    gltf.document["nodes"][0]["skin"] = 0
+    with pytest.raises(UserError, match=r"object 'cabinet' .* is moved by a skin"):
+        read_objects(gltf.write(tmp_path / "a.gltf"))
+
+
+def test_gltf_against_trimesh(tmp_path, rng):
+    """Nested nodes with rotations, scales and mirrors."""
+    scene = trimesh.Scene()
+    for name in ("a", "b", "c"):
+        matrix = trimesh.transformations.random_rotation_matrix(rng.random(3))
+        matrix[:3, :3] *= rng.uniform(0.5, 2, 3) * [1, 1, -1]
+        matrix[:3, 3] = rng.normal(size=3)
+        scene.add_geometry(trimesh.creation.icosphere(2), node_name=name, geom_name=name, transform=matrix)
+    scene.export(tmp_path / "a.glb")
+    ours = found(tmp_path / "a.glb", up="z")
+    for name in ("a", "b", "c"):
+        matrix, geometry = scene.graph[name]
+        mesh = scene.geometry[geometry].copy().apply_transform(matrix)
+        assert ours[name] == (pytest.approx(mesh.area, rel=1e-4), pytest.approx(tuple(mesh.bounds.mean(0)), abs=2e-4))
+
+
+# PLY
+
+
+def test_ply_of_strips_and_of_points_alone(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+    points = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 2 0\n1 2 0\n"
+    strips = "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + strips + points + "9 0 1 2 3 -1 2 3 4 5\n")
+    (strip,) = read_objects(tmp_path / "a.ply")
+    assert len(strip.mesh.faces) == 4 and strip.mesh.area == pytest.approx(2) and strip.mesh.is_winding_consistent
+    (tmp_path / "b.ply").write_text(head + "end_header\n" + points)
+    with pytest.raises(UserError, match="points without faces"):
+        read_objects(tmp_path / "b.ply")
+
+
+# Mitsuba
+
+
+XML = '<scene version="2.1.0"><default name="high" value="2"/>{}</scene>'
+SHAPES = {
+    "rectangle": (4.0, '<scale x="1" y="1"/>'),
+    "cube": (24.0, ""),
+    "disk": (np.pi, ""),
+    "sphere": (4 * np.pi, ""),
+    "cylinder": (2 * np.pi, ""),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize("transform", ["to_world", "toWorld"])
+def test_mitsuba_shapes_that_are_built_in(tmp_path, kind, transform):
+    area, steps = SHAPES[kind]
+    shape = f'<shape type="{kind}" id="a"><transform name="{transform}">{steps}<translate x="1" z="$high"/></transform></shape>'
+    (tmp_path / "a.xml").write_text(XML.format(shape))
+    measured, centre = found(tmp_path / "a.xml")["a"]
+    assert measured == pytest.approx(area, rel=5e-3)
+    np.testing.assert_allclose(centre, (1, 0, 2.5 if kind == "cylinder" else 2), atol=1e-6)
+
+
+def test_mitsuba_spheres_and_cylinders_have_their_own_places(tmp_path):
+    ball = '<shape type="sphere" id="ball"><point name="center" x="1" y="2" z="3"/><float name="radius" value="0.5"/></shape>'
+    ends = '<point name="p0" value="0, 0, 0"/><point name="p1" value="0, 4, 0"/><float name="radius" value="0.1"/>'
+    (tmp_path / "a.xml").write_text(XML.format(ball + f'<shape type="cylinder" id="pipe">{ends}</shape>'))
+    objects = found(tmp_path / "a.xml")
+    assert objects["ball"] == (pytest.approx(np.pi, rel=5e-3), (1, 2, 3))
+    assert objects["pipe"] == (pytest.approx(0.8 * np.pi, rel=5e-3), (0, 2, 0))
+
+
+def test_mitsuba_names_that_nobody_fills_in_and_files_of_windows(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    BOX.export(tmp_path / "meshes" / "box.ply")
+    shape = '<shape type="ply" id="mesh-box"><string name="filename" value="{}"/></shape>'
+    (tmp_path / "a.xml").write_text(XML.format(shape.format("meshes\\box.ply")))
+    assert found(tmp_path / "a.xml") == {"box": (pytest.approx(6), (0, 0, 0))}
+    (tmp_path / "b.xml").write_text(XML.format(shape.format("$folder/box.ply")))
+    with pytest.raises(UserError, match=r"leaves '\$folder/box.ply' open; give a <default>"):
+        read_objects(tmp_path / "b.xml")
+
+
+# Other kinds, and places far away
+
+
+@pytest.mark.parametrize("name", ["house.ifc", "plan.dxf", "walls.svg", "street.geojson", "room.fbx", "room.blend"])
+def test_other_kinds_are_refused_by_what_they_are(tmp_path, name):
+    (tmp_path / name).write_text("anything")
+    with pytest.raises(UserError, match=r"room|drawing|building|map|Autodesk|Blender"):
+        read_objects(tmp_path / name)
+
+
+@pytest.mark.parametrize("away", [3e4, 4.5e6])
+def test_map_coordinates_are_refused(tmp_path, away):
+    (tmp_path / "a.obj").write_text(f"v {away} 0 0\nv {away + 6} 0 0\nv {away} 5 0\nf 1 2 3\n")
+    with pytest.raises(UserError, match="single precision is too coarse for waves; subtract a place on the site"):
+        read_objects(tmp_path / "a.obj")
+
+
+@pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")
+def test_small_inputs_that_were_read_wrongly():
+    for path in sorted((CASES / "polygons").glob("*")):
+        ((area, _),) = found(path).values()
+        assert area == pytest.approx(18), path
+    for path in sorted((CASES / "obj").glob("*")):
+        assert found(path) == {"floor": (30, (3, 2.5, 0)), "box": (pytest.approx(6), (3, 3, 0.6))}, path
+    for path in sorted((CASES / "scene_xml").glob("*.xml")):
+        (cube,) = (place for area, place in found(path).values() if area < 10)
+        assert cube == (3, 3, 1.2 if path.stem == "transform_v06" else 0.6), path
+    rows = {o.name: o.mesh for o in read_objects(CASES / "glb" / "instancing.glb")}
+    assert len(rows["cabinet"].faces) == 48
+    for name in ("quantized", "quantized_int"):
+        cabinet = {o.name: o.mesh for o in read_objects(CASES / "glb" / f"{name}.glb")}["cabinet"]
+        np.testing.assert_allclose(cabinet.bounds, [[1, 1, 0.01], [1.6, 1.6, 1.81]], atol=1e-3)

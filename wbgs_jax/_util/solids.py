@@ -1,0 +1,41 @@
+"""Closed bodies, and which points are inside (NumPy)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+CHUNK = 1_000_000
+"""Pairs of a point and a triangle whose solid angles are computed together; bounds the memory to some 100 MB."""
+
+
+class ClosedBody(NamedTuple):
+    """A solid object: a cabinet, a pillar."""
+
+    name: str
+    triangles: Float[np.ndarray, "t 3 3"]
+    """Corners, metres."""
+
+
+def inside(body: ClosedBody, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Returns which points a body goes around."""
+    low, high = body.triangles.min((0, 1)), body.triangles.max((0, 1))
+    result = ((points > low) & (points < high)).all(1)
+    result[result] = np.abs(winding_number(body.triangles, points[result])) > 0.5
+    return result
+
+
+def winding_number(triangles: Float[np.ndarray, "t 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Returns how often closed triangles go around every point: 0 outside, 1 or -1 inside (from their solid angles, van
+    Oosterom and Strackee 1983)."""
+    step = max(1, CHUNK // max(1, len(triangles)))
+    each = [_solid_angles(triangles, points[i : i + step]).sum(1) for i in range(0, len(points), step)]
+    return np.concatenate([np.zeros(0), *each]) / (4 * np.pi)
+
+
+def _solid_angles(triangles: Float[np.ndarray, "t 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n t"]:
+    a, b, c = (triangles[None, :, corner] - points[:, None] for corner in range(3))
+    la, lb, lc = (np.linalg.norm(one, axis=-1) for one in (a, b, c))
+    triple = np.einsum("nti,nti->nt", a, np.cross(b, c))
+    below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return 2 * np.arctan2(triple, below)

@@ -1,0 +1,129 @@
+"""In which order published folders hold the pixels of a spectrum, which no file of theirs records.
+
+Two orders are in use, in folders of the same names and images of the same size:
+
+    zenith         rows are zenith angles, 0..90 degrees; azimuths -180..180 degrees; the array in the local y-z plane (the
+                   paper's authors)
+    elevation      rows are elevations, 0..89 degrees; azimuths 0..359 degrees; the array in the local x-y plane (NeRF2's
+                   generator of spectra; WRF-GS and WRF-GS+ took it over)
+
+In both the zenith is local +z and azimuths grow from local +x to +y; the receiver's quaternion turns local vectors into the
+world frame. The first is that of `radio.array.pas_directions`. Pixels of the second are moved, never interpolated: nothing is
+lost, and directions are off by a degree at most (rows near the zenith, columns near +180 degrees).
+"""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.special import stdtrit
+
+from wbgs_jax._util.statistics import by_transmitter
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH, planar_array
+from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.types import Receiver
+
+ConventionName = Literal["zenith", "elevation"]
+"""In which order a folder holds its pixels."""
+CONVENTIONS: tuple[ConventionName, ...] = get_args(ConventionName)
+
+INWARD = 3
+"""Rows further in with which the outer rows are compared: next to the zenith, a single direction, what pixels vary by grows
+from nothing; at the horizon it is about as large."""
+POLE, APART = 0.5, 2.0
+"""Variation of the row at the zenith, as a share of that further in, at most; and how many times as large that share is at the
+other end."""
+VISIBLE = 0.3
+"""Grey levels (of 255) that pixels further in have to vary by: an image without content decides nothing."""
+CHANCE, FEWEST = 1e-3, 5
+"""With which lines of sight may prefer a convention by accident, and transmitters that they take."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What spectra reveal of their convention."""
+
+    convention: ConventionName | None
+    """None: undecided."""
+    reason: str
+    """In words."""
+
+
+def to_pas(images: UInt8[np.ndarray, "n 90 360"], convention: ConventionName) -> UInt8[np.ndarray, "n 90 360"]:
+    """Returns spectra of a convention with their pixels in the order of `radio.array.pas_directions`."""
+    return images if convention == "zenith" else np.roll(images[:, ::-1], PAS_WIDTH // 2, axis=2)
+
+
+def array_of(convention: ConventionName) -> Float[np.ndarray, "elements 3"]:
+    """Returns the element positions (wavelengths, local frame) of the array that a convention goes with, 4x4 at half a
+    wavelength."""
+    elements = planar_array()
+    return elements if convention == "zenith" else elements[:, [1, 2, 0]]
+
+
+def find_convention(
+    images: UInt8[np.ndarray, "n 90 360"],
+    receiver: Receiver,
+    tx_positions: Float[np.ndarray, "n 3"],
+    tx_index: Int[np.ndarray, " n"],
+) -> Evidence:
+    """Returns the convention of some spectra, as their geometry shows it.
+
+    The row of the zenith is (nearly) a single direction, so that its pixels are alike. Where neither outer row is such, lines
+    of sight decide: the pixel towards the transmitter is the brighter one.
+
+    Args:
+        images: as the folder holds them.
+        receiver: that saw them.
+        tx_positions: world frame, metres.
+        tx_index: which transmitter.
+    """
+    if found := _by_the_zenith(images):
+        return found
+    towards = jnp.asarray(tx_positions - np.asarray(receiver.position, np.float64))
+    local = np.asarray(to_local(towards, receiver.orientation))
+    above = (local[:, 2] > 0) & (np.linalg.norm(local, axis=1) > 0)
+    if not above.any():
+        return Evidence(None, "no transmitter is above the receiver's horizon")
+    ranks = [_brighter(images[above], *_pixel(local[above], name)) for name in CONVENTIONS]
+    first, second = (by_transmitter(rank, tx_index[above]) for rank in ranks)
+    gain = second - first
+    error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
+    compared = (
+        f"towards the transmitter spectra are brighter than {100 * second.mean():.0f} % of their pixels read as elevations"
+    )
+    compared += f", than {100 * first.mean():.0f} % read as zenith angles"
+    if len(gain) < FEWEST or not abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - CHANCE / 2) * error:
+        return Evidence(None, compared)
+    return Evidence("elevation" if gain.mean() > 0 else "zenith", compared)
+
+
+def _by_the_zenith(images: UInt8[np.ndarray, "n 90 360"]) -> Evidence | None:
+    outer, inner = (images[:, rows].std(2).mean(0) for rows in ([0, PAS_HEIGHT - 1], [INWARD, PAS_HEIGHT - 1 - INWARD]))
+    share = outer / np.maximum(inner, 1e-9)
+    for pole, convention, row in ((0, CONVENTIONS[0], "first"), (1, CONVENTIONS[1], "last")):
+        if inner.min() >= VISIBLE and share[pole] <= POLE and share[1 - pole] >= APART * share[pole]:
+            spread = f"grey levels spread by {outer[pole]:.1f}, {INWARD} rows on by {inner[pole]:.1f}"
+            return Evidence(convention, f"the {row} row is at a single direction ({spread}), as the zenith is")
+    return None
+
+
+def _pixel(local: Float[np.ndarray, "n 3"], convention: ConventionName) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Returns rows and columns of a folder's images in which directions lie."""
+    zenith = np.degrees(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]))
+    azimuth = np.degrees(np.arctan2(local[:, 1], local[:, 0]))
+    if convention == "zenith":
+        row, column = zenith * (PAS_HEIGHT - 1) / 90, (azimuth + 180) * (PAS_WIDTH - 1) / 360
+    else:
+        row, column = 90 - zenith, azimuth
+    return np.clip(np.rint(row), 0, PAS_HEIGHT - 1).astype(int), np.rint(column).astype(int) % PAS_WIDTH
+
+
+def _brighter(
+    images: UInt8[np.ndarray, "n 90 360"], row: Int[np.ndarray, " n"], column: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Returns the share of its image that a pixel is brighter than, pixels as bright as it by half."""
+    pixel = images[np.arange(len(images)), row, column][:, None, None]
+    return (images < pixel).mean((1, 2)) + 0.5 * (images == pixel).mean((1, 2))
