@@ -9,13 +9,13 @@ from typing import Literal
 import numpy as np
 
 from data_gen.jobs import Job
-from data_gen.materials import check_material_frequencies
 from data_gen.own_scene import own_scene, parse_point
 from data_gen.scenes import SceneSpec, get_scene
 from data_gen.scenes.base import FREQUENCIES_21_HZ
 from data_gen.settings import ArraySettings, Solver, SolverSettings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
+from wbgs_jax.interchange.building_materials import check_material_frequencies
 
 HERE = Path(__file__).parent
 SUBSET_SEED = 0

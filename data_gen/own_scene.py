@@ -4,46 +4,22 @@ All that can be wrong is told here in one line, before hours are spent on tracin
 """
 
 import dataclasses
-import fnmatch
-import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 
-from data_gen.materials import ITU, THICKNESS, Law, check_material_frequencies, own_material
 from data_gen.mesh_checks import is_solid, kind, outward, place, surface_flaws
 from data_gen.scenes.base import FREQUENCIES_HZ, RX_CLEARANCE, Part, SceneSpec, grid_3d
 from data_gen.scenes.geometry import Vec3, distance, winding_number
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_files import FileObject, read_objects
+from wbgs_jax.interchange.building_materials import check_material_frequencies
+from wbgs_jax.interchange.material_files import Slab
+from wbgs_jax.interchange.rooms import RoomObject, describe_room, read_room
 
-EXTENT = (0.5, 200.0)
-"""Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody says so, ..."""
-SAID_EXTENT = (0.01, 20_000.0)
-"""... and then in between these. A scene.xml of Sionna RT says so by itself."""
-ROOM = 10.0
-"""Metres: the usual size of a room, to guess a unit from."""
-MAX_THICKNESS = 2.0
-"""Metres: a thicker slab is one given in millimetres."""
-MAX_TRIANGLES = 2_000_000
 MAX_TX = 1_000_000
-MAX_WALL, THIN, FULL = 0.6, 0.25, 0.95
-"""Metres: a box that is no thicker, thinner than this share of its height, and as full as this, is a wall."""
-SHOWN = 40
-"""Objects that are described."""
-HELP = "see docs/own_scene.md"
-
-
-class Slab(NamedTuple):
-    """A material by name and its thickness in metres; the name of an own material carries its law (`own_material`)."""
-
-    material: str
-    thickness: float
 
 
 @dataclass(frozen=True)
@@ -52,6 +28,8 @@ class OwnScene(SceneSpec):
 
     flaws: tuple[str, ...] = ()
     """What is wrong with surfaces that are taken as they are."""
+    walls: dict[str, float] = field(default_factory=dict)
+    """Sheets that were closed boxes, and how deep these were, metres."""
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points are in the box around all objects."""
@@ -94,12 +72,11 @@ def own_scene(
     """
     position, candidates = parse_point(rx, "--rx"), _transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
-    objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
-    _check_size(file, objects, SAID_EXTENT if simulated or scale is not None else EXTENT)
-    slabs = _slabs(file, objects, materials)
-    check_material_frequencies([slab.material for slab in slabs], frequencies)
+    objects, simulated = read_room(file, materials, up, scale), file.suffix.lower() == ".xml"
+    check_material_frequencies([one.slab.material for one in objects], frequencies)
     description = f"{len(objects)} objects of {file.name}"
-    spec = OwnScene(file.stem, _parts(objects, slabs), position, candidates, frequencies, description=description)
+    walls = {one.name: one.wall for one in objects if one.wall}
+    spec = OwnScene(file.stem, _parts(objects), position, candidates, frequencies, description=description, walls=walls)
     spec.check_receiver()
     if not spec.in_room(candidates).any():
         raise UserError(f"no transmitter of --tx-grid is inside the scene, which spans {_span(spec)}; move the grid")
@@ -109,33 +86,14 @@ def own_scene(
 
 
 def describe(spec: SceneSpec) -> str:
-    """Returns how objects were understood, a line each, of many those with most triangles: name, material, thickness (m), solid
-    or sheet, number of triangles; and what is wrong with them."""
-    sort = {True: "solid", False: "sheet"}
-    largest = sorted(np.argsort([-len(p.mesh.faces) for p in spec.parts], kind="stable")[:SHOWN])
-    shown = [spec.parts[i] for i in largest]
-    rows = [(p.name, p.material, f"{p.thickness:g} m", sort[p.closed], f"{len(p.mesh.faces)} triangles") for p in shown]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-    if len(shown) < len(spec.parts):
-        lines.append(f"... and {len(spec.parts) - len(shown)} smaller objects")
-    if walls := {p.name: depth for p in spec.parts if p.closed and (depth := _depth(p.mesh)) <= MAX_WALL}:
-        deep = next(iter(walls.values()))
-        lines.append(
-            f"warning: {_list(list(walls), 4)} are closed boxes as thin as walls ({deep:.2g} m): a wave passes two "
-            f"faces, and each counts as a slab of its material's thickness; give {deep / 2:.2g} m, or one sheet a wall"
-        )
+    """Returns how objects were understood (`describe_room`), and what is wrong with them."""
+    walls = spec.walls if isinstance(spec, OwnScene) else {}
+    objects = [RoomObject(p.name, p.mesh, Slab(p.material, p.thickness), walls.get(p.name, 0.0)) for p in spec.parts]
+    lines = [describe_room(objects, ["solid" if p.closed else "sheet" for p in spec.parts])]
     flaws = spec.flaws if isinstance(spec, OwnScene) else ()
     if flaws:
         lines.append(f"warning: {flaws[0]}" + (f" ({len(flaws) - 1} more of such places)" if len(flaws) > 1 else ""))
     return "\n".join(lines)
-
-
-def _depth(mesh: trimesh.Trimesh) -> float:
-    """Returns how thick a closed box is that is thin against its length and height; infinity for any other body."""
-    low, middle, _ = sorted(mesh.extents)
-    box = mesh.volume > FULL * np.prod(mesh.extents)
-    return float(low) if box and low < THIN * middle else np.inf
 
 
 def _span(spec: SceneSpec) -> str:
@@ -143,112 +101,14 @@ def _span(spec: SceneSpec) -> str:
     return f"{place(low)} to {place(high)} m"
 
 
-def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, float]) -> None:
-    corners = np.concatenate([o.mesh.bounds for o in objects])
-    size = np.ptp(corners, axis=0)
-    largest = float(size.max())
-    if not extent[0] <= largest <= extent[1]:
-        factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / ROOM)))
-        sides = " x ".join(f"{side:.4g}" for side in size)
-        raise UserError(
-            f"{file} measures {sides} m; give the metres in its unit, perhaps --scale {factor:g}, or --scale 1 if that is right"
-        )
-    total = sum(len(o.mesh.faces) for o in objects)
-    if total > MAX_TRIANGLES:
-        name = max(objects, key=lambda o: len(o.mesh.faces)).name
-        raise UserError(f"{file} has {total} triangles, most in {name!r}; simplify it to {MAX_TRIANGLES} or fewer")
-
-
-def _parts(objects: Sequence[FileObject], slabs: Sequence[Slab]) -> tuple[Part, ...]:
+def _parts(objects: Sequence[RoomObject]) -> tuple[Part, ...]:
     corners = np.concatenate([o.mesh.bounds for o in objects])
     bounds = np.stack([corners.min(0), corners.max(0)])
     meshes = [outward(o.mesh) if is_solid(o.mesh, bounds) else o.mesh for o in objects]
     return tuple(
-        Part(o.name, mesh, slab.material, slab.thickness, kind(mesh, bounds))
-        for o, mesh, slab in zip(objects, meshes, slabs, strict=True)
+        Part(o.name, mesh, o.slab.material, o.slab.thickness, kind(mesh, bounds))
+        for o, mesh in zip(objects, meshes, strict=True)
     )
-
-
-def _slabs(file: Path, objects: Sequence[FileObject], materials: Path | None) -> list[Slab]:
-    """Returns the material of every object: by its name in the .toml, by a pattern there, or what the file itself says."""
-    tables = _read_toml(materials) if materials is not None else {}
-    own = {name: _own_slab(name, table, f"{materials}") for name, table in tables.get("materials", {}).items()}
-    chosen = {pattern: _slab(value, own, f"{materials}: {pattern!r}") for pattern, value in tables.get("objects", {}).items()}
-    names = [o.name for o in objects]
-    for pattern in chosen:
-        if pattern not in names and not fnmatch.filter(names, pattern):
-            raise UserError(f"{materials}: {pattern!r} is no object of {file}; there are {_list(names)}")
-    found = [_choose(o, chosen, f"{file}: {o.name!r}") for o in objects]
-    without = [o.name for o, slab in zip(objects, found, strict=True) if slab is None]
-    if without:
-        where = f"{materials}" if materials is not None else "a .toml file given with --materials"
-        raise UserError(f"no material for {_list(without)} of {file}; name them under [objects] in {where} ({HELP})")
-    return [slab for slab in found if slab is not None]
-
-
-def _list(names: Sequence[str], most: int = 12) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(repr(name) for name in names[:most]) + more
-
-
-def _choose(found: FileObject, chosen: dict[str, Slab], where: str) -> Slab | None:
-    if found.name in chosen:
-        return chosen[found.name]
-    for pattern, slab in chosen.items():
-        if fnmatch.fnmatchcase(found.name, pattern):
-            return slab
-    if found.material is None:
-        return None
-    name, thickness, properties = found.material
-    if properties is not None:
-        permittivity, conductivity = properties
-        return Slab(own_material(name, Law(permittivity, 0.0, conductivity, 0.0)), _thickness(thickness, where))
-    return _slab({"material": name, "thickness": thickness}, {}, where)
-
-
-def _read_toml(file: Path) -> dict[str, dict[str, Any]]:
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {file}: {error.strerror}; give the .toml with the materials") from error
-    except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError
-        raise UserError(f"{file} is not valid TOML: {error}") from error
-    if not set(tables) <= {"objects", "materials"} or not all(isinstance(table, dict) for table in tables.values()):
-        raise UserError(f"{file} may hold the tables [objects] and [materials.<name>] and nothing else; {HELP}")
-    return tables
-
-
-def _own_slab(name: str, table: Any, where: str) -> Slab:
-    """Returns a user's own material.
-
-    Its relative permittivity and conductivity (S/m) are each a number, or [a, b] for a f^b with f in GHz.
-    """
-    keys = ("relative_permittivity", "conductivity", "thickness")
-    if not isinstance(table, dict) or set(table) != set(keys):
-        raise UserError(f"{where}: [materials.{name}] needs {', '.join(keys)} and nothing else; {HELP}")
-    laws = [table[key] if isinstance(table[key], list) else [table[key], 0] for key in keys[:2]]
-    if not all(len(law) == 2 and all(isinstance(value, int | float) for value in law) for law in laws):
-        raise UserError(f"{where}: [materials.{name}] is described by numbers, or [a, b] for a f^b with f in GHz")
-    return Slab(own_material(name, Law(*laws[0], *laws[1])), _thickness(table["thickness"], f"{where}: {name!r}"))
-
-
-def _slab(value: Any, own: dict[str, Slab], where: str) -> Slab:
-    """Returns the slab that `"name"` or `{material = "name", thickness = metres}` stands for."""
-    table = {"material": value} if isinstance(value, str) else value
-    if not isinstance(table, dict) or not isinstance(table.get("material"), str) or not set(table) <= {"material", "thickness"}:
-        raise UserError(f'{where} needs "material" or {{material = "...", thickness = metres}}; quote names that have a dot')
-    name = table["material"]
-    if name not in own and name not in ITU:
-        known = ", ".join(sorted({*own, *THICKNESS}))
-        raise UserError(f"{where} is of unknown material {name!r}; choose among {known} (more in {HELP.removeprefix('see ')})")
-    slab = own.get(name) or Slab(name, ITU[name].thickness)
-    return slab._replace(thickness=_thickness(table.get("thickness", slab.thickness), where))
-
-
-def _thickness(value: Any, where: str) -> float:
-    if not isinstance(value, int | float) or not 0 < value <= MAX_THICKNESS:
-        raise UserError(f"{where} has a thickness of {value}; give metres, more than 0 and at most {MAX_THICKNESS:g}")
-    return float(value)
 
 
 def parse_point(text: str, option: str) -> Vec3:

@@ -22,12 +22,12 @@ import numpy as np
 import sionna.rt as rt
 from jaxtyping import Complex, Float, Int
 
-from data_gen.materials import check_frequency
 from data_gen.public_solver import PublicTracer, public_material
 from data_gen.rays import RayLauncher
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
 from data_gen.trace import BalancedMaterial, DiffuseTracer, PathTracer
+from wbgs_jax.interchange.building_materials import check_frequency
 
 FAINT = 1e-15
 """Amplitude (-300 dB) below which a path is left out. Whether the simulator keeps a path whose power is a denormal number is

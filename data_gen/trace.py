@@ -22,12 +22,12 @@ from sionna.rt.path_solvers import sb_deterministic
 from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 from sionna.rt.radio_materials.itu import itu_material
 
-from data_gen.materials import own_law
 from data_gen.rays import RayLauncher
 from data_gen.scenes.base import Part, SceneSpec
 from data_gen.settings import SolverSettings
 from data_gen.utd import diffraction_matrix, end_unused_vertices
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.interchange.building_materials import own_law
 
 
 def electrical_constants(material: str) -> Callable[[Any], tuple[Any, Any]]:

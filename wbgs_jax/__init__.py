@@ -9,7 +9,7 @@ the host's modules. `__init__.pyi` lists them with their types; docs/api.md desc
   new model fits
 * splatting onto a receiver's hemisphere: `project`, `geometry_plan`, `render_splats`, `render_dense`
 * the antenna array: `planar_array`, `steering_vector`, `cbf`, `snapshot_to_pas`, `pas_directions`
-* data on the host: `load_dataset`, `load_scene`, `make_surface`, `make_mesh`, `surface_from_points`
+* data on the host: `load_dataset`, `load_scene`, `load_room`, `make_surface`, `make_mesh`, `surface_from_points`
 * a trained field: `load_trained`, `at_receiver`, `predictor`, `power_predictor`, `predict_many`, `predict_blocks`,
   `predict_map`, `map_queries`, `expected_ssim`, `expected_power`, `export_field`, `load_exported` (docs/inference.md)
 """

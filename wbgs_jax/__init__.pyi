@@ -20,6 +20,7 @@ from .applications.turning import boresight_quaternion as boresight_quaternion
 from .applications.turning import power_when_turned as power_when_turned
 from .applications.turning import turn_array as turn_array
 from .data.load import load_dataset as load_dataset
+from .data.room_file import load_room as load_room
 from .data.scene_file import load_scene as load_scene
 from .data.scene_file import save_scene as save_scene
 from .data.surface import make_mesh as make_mesh

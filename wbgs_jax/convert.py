@@ -1,10 +1,11 @@
-"""Hand a trained field to other programs, and their channels to a training:
+"""Hand a trained field to other programs, and their channels and rooms to a training:
 
 wbgs-jax convert --run RUN --tx x,y,z --ghz 28 --out gaussians.ply          Gaussians, for splat viewers
 wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths, as sionna.rt.Paths has them
 wbgs-jax convert --run RUN --grid LOW:HIGH:NXxNYxNZ --ghz 28 --out folder   a DeepMIMO scenario
 wbgs-jax convert --paths sionna.npz --array 4x4 --out scene.npz             paths of Sionna RT as a scene file
 wbgs-jax convert --paths scenario --ghz 28 --array 4x4 --out scene.npz      a DeepMIMO scenario as a scene file
+wbgs-jax convert room.glb --materials materials.toml --out data/room.npz    a model of a room, beside measured spectra
 """
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
@@ -14,7 +15,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -35,14 +36,22 @@ BRIGHT = 0.99
 
 @dataclass(frozen=True)
 class Command:
-    """Hand a trained field to other programs, and their channels to a training."""
+    """Hand a trained field to other programs, and their channels and rooms to a training."""
 
     out: Path
-    """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). From --paths: a scene file, .npz."""
+    """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). Else: a scene file or a room file, .npz."""
+    model: tyro.conf.Positional[Path | None] = None
+    """A model of a room: .glb, .gltf, .obj, .ply, or the .xml of Sionna RT; or ..."""
     run: Path | None = None
-    """Run folder, or ..."""
+    """... a run folder, or ..."""
     paths: Path | None = None
     """... paths of another program: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
+    materials: Path | None = None
+    """Of a model: a .toml with the materials of its objects (docs/own_scene.md); without it each is of its own."""
+    up: Literal["y", "z"] | None = None
+    """Of a model: the axis that points up, if not y in .glb and .gltf and z in others."""
+    scale: float | None = None
+    """Of a model: metres in one unit of it."""
     tx: tuple[str, ...] = ()
     """Of a run: transmitters, each as x,y,z in metres."""
     grid: str = ""
@@ -58,7 +67,7 @@ class Command:
     tx_antenna: int | None = None
     """Of --paths whose transmitters have several antennas: which one, 1, 2, ..."""
     mesh: Path | None = None
-    """Of --paths: the scene's surfaces, a .ply file in metres, which the coherent field needs."""
+    """Of --paths: the scene's surfaces, a room file or a model in metres, which the coherent field needs."""
     swap: bool = False
     """Of --paths: train for the other side: the transmitters' of Sionna RT, the users' of DeepMIMO."""
     tx_set: int | None = None
@@ -71,10 +80,13 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that cannot work."""
-    if (command.run is None) == (command.paths is None):
-        raise UserError("give either --run RUN, to hand a field on, or --paths FILE, to make a scene file of other paths")
-    if command.paths is not None and command.out.suffix != ".npz":
-        raise UserError(f"--out {command.out} does not end in .npz; a scene file does")
+    if [command.run, command.paths, command.model].count(None) != 2:
+        raise UserError(
+            "give one of --run RUN, to hand a field on, --paths FILE, to make a scene file of other paths, or a model such as "
+            "room.glb, to make a room file of it"
+        )
+    if command.run is None and command.out.suffix != ".npz":
+        raise UserError(f"--out {command.out} does not end in .npz; scene files and room files do")
     if command.run is None:
         return
     if bool(command.tx) == bool(command.grid) or command.ghz is None:
@@ -145,11 +157,11 @@ def _write_paths(
 def take_in(command: Command) -> str:
     """Writes a scene file of other programs' paths, and returns a line about it."""
     from wbgs_jax.data.other_files import check_kind
-    from wbgs_jax.data.ply import read_ply
     from wbgs_jax.data.scene_file import save_scene
     from wbgs_jax.interchange.deepmimo import is_deepmimo, load_deepmimo
     from wbgs_jax.interchange.plausible_paths import check_paths
     from wbgs_jax.interchange.ray_paths import read_paths
+    from wbgs_jax.interchange.rooms import open_room
     from wbgs_jax.interchange.scenes import scene_of_paths
     from wbgs_jax.interchange.sionna_arrays import DEFAULT, scene_of_sionna
     from wbgs_jax.radio.array import planar_array
@@ -159,20 +171,35 @@ def take_in(command: Command) -> str:
     if command.paths.is_file() and command.paths.suffix.lower() not in (".npz", ".mat"):
         check_kind(command.paths)
         raise UserError(f"{command.paths} is of no known kind; give an .npz with Sionna's arrays, or a DeepMIMO scenario")
-    vertices, faces = (None, None) if command.mesh is None else read_ply(command.mesh)
+    room = None if command.mesh is None else open_room(command.mesh)
     shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
     if is_deepmimo(command.paths):
         paths = load_deepmimo(command.paths, hertz, command.tx_set, command.tx_index, command.rx_set)
         check_paths(paths, str(command.paths))
         paths = paths if command.swap else paths.reversed()
-        scene = scene_of_paths([paths], planar_array(*(shape or DEFAULT)), name, vertices, faces)
+        scene = scene_of_paths([paths], planar_array(*(shape or DEFAULT)), name, room=room)
     else:
         choice = shape, command.port, command.tx_antenna, command.swap
-        scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, vertices, faces, str(command.paths))
+        scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, room, str(command.paths))
     save_scene(command.out, scene)
     heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
     count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
     return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {shlex.quote(str(command.out))}"
+
+
+def take_room(command: Command) -> str:
+    """Writes a room file of a model, lists its objects, and returns a line about it."""
+    from wbgs_jax.data.room_file import save_room
+    from wbgs_jax.interchange.rooms import describe_room, read_room, room_of
+
+    assert command.model is not None, "checked"
+    objects = read_room(command.model, command.materials, command.up, command.scale, named=False)
+    room = room_of(objects)
+    save_room(command.out, room)
+    say(describe_room(objects, ["closed" if one.mesh.is_watertight else "sheet" for one in objects]))
+    low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (room.vertices.min(0), room.vertices.max(0)))
+    beside = "it belongs into a folder of spectra, as room.npz, or beside snapshots (docs/own_scene.md)"
+    return f"room: {command.out} ({len(objects)} objects from ({low}) to ({high}) m); {beside}"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -181,7 +208,8 @@ def main(arguments: list[str] | None = None) -> None:
     check(command)
     check_writable(command.out if command.out.suffix else command.out / "scenario")
     use_compilation_cache()
-    say(take_in(command) if command.run is None else hand_on(command))
+    job = take_in if command.paths is not None else take_room if command.run is None else hand_on
+    say(job(command))
 
 
 if __name__ == "__main__":

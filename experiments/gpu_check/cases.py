@@ -30,8 +30,8 @@ from wbgs_jax.training.run_folder import RunConfig, TrainedField
 ON_THE_HOST = frozenset(
     """
     arrivals_anywhere arrivals_of as_deepmimo at_receiver cell_means choose_beams export_field from_arrivals
-    from_deepmimo from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings load_scene
-    load_trained load_walls locator make_mesh make_query make_receiver make_surface map_queries measure_limits
+    from_deepmimo from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings load_room
+    load_scene load_trained load_walls locator make_mesh make_query make_receiver make_surface map_queries measure_limits
     pas_directions place_reflector planar_array power_at_users power_predictor power_when_turned predict_blocks
     predict_many predict_map predictor pytree rank_beams read_deepmimo read_gaussians register save_paths
     save_scene scene_of_paths scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers

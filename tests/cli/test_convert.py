@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import trimesh
 from commands import assert_error_for_people, call
 from untrained import make_coherent_run, make_run
 
 from wbgs_jax import convert as convert_command
 from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.room_file import load_room
 from wbgs_jax.interchange.deepmimo import read_deepmimo
 from wbgs_jax.interchange.gaussian_ply import read_gaussians
 from wbgs_jax.interchange.ray_paths import load_paths
@@ -51,10 +53,46 @@ def test_paths_out_and_in_again(runs, tmp_path):
     np.testing.assert_allclose(one.snapshots, other.snapshots, rtol=1e-2, atol=1e-3 * np.abs(one.snapshots).max())
 
 
+def test_a_model_becomes_a_room_beside_spectra(tmp_path):
+    """A building model: slabs as closed boxes, y up, in millimetres, with materials by name."""
+    model = trimesh.Scene()
+    for name, low, high in (
+        ("floor", (0, 0, -0.2), (8, 5, 0)), ("wall_a", (0, 0, 0), (8, 0.2, 2.7)), ("wall_b", (7.9, 0.2, 0), (8, 5, 2.7)),
+        ("desk", (2, 2, 0.7), (3.4, 2.8, 0.73)),
+    ):  # fmt: skip
+        model.add_geometry(trimesh.creation.box(bounds=1000 * np.array([low, high])), node_name=name, geom_name=name)
+    model.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    model.export(tmp_path / "hall.glb")
+    (tmp_path / "m.toml").write_text(
+        '[objects]\n"wall*" = "brick"\nwall_b = { material = "glass", thickness = 0.01 }\n"*" = "concrete"\ndesk = "wood"\n'
+    )
+    options = "--materials", tmp_path / "m.toml", "--scale", 0.001, "--out", tmp_path / "room.npz"
+    listing = convert(tmp_path / "hall.glb", *options)
+    assert "wall_a  brick     0.2 m   sheet, of a closed box 0.2 m deep  2 triangles" in listing
+    assert "desk    wood      0.03 m  closed" in listing, "a name takes precedence over a pattern"
+    assert "4 objects from (0, 0, 0) to (8, 5, 2.7) m" in listing
+    room = load_room(tmp_path / "room.npz")
+    assert [(part["material"], part["thickness"]) for part in room.parts] == [
+        ("wood", 0.03), ("concrete", 0.2), ("brick", 0.2), ("glass", 0.01)
+    ]  # fmt: skip
+    unknown = convert(tmp_path / "hall.glb", "--scale", 0.001, "--out", tmp_path / "other.npz")
+    assert "desk    desk    of unknown thickness" in unknown
+    np.testing.assert_array_equal(load_room(tmp_path / "other.npz").vertices, room.vertices)
+
+
+def test_a_model_without_an_answer(tmp_path):
+    (tmp_path / "a.blend").write_bytes(b"BLENDER")
+    refused = call(convert_command.main, str(tmp_path / "a.blend"), "--out", str(tmp_path / "room.npz"))
+    assert_error_for_people(refused, "a.blend", "Blender's own form", "glTF")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--out", "a.ply"], ["--run", "--paths"]),
+        (["--out", "a.ply"], ["--run", "--paths", "room.glb"]),
+        (["room.glb", "--run", "RUN", "--out", "a.npz"], ["one of --run"]),
+        (["room.glb", "--out", "a.ply"], ["a.ply does not end in .npz"]),
+        (["room.glb", "--out", "a.npz"], ["there is no scene file room.glb"]),
         (["--run", "RUN", "--out", "a.ply"], ["--tx", "--ghz 28"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.obj"], ["a.obj", "gaussians.ply"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["knows no paths"]),

@@ -16,6 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, scene_dataset
 from wbgs_jax.data.layout import NOMINAL_FREQUENCY_HZ, export_layout, load_layout, mesh_to_world, world_to_mesh
 from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.room_file import Room, save_room
 from wbgs_jax.data.scene_file import SceneFile, save_scene
 from wbgs_jax.radio.array import planar_array
 
@@ -83,6 +84,20 @@ def test_the_mesh_turns_from_z_up_to_y_up(folder):
     dataset = load_layout(folder)
     assert dataset.vertices.tolist() == [[1, 3, -2], [4, 6, -5], [7, 10, -8]]
     assert dataset.faces.tolist() == [[0, 1, 2]]
+
+
+def test_a_room_lies_in_the_frame_of_the_transmitters(folder, rng):
+    room = Room(
+        rng.normal(size=(4, 3)).astype(np.float32), np.array([[0, 1, 2], [1, 2, 3]], np.int32), np.array([0, 1], np.int32)
+    )
+    save_room(folder / "room.npz", dataclasses.replace(room, parts=[{"name": n, "material": n, "thickness": 0} for n in "ab"]))
+    with pytest.raises(UserError, match=r"both point_cloud.ply and room.npz; keep the one"):
+        load_layout(folder)
+    (folder / "point_cloud.ply").unlink()
+    dataset = load_layout(folder)
+    np.testing.assert_array_equal(dataset.vertices, room.vertices)
+    np.testing.assert_array_equal(dataset.face_part, [0, 1])
+    assert dataset.materials.names == ("a 0", "b 0") and dataset.materials.material.tolist() == [0, 1]
 
 
 def test_mesh_frames_are_each_other_s_inverse(rng):

@@ -65,7 +65,7 @@ def test_the_guide_shows_the_example():
 
 
 def test_the_guide_lists_every_material():
-    from data_gen.materials import ITU
+    from wbgs_jax.interchange.building_materials import ITU
 
     text = GUIDE[GUIDE.index("The materials of ITU-R P.2040") :]
     for name, (thickness, low, _) in ITU.items():
@@ -202,13 +202,13 @@ def test_flaws_of_a_scene_of_the_simulator_are_warnings(tmp_path):
 
 
 def test_many_objects_are_not_all_described(tmp_path, monkeypatch):
-    monkeypatch.setattr("data_gen.own_scene.SHOWN", 3)
+    monkeypatch.setattr("wbgs_jax.interchange.rooms.SHOWN", 3)
     lines = describe(load()).splitlines()
     assert len(lines) == 4 and lines[-1] == "... and 7 smaller objects" and any("table" in line for line in lines)
 
 
 def test_too_many_triangles(tmp_path, monkeypatch):
-    monkeypatch.setattr("data_gen.own_scene.MAX_TRIANGLES", 80)
+    monkeypatch.setattr("wbgs_jax.interchange.rooms.MAX_TRIANGLES", 80)
     refused("has 98 triangles, most in 'table'")
 
 

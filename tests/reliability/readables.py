@@ -26,6 +26,7 @@ from wbgs_jax._util.yaml_files import read_yaml
 from wbgs_jax.data import load_dataset, save_scene
 from wbgs_jax.data.layout import export_layout
 from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.room_file import Room, load_room, save_room
 from wbgs_jax.inference.confidence import read_confidence, read_power_confidence
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.neighbours import read_neighbours
@@ -120,6 +121,12 @@ def _make_readings(folder: Path) -> None:
     )
     (folder / "receivers.csv").write_text("id,x,y,z\na,0,0,2\nb,5,5,2.5\n")
     (folder / "README.md").write_text("# Data\n\nLicence: CC BY 4.0\n")
+
+
+def _make_room_file(folder: Path) -> None:
+    box = trimesh.creation.box()
+    parts = [{"name": "box", "material": "wood", "thickness": 0.02}]
+    save_room(folder / "room.npz", Room(np.float32(box.vertices), np.int32(box.faces), np.zeros(12, np.int32), parts))
 
 
 def _make_rssi(folder: Path) -> None:
@@ -280,5 +287,6 @@ READABLES: dict[str, Readable] = {
     "room in OBJ": Readable(lambda f: _make_room(f, ".obj"), lambda f: _read_room(f, ".obj")),
     "room in GLB": Readable(lambda f: _make_room(f, ".glb"), lambda f: _read_room(f, ".glb"), "room.glb"),
     "room in Mitsuba's XML": Readable(_make_xml, lambda f: _read_room(f, ".xml")),
+    "room file": Readable(_make_room_file, lambda f: load_room(f / "room.npz")),
     "batch of the generator": Readable(_make_batch, lambda f: batches._load(f / "0000.npz")),
 }

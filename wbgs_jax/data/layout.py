@@ -6,10 +6,12 @@
                                  frequency (GHz), convention (of the spectra)
     freq.txt                     optional: one frequency (GHz) a spectrum
     train_, test_index.txt       optional: image names without .png, zero-padded or not; beside them validation_index.txt
-    point_cloud.ply              optional: the surface
+    point_cloud.ply              optional: the surface, or ...
+    room.npz                     ... optional: a room with its objects and materials (`wbgs-jax convert room.glb`)
 
-Frames: transmitters and receiver share the world frame. The mesh is z-up while that frame is y-up: a mesh point (x, y, z)
-lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed, of unknown element pattern.
+Frames: transmitters and receiver share the world frame, and room.npz is in it. The mesh is z-up while that frame is y-up: a
+mesh point (x, y, z) lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed, of
+unknown element pattern.
 
     python -m wbgs_jax.data.layout SCENE.npz FOLDER      writes a scene file as such a folder
 """
@@ -36,8 +38,9 @@ from wbgs_jax._util.files import read_text, safe_name
 from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.gateway import Gateway, ghz_to_hz, read_gateway, vector
-from wbgs_jax.data.load import scene_dataset
+from wbgs_jax.data.load import materials_of, scene_dataset
 from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.room_file import Room, load_room
 from wbgs_jax.data.scene_file import SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
@@ -53,7 +56,8 @@ DIGITS = 9
 NOMINAL_FREQUENCY_HZ = 1e9
 """Stands for the frequency of a folder that names none: without a mesh, a model of one frequency only needs some constant."""
 
-SPECTRA, POSITIONS, GATEWAY, FREQUENCIES, MESH = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt", "point_cloud.ply"
+SPECTRA, POSITIONS, GATEWAY, FREQUENCIES = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt"
+MESH, ROOM = "point_cloud.ply", "room.npz"
 INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
 
 
@@ -81,8 +85,7 @@ def load_layout(
     positions = _read_positions(folder / POSITIONS, len(images))
     gateway = read_gateway(folder / GATEWAY)
     tx_index = group_transmitters(positions)
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-    vertices, faces = read_ply(folder / MESH) if (folder / MESH).exists() else nothing
+    room = _read_room(folder)
     if any((folder / name).exists() for name in INDEX.values()):
         split = _read_split(folder, tx_index)
     else:
@@ -94,15 +97,19 @@ def load_layout(
         name=gateway.name or safe_name(folder.resolve().name),
         receivers=stack_receivers([receiver]),
         tx_positions=positions,
-        frequencies_hz=_read_frequencies(folder / FREQUENCIES, len(images), frequency_hz, gateway.frequency_hz, len(faces) > 0),
+        frequencies_hz=_read_frequencies(
+            folder / FREQUENCIES, len(images), frequency_hz, gateway.frequency_hz, len(room.faces) > 0
+        ),
         receiver_index=np.zeros(len(images), int),
         tx_index=tx_index,
         train=split["train"],
         validation=split["validation"],
         test=split["test"],
         images=to_pas(images, named),
-        vertices=mesh_to_world(vertices),
-        faces=faces,
+        vertices=room.vertices,
+        faces=room.faces,
+        face_part=room.face_part if room.parts else None,
+        materials=materials_of(room, str(folder / ROOM)),
         convention=named,
     )
 
@@ -152,6 +159,17 @@ def world_to_mesh(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Returns the inverse of `mesh_to_world`: (x, y, z) -> (x, -z, y)."""
     x, y, z = points.T
     return np.stack([x, -z, y], -1)
+
+
+def _read_room(folder: Path) -> Room:
+    """Returns the surfaces of a folder, in the frame of its transmitters; without a triangle where it has points or nothing."""
+    mesh, room = folder / MESH, folder / ROOM
+    if room.exists():
+        if mesh.exists():
+            raise UserError(f"{folder} has both {MESH} and {ROOM}; keep the one that shows the room as it was")
+        return load_room(room)
+    vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    return Room(mesh_to_world(vertices), faces, np.zeros(len(faces), np.int32))
 
 
 def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:

@@ -13,6 +13,7 @@ from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.join import join
 from wbgs_jax.data.other_files import check_kind
+from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.radio.channel import NOT_HEARD_DB
@@ -99,7 +100,7 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         vertices=scene.vertices,
         faces=scene.faces,
         face_part=scene.face_part,
-        materials=_materials(scene),
+        materials=materials_of(Room(scene.vertices, scene.faces, scene.face_part, scene.meta.get("parts", [])), scene.name),
     )
 
 
@@ -133,18 +134,18 @@ def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
     return np.ones(scene.observations.shape[:3], bool) if scene.snapshots is None else ~np.isnan(scene.snapshots).all(-1)
 
 
-def _common(labels: list[tuple[str, float]], scene: SceneFile) -> list[tuple[str, float]]:
+def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tuple[str, float]]:
     """Returns the labels of parts with at most `MOST_MATERIALS` of them, the largest by area, and one for the others of every
     thickness: where each object is of a material of its own, searching them all takes hours."""
     kinds = sorted(set(labels))
     if len(kinds) <= MOST_MATERIALS:
         return labels
-    a, b, c = np.moveaxis(scene.vertices[scene.faces].astype(np.float64), 1, 0)
-    of_face = np.array([kinds.index(label) for label in labels])[scene.face_part]
+    a, b, c = np.moveaxis(room.vertices[room.faces].astype(np.float64), 1, 0)
+    of_face = np.array([kinds.index(label) for label in labels])[room.face_part]
     area = np.bincount(of_face, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(kinds))
     largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:MOST_MATERIALS]}
     warnings.warn(
-        f"{scene.name} names {len(kinds)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
+        f"{name} names {len(kinds)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
         stacklevel=3,
     )
     return [label if label in largest else (REST, label[1]) for label in labels]
@@ -160,15 +161,15 @@ def _receivers(scene: SceneFile) -> list[Receiver]:
     ]
 
 
-def _materials(scene: SceneFile) -> Materials | None:
-    """Returns what the triangles are made of: parts of one material and thickness share a material, and of very many materials
-    the smaller ones do. None if the file does not name its parts; what is no part is a `UserError`."""
-    parts = scene.meta.get("parts", [])
-    if not isinstance(parts, list) or len(parts) <= int(scene.face_part.max(initial=-1)):
+def materials_of(room: Room, name: str) -> Materials | None:
+    """Returns what triangles are made of: objects of one material and thickness share a material, and of very many materials
+    the smaller ones do. None if not all objects are named; what is no object is a `UserError` that names `name`."""
+    parts = room.parts
+    if not isinstance(parts, list) or len(parts) <= int(room.face_part.max(initial=-1)):
         if parts:
-            warnings.warn(f"{scene.name} does not name all of its parts: they are taken to be of one material", stacklevel=2)
+            warnings.warn(f"{name} does not name all of its parts: they are taken to be of one material", stacklevel=2)
         return None
-    labels = _common([_label(part, i, scene.name) for i, part in enumerate(parts)], scene)
+    labels = _common([_label(part, i, name) for i, part in enumerate(parts)], room, name)
     kinds = sorted(set(labels))
-    material = np.array([kinds.index(label) for label in labels], np.int32)[scene.face_part]
-    return Materials(material, tuple(f"{name} {thickness:g}" for name, thickness in kinds), np.array([t for _, t in kinds]))
+    material = np.array([kinds.index(label) for label in labels], np.int32)[room.face_part]
+    return Materials(material, tuple(f"{label} {thickness:g}" for label, thickness in kinds), np.array([t for _, t in kinds]))

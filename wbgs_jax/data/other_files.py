@@ -6,7 +6,7 @@ from wbgs_jax._util.errors import UserError
 
 SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
 PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
-ROOM = "it holds a room: data_gen makes spectra for it (docs/own_scene.md)"
+ROOM = "`wbgs-jax convert` makes a room of it beside measured data, data_gen makes spectra for it (docs/own_scene.md)"
 KINDS = {
     ".h5": ("of HDF5", SNAPSHOTS),
     ".hdf5": ("of HDF5", SNAPSHOTS),

@@ -31,6 +31,8 @@ ARRAYS: dict[str, Spec] = {
     "split": (np.int8, ("tx",)),
 }
 """... and all of these, ..."""
+MESH = ("vertices", "faces", "face_part")
+"""Those of the surfaces."""
 TEXTS = ("element_unit", "element_pattern")
 """... and these, arrays of text."""
 
@@ -45,14 +47,32 @@ def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
         kind = _kind(arrays)
         specs = {kind: OBSERVATIONS[kind], **ARRAYS}
         sizes = _sizes(arrays, specs)
+        _demand(all(sizes[axis] > 0 for axis in ("tx", "rx", "freq", "elements")), "there is no link in it")
         _check_values(arrays, sizes["vertices"])
         _check_texts(arrays, sizes["rx"])
-        with np.errstate(over="ignore", invalid="ignore"):  # the next line tells what has become infinite
-            cast = {key: arrays[key].astype(dtype, copy=False) for key, (dtype, _) in specs.items()}
+        cast = _cast(arrays, specs)
         _check_values(cast, sizes["vertices"])
     except _Wrong as error:
         raise UserError(f"{where}: {error}; mend the scene or make it again (docs/formats.md)") from None
     return cast | {key: arrays[key] for key in TEXTS}
+
+
+def check_mesh(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """Returns the arrays of surfaces (`MESH`) in their dtypes, or raises a `UserError` that starts with `where`."""
+    specs = {key: ARRAYS[key] for key in MESH}
+    try:
+        count = _sizes(arrays, specs)["vertices"]
+        _check_surfaces(arrays, count)
+        cast = _cast(arrays, specs)
+        _check_surfaces(cast, count)
+    except _Wrong as error:
+        raise UserError(f"{where}: {error}; mend the mesh or make it again (docs/formats.md)") from None
+    return cast
+
+
+def _cast(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, np.ndarray]:
+    with np.errstate(over="ignore", invalid="ignore"):  # what has become infinite is found afterwards
+        return {key: arrays[key].astype(dtype, copy=False) for key, (dtype, _) in specs.items()}
 
 
 class _Wrong(Exception):
@@ -84,32 +104,42 @@ def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, i
         expected = tuple(sizes.get(axis, n) if isinstance(axis, str) else axis for axis, n in lengths)
         _demand(value.shape == expected, f"{key} has shape {value.shape}, expected {expected} beside the other arrays")
         sizes |= {axis: n for axis, n in lengths if isinstance(axis, str)}
-    _demand(all(sizes[axis] > 0 for axis in ("tx", "rx", "freq", "elements")), "there is no link in it")
     return sizes
 
 
+def _check_surfaces(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
+    _check_positions(arrays, "vertices")
+    faces = arrays["faces"]
+    _demand((arrays["face_part"] >= 0).all(), "face_part must not be negative")
+    _demand(((faces >= 0) & (faces < n_vertices)).all(), "faces point at vertices that do not exist")
+
+
+def _check_positions(arrays: dict[str, np.ndarray], key: str) -> None:
+    _demand(np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
+    largest = np.abs(arrays[key]).max(initial=0)
+    _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres, from a place on the site")
+
+
 def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
-    for key in ARRAYS:
+    for key in ("tx_positions", "rx_position", "element_positions"):
+        _check_positions(arrays, key)
+    for key in ("rx_orientation", "frequencies_hz"):
         _demand(np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
+    _check_surfaces(arrays, n_vertices)
     if (snapshots := arrays.get("snapshots")) is not None:
         known, nothing = np.isfinite(snapshots).all(-1), np.isnan(snapshots).all(-1)
         _demand((known | nothing).all(), "snapshots contains infinity, or NaN in some elements of a link alone")
         _demand(known.any(), "snapshots contains NaN alone")
     if (power := arrays.get("power_db")) is not None:
         _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
-    for key in ("tx_positions", "rx_position", "element_positions", "vertices"):
-        largest = np.abs(arrays[key]).max(initial=0)
-        _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres, from a place on the site")
     lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
     band = f"the model knows {LOWEST_FREQUENCY_HZ:g} to {HIGHEST_FREQUENCY_HZ:g} Hz"
     _demand(lowest > 0, "frequencies_hz must be positive")
     _demand(lowest >= LOWEST_FREQUENCY_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz, and {band}")
     _demand(highest <= HIGHEST_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz, and {band}")
-    _demand((arrays["face_part"] >= 0).all(), "face_part must not be negative")
     split = np.isin(arrays["split"], (TRAIN, TEST, VALIDATION))
     _demand(split.all(), "split must hold 0 (train), 1 (test) and 2 (validation) only")
-    faces, lengths = arrays["faces"], np.linalg.norm(arrays["rx_orientation"], axis=-1)
-    _demand(((faces >= 0) & (faces < n_vertices)).all(), "faces point at vertices that do not exist")
+    lengths = np.linalg.norm(arrays["rx_orientation"], axis=-1)
     _demand((np.abs(lengths - 1) < 1e-3).all(), "rx_orientation must hold unit quaternions (wxyz)")
 
 

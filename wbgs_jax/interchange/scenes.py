@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile
 from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
 from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
@@ -22,6 +23,7 @@ def scene_of_paths(
     vertices: Float[np.ndarray, "vertices 3"] | None = None,
     faces: np.ndarray | None = None,
     seed: int = 0,
+    room: Room | None = None,
 ) -> SceneFile:
     """Returns a scene of paths between the same places at one frequency or several: snapshots of an array at every receiver,
     whose local frame is the world's. A fifth of the transmitters is for the test.
@@ -35,6 +37,7 @@ def scene_of_paths(
         vertices: of the scene's surfaces, metres; none by default.
         faces: triangles.
         seed: of the split.
+        room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
 
     Raises:
         UserError: places are not known or differ, or there are too few transmitters.
@@ -56,7 +59,7 @@ def scene_of_paths(
     frequencies = np.array([paths[i].frequency_hz for i in order])
     level = np.tile([1.0, 0, 0, 0], (len(first.targets), 1))
     return scene_of_snapshots(
-        snapshots, first.sources, frequencies, first.targets, level, element_positions, name, vertices, faces, seed
+        snapshots, first.sources, frequencies, first.targets, level, element_positions, name, vertices, faces, seed, room
     )
 
 
@@ -71,6 +74,7 @@ def scene_of_snapshots(
     vertices: Float[np.ndarray, "vertices 3"] | None = None,
     faces: np.ndarray | None = None,
     seed: int = 0,
+    room: Room | None = None,
 ) -> SceneFile:
     """Returns a scene of measured array snapshots, to be written with `save_scene`. A fifth of the transmitters is for the
     test.
@@ -87,6 +91,7 @@ def scene_of_snapshots(
         vertices: of the scene's surfaces, metres; none by default.
         faces: triangles.
         seed: of the split.
+        room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
 
     Raises:
         UserError: there are too few transmitters, or the shapes do not agree.
@@ -103,7 +108,7 @@ def scene_of_snapshots(
         raise UserError(f"{name} has {places} transmitters, and a training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
     split[tx_disjoint_split(transmitter, TEST_SHARE, seed)[1]] = TEST
-    known = faces is not None and vertices is not None
+    surfaces = room or _one_surface(vertices, faces)
     return SceneFile(
         name=name,
         tx_positions=tx_positions,
@@ -111,13 +116,21 @@ def scene_of_snapshots(
         rx_position=rx_position,
         rx_orientation=rx_orientation,
         element_positions=np.tile(element_positions, (receivers, 1, 1)),
-        vertices=np.asarray(vertices if known else np.zeros((0, 3)), np.float32),
-        faces=np.asarray(faces if known else np.zeros((0, 3)), np.int32),
-        face_part=np.zeros(0 if faces is None or not known else len(faces), np.int32),
+        vertices=surfaces.vertices,
+        faces=surfaces.faces,
+        face_part=surfaces.face_part,
         split=split,
         snapshots=np.asarray(snapshots, np.complex64),
-        meta={"parts": [{"name": "surface", "material": "unknown", "thickness": 0}]} if known else {},
+        meta={"parts": surfaces.parts} if surfaces.parts else {},
     )
+
+
+def _one_surface(vertices: np.ndarray | None, faces: np.ndarray | None) -> Room:
+    """Returns surfaces of which nothing else is known; none where there are no triangles."""
+    if vertices is None or faces is None:
+        return Room(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
+    part = {"name": "surface", "material": "unknown", "thickness": 0}
+    return Room(np.asarray(vertices, np.float32), np.asarray(faces, np.int32), np.zeros(len(faces), np.int32), [part])
 
 
 def snapshots_of(paths: RayPaths, element_positions: Float[np.ndarray, "elements 3"]) -> Complex[np.ndarray, "t r elements"]:

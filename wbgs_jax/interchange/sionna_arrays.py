@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import SceneFile
 from wbgs_jax.interchange.plausible_paths import check_paths
 from wbgs_jax.interchange.ray_paths import (
@@ -58,8 +59,7 @@ def scene_of_sionna(
     port: int | None = None,
     tx_antenna: int | None = None,
     swap: bool = False,
-    vertices: Float[np.ndarray, "vertices 3"] | None = None,
-    faces: np.ndarray | None = None,
+    room: Room | None = None,
     source: str = "",
 ) -> SceneFile:
     """Returns the snapshots that the receivers' arrays take of every transmitter, as a scene to train on.
@@ -74,8 +74,7 @@ def scene_of_sionna(
         port: of antennas with two polarisations: 1 or 2.
         tx_antenna: of transmitters with several antennas: 1, 2, ...
         swap: whether to train for the transmitters' side.
-        vertices: of the scene's surfaces, metres.
-        faces: triangles.
+        room: the scene's surfaces (`load_room`).
         source: what errors call the paths; by default the name of the scene.
 
     Raises:
@@ -95,13 +94,13 @@ def scene_of_sionna(
     if arrays["a"].ndim < ARRAYS:
         single = from_sionna(arrays, frequency_hz)
         check_paths(single, what)
-        return scene_of_paths([single], planar_array(*(shape or DEFAULT)), name, vertices, faces)
+        return scene_of_paths([single], planar_array(*(shape or DEFAULT)), name, room=room)
     sent = _chosen(arrays["a"].shape[3], tx_antenna, f"the transmitters of {what} have", "--tx-antenna")
     chosen, shape = _elements(arrays["a"], shape, port, what)
     first = from_sionna(arrays, frequency_hz, antennas=(int(chosen[0]), sent))
     check_paths(first, what)
     if len(chosen) == 1:
-        return scene_of_paths([first], planar_array(*(shape or DEFAULT)), name, vertices, faces)
+        return scene_of_paths([first], planar_array(*(shape or DEFAULT)), name, room=room)
     a, tau, direction = _of_antennas(arrays, chosen, sent)
     valid = np.isfinite(a) & (tau >= 0)
     snapshots = np.where(valid, a * carrier(first.frequency_hz, tau), 0).sum(-1)  # receiver, antenna, transmitter
@@ -122,8 +121,7 @@ def scene_of_sionna(
         np.stack([one.orientation for one in devices]),
         devices[0].elements,
         name,
-        vertices,
-        faces,
+        room=room,
     )
 
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from data_gen import materials
-from data_gen.materials import Law, check_material_frequencies, own_law, own_material
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.interchange import building_materials as materials
+from wbgs_jax.interchange.building_materials import Law, check_material_frequencies, own_law, own_material
 
 
 def test_materials_of_the_released_scenes_cover_the_whole_band():

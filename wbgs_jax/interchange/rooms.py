@@ -1,0 +1,136 @@
+"""A room as a user's own file has it: its objects, what they are made of, and walls with two faces as one sheet."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.room_file import Room, load_room
+from wbgs_jax.interchange.material_files import Slab, slabs_of
+from wbgs_jax.interchange.room_files import FileObject, read_objects
+from wbgs_jax.interchange.walls import walls_as_sheets
+
+EXTENT = (0.5, 200.0)
+"""Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody gives it, ..."""
+GIVEN_EXTENT = (0.01, 20_000.0)
+"""... and then in between these. A scene.xml of Sionna RT is always in metres."""
+USUAL = 10.0
+"""Metres: the usual size of a room, to guess a unit from."""
+MAX_TRIANGLES = 2_000_000
+MANY_TRIANGLES = 20_000
+"""From so many on, paths take long to find, and furniture in such detail changes none."""
+SHOWN = 40
+"""Objects that are described."""
+UNKNOWN = 0.0
+"""Thickness that a room file gives what nobody has measured."""
+
+
+@dataclass(frozen=True)
+class RoomObject:
+    """An object of a room: metres, z up."""
+
+    name: str
+    mesh: trimesh.Trimesh
+    slab: Slab
+    wall: float = 0.0
+    """Metres between the two faces of the closed box that the sheet was; 0 for all else."""
+
+
+def read_room(
+    file: Path, materials: Path | None = None, up: str | None = None, scale: float | None = None, named: bool = True
+) -> list[RoomObject]:
+    """Returns the objects of a room in order of their names.
+
+    Closed boxes that are walls become sheets of the box's thickness, unless the materials give another for the object. Shapes
+    of a scene.xml stay as they are: the simulator that wrote it counts every face.
+
+    Args:
+        file: .glb, .gltf, .obj, .ply or .xml.
+        materials: a .toml (docs/own_scene.md).
+        up: "y" or "z": the axis of the file that points up, where it is not the usual one.
+        scale: metres in one unit of the file; without it the unit is the metre, and sizes that make one doubt it are refused.
+        named: whether all objects must have a material; otherwise, without `materials`, each is of its own, of unknown
+            thickness.
+
+    Raises:
+        UserError: the file or the materials cannot be read, or the size is not that of a room.
+    """
+    objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
+    _check_size(file, objects, GIVEN_EXTENT if simulated or scale is not None else EXTENT)
+    if named or materials is not None or simulated:
+        slabs = slabs_of(file, objects, materials)
+    else:
+        slabs = [Slab(one.name, UNKNOWN) for one in objects]
+    found = [RoomObject(one.name, one.mesh, slab) for one, slab in zip(objects, slabs, strict=True)]
+    if simulated:
+        return found
+    meshes, walls = walls_as_sheets([one.mesh for one in found])
+    return [_as_wall(one, mesh, wall) for one, mesh, wall in zip(found, meshes, walls, strict=True)]
+
+
+def room_of(objects: Sequence[RoomObject]) -> Room:
+    """Returns what a room file holds of some objects."""
+    starts = np.cumsum([0, *(len(one.mesh.vertices) for one in objects)])
+    faces = [np.asarray(one.mesh.faces) + start for one, start in zip(objects, starts, strict=False)]
+    return Room(
+        vertices=np.concatenate([one.mesh.vertices for one in objects]).astype(np.float32),
+        faces=np.concatenate(faces).astype(np.int32),
+        face_part=np.repeat(np.arange(len(objects), dtype=np.int32), [len(own) for own in faces]),
+        parts=[{"name": one.name, "material": one.slab.material, "thickness": one.slab.thickness} for one in objects],
+    )
+
+
+def open_room(path: Path) -> Room:
+    """Returns the room of a room file or a scene file (.npz), or of a model in metres whose materials are not known."""
+    return load_room(path) if path.suffix.lower() == ".npz" else room_of(read_room(path, named=False))
+
+
+def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
+    """Returns how objects were understood, a line each, of many those with most triangles: name, material, thickness, of which
+    sort it is (one for each object), number of triangles; and what walls were taken from closed boxes."""
+    largest = sorted(np.argsort([-len(one.mesh.faces) for one in objects], kind="stable")[:SHOWN])
+    rows = [_row(objects[i], sorts[i]) for i in largest]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    if len(rows) < len(objects):
+        lines.append(f"... and {len(objects) - len(rows)} smaller objects")
+    total = sum(len(one.mesh.faces) for one in objects)
+    if total > MANY_TRIANGLES:
+        lines.append(
+            f"warning: {total} triangles: simplify furniture and scans to some thousands before training (Blender: Decimate; "
+            "MeshLab: Quadric Edge Collapse)"
+        )
+    return "\n".join(lines)
+
+
+def _row(one: RoomObject, sort: str) -> tuple[str, ...]:
+    sort = f"sheet, of a closed box {one.wall:.2g} m deep" if one.wall else sort
+    thickness = f"{one.slab.thickness:g} m" if one.slab.thickness else "of unknown thickness"
+    return one.name, one.slab.material, thickness, sort, f"{len(one.mesh.faces)} triangles"
+
+
+def _as_wall(one: RoomObject, mesh: trimesh.Trimesh, wall: float) -> RoomObject:
+    slab = one.slab._replace(thickness=round(wall, 6)) if wall and not one.slab.given else one.slab
+    return replace(one, mesh=mesh, slab=slab, wall=wall)
+
+
+def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, float]) -> None:
+    corners = np.concatenate([o.mesh.bounds for o in objects])
+    size = np.ptp(corners, axis=0)
+    largest = float(size.max())
+    if not extent[0] <= largest <= extent[1]:
+        factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / USUAL)))
+        sides = " x ".join(f"{side:.4g}" for side in size)
+        raise UserError(
+            f"{file} measures {sides} m; give the metres in its unit, perhaps --scale {factor:g}, or --scale 1 if that is right"
+        )
+    total = sum(len(o.mesh.faces) for o in objects)
+    if total > MAX_TRIANGLES:
+        name = max(objects, key=lambda o: len(o.mesh.faces)).name
+        raise UserError(
+            f"{file} has {total} triangles, most in {name!r}; simplify it to {MAX_TRIANGLES} or fewer (Blender: Decimate; "
+            "MeshLab: Quadric Edge Collapse)"
+        )
