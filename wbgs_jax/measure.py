@@ -30,6 +30,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
 from wbgs_jax.evaluation.report import environment
+from wbgs_jax.inference.bounds import Bounds
 from wbgs_jax.measured.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
 from wbgs_jax.measured.held_out import COMPARED, NINETY, Score, scores
 from wbgs_jax.measured.pictures import draw
@@ -37,6 +38,8 @@ from wbgs_jax.measured.plausible import check_positions
 from wbgs_jax.measured.power_map import MAX_PLACES, PowerMap, learn_map, received_power
 from wbgs_jax.measured.readings import Readings, attribution, cell_means, load_readings
 
+BEYOND_M = 2.0
+"""How far from readings, receivers and walls an answer still has an interval: the next room, not the next building."""
 SUFFIXES = {"out": ".json", "picture": ".png", "answers": ".csv", "mesh": ".ply"}
 
 
@@ -109,13 +112,25 @@ def table(found: list[Score]) -> Table:
     return shown
 
 
-def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"]) -> list[list[str]]:
-    """Returns a header and a row a transmitter: its place, then mean and half of the 90 % interval at every receiver."""
+def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Bounds) -> list[list[str]]:
+    """Returns a header and a row a transmitter: its place, then mean and half of the 90 % interval at every receiver; NaN for
+    an interval outside of what was measured."""
     mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(places, jnp.float32)))
+    std = np.where(where.without_confidence(places)[:, None], np.nan, std)
     names = [f"{name}_{r + 1}" for r in range(mean.shape[1]) for name in ("dbm", "within_db")]
     pairs = np.stack([mean, NINETY * std], -1).reshape(len(places), -1)
     rows = [[*(f"{x:g}" for x in place), *(f"{x:.2f}" for x in row)] for place, row in zip(places, pairs, strict=True)]
     return [["x", "y", "z", *names], *rows]
+
+
+def measured_bounds(cells: Readings, walls: Walls) -> Bounds:
+    """Returns the box around readings, receivers and walls."""
+    points = np.concatenate([cells.places, cells.receivers])
+    low, high = points.min(0), points.max(0)
+    ends = np.asarray(walls.ends).reshape(-1, 2)
+    if len(ends):
+        low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
+    return Bounds("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
 
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
@@ -163,10 +178,17 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"about the data: {line}")
     learned = learn_map(cells, walls)
     if command.tx:
-        rows = answers(learned, places)
-        for row in rows[1:]:
-            heard = (f"{r + 1}: {row[3 + 2 * r]} ± {row[4 + 2 * r]}" for r in range(len(cells.receivers)))
-            print(f"TX ({', '.join(row[:3])}) m, mean dBm, 90 % within: receiver {', '.join(heard)}")
+        where = measured_bounds(cells, walls)
+        rows = answers(learned, places, where)
+        for row, outside in zip(rows[1:], where.without_confidence(places), strict=True):
+            if outside:
+                found = (f"{r + 1}: {row[3 + 2 * r]}" for r in range(len(cells.receivers)))
+                print(
+                    f"TX ({', '.join(row[:3])}) m, mean dBm: receiver {', '.join(found)}; outside of the readings: no interval"
+                )
+                continue
+            found = (f"{r + 1}: {row[3 + 2 * r]} ± {row[4 + 2 * r]}" for r in range(len(cells.receivers)))
+            print(f"TX ({', '.join(row[:3])}) m, mean dBm, 90 % within: receiver {', '.join(found)}")
         if command.answers:
             write_csv(command.answers, rows)
             say(f"answers: {command.answers}")

@@ -18,13 +18,15 @@ def test_scores_pictures_and_answers(tmp_path, rng):
         name: tmp_path / f"answer{suffix}" for name, suffix in (("out", ".json"), ("picture", ".png"), ("answers", ".csv"))
     }
     options = [word for name, path in files.items() for word in (f"--{name}", path)]
-    done = call(main, "--data", data, "--tx", "1,1,1.3", "7,1,1.3", *options)
+    done = call(main, "--data", data, "--tx", "1,1,1.3", "7,1,1.3", "500,1,1.3", *options)
     assert done.code == 0, done.err
     report = json.loads(files["out"].read_text())
     assert set(report["scores"]) == {"room_west", "room_east", "squares_of_1_m"}
     assert abs(report["law"]["first_wall_db"] - LAW[2]) < 2.5
     assert all(0.7 < score["within"] <= 1 for score in report["scores"].values())
     table = np.genfromtxt(files["answers"], delimiter=",", names=True)
+    assert np.isnan(table["within_db_1"][2]) and "outside of the readings: no interval" in done.out.splitlines()[2]
+    table = table[:2]
     expected = powers(np.array([[1, 1, 1.3], [7, 1, 1.3]]))
     assert np.abs(table["dbm_1"] - expected[:, 0]).max() < 6 and (table["within_db_1"] > 0).all()
     assert files["picture"].read_bytes()[:4] == b"\x89PNG"

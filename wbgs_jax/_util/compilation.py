@@ -28,7 +28,10 @@ PROGRAMS = "programs"
 def cache_folder() -> Path | None:
     """Returns the folder that commands keep programs in, `WBGS_CACHE` (~/.cache/wbgs-jax unless set); None where there is
     none."""
-    wanted = os.environ.get(VARIABLE, str(Path.home() / ".cache" / "wbgs-jax"))
+    try:
+        wanted = os.environ.get(VARIABLE) if VARIABLE in os.environ else str(Path.home() / ".cache" / "wbgs-jax")
+    except RuntimeError:  # a user without a home
+        wanted = None
     if not wanted:
         return None
     folder = Path(wanted) / _machine()

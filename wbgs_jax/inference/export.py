@@ -28,7 +28,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.inference.neighbours import correct, for_receiver
-from wbgs_jax.inference.predictor import Predictor, Trained, on_any_shape, trained_band
+from wbgs_jax.inference.predictor import OnAnyShape, Predictor, Trained, trained_band
 from wbgs_jax.types import Query, Receiver
 
 FORMAT = 1
@@ -133,7 +133,7 @@ def load_exported(path: Path | str) -> ExportedField:
             f"{path} was exported by jax {made} and jax {jax.__version__} cannot read it ({reason}); export it again"
         ) from error
     call = jax.jit(exported.call)
-    return ExportedField(metadata, on_any_shape(lambda query: call(query.tx_position, query.frequency_hz)))
+    return ExportedField(metadata, OnAnyShape(lambda query: call(query.tx_position, query.frequency_hz)))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes]:

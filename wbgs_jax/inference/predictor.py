@@ -115,7 +115,7 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
-    return on_any_shape(_shared(render_pas, (trained.field, trained.params, plan), (neighbours,)))
+    return OnAnyShape(_Shared("pas", (trained.field, trained.params, plan), (neighbours,)))
 
 
 def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
@@ -128,7 +128,7 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
     dataset = trained.dataset()
     check_power(trained.field, dataset)
     plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
-    return on_any_shape(_shared(_render_power, (trained.field, trained.params, plan)), ())
+    return OnAnyShape(_Shared("power_db", (trained.field, trained.params, plan)), ())
 
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
@@ -149,19 +149,23 @@ def check_power(field: Field, dataset: Dataset) -> None:
         )
 
 
-def _shared(render: Callable[..., Any], before: tuple[Any, ...], after: tuple[Any, ...] = ()) -> Callable[[Query], Any]:
-    """Returns a function of a query, which stands between other arguments of `render`. Several devices divide more than `BLOCK`
-    queries, if that goes evenly and nobody differentiates, transforms or compiles them."""
-    devices = own_devices()
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Shared:
+    """A function of a query, which stands between other arguments of one of `RENDER`. Several devices divide more than `BLOCK`
+    queries, if that goes evenly and nobody differentiates, transforms or compiles them. It can be pickled, which neither
+    closures nor compiled functions can be."""
 
-    def ask(query: Query) -> Any:
+    quantity: str
+    before: tuple[Any, ...]
+    after: tuple[Any, ...] = ()
+
+    def __call__(self, query: Query) -> Any:
+        devices, render = own_devices(), RENDER[self.quantity]
         count, traced = query.frequency_hz.shape[0], isinstance(query.tx_position, jax.core.Tracer)
         if devices.count == 1 or count <= BLOCK or count % devices.count or traced:
-            return render(*before, query, *after)
-        *known, beside = devices.kept(*before, after)
+            return render(*self.before, query, *self.after)
+        *known, beside = devices.kept(*self.before, self.after)
         return _divided(*known, query, beside, render, devices.mesh)
-
-    return ask
 
 
 @partial(jax.jit, static_argnums=(5, 6))
@@ -187,6 +191,10 @@ def render_pas(field: Field, params: Any, plan: Any, query: Query, neighbours: B
     return correct(neighbours, field.render(params, plan, query).pas, query)
 
 
+RENDER: dict[str, Callable[..., Any]] = {"pas": render_pas, "power_db": _render_power}
+"""Compiled functions of field, parameters, plan and query, by what they return."""
+
+
 @partial(jax.jit, static_argnames=("quantity", "mesh"))
 def _observe(
     field: Field,
@@ -206,11 +214,15 @@ def _observe(
     return spread(own, mesh, divided=0)(links, field, params, plan, cache, neighbours)
 
 
-def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_SHAPE) -> Predictor:
+@dataclasses.dataclass(frozen=True, eq=False)
+class OnAnyShape:
     """Lets a function of a flat batch of queries, with an answer of known shape to each, take positions (*b, 3) and frequencies
     (*b,) whose leading axes broadcast."""
 
-    def predict(tx_position: Any, frequency_hz: Any) -> Float[Array, "..."]:
+    render: Callable[[Query], Any]
+    answer: tuple[int, ...] = PAS_SHAPE
+
+    def __call__(self, tx_position: Any, frequency_hz: Any) -> Float[Array, "..."]:
         position, frequency = jnp.asarray(tx_position, jnp.float32), jnp.asarray(frequency_hz, jnp.float32)
         if position.shape[-1:] != (3,):
             raise ValueError(f"tx_position has shape {position.shape}; expected (3,) or (..., 3)")
@@ -219,10 +231,8 @@ def on_any_shape(render: Callable[[Query], Any], answer: tuple[int, ...] = PAS_S
         query = Query(position.reshape(-1, 3), frequency.reshape(-1))
         check_query(query)
         if 0 in shape:
-            return jnp.zeros((*shape, *answer), jnp.float32)
-        return render(query).reshape(*shape, *answer)
-
-    return predict
+            return jnp.zeros((*shape, *self.answer), jnp.float32)
+        return self.render(query).reshape(*shape, *self.answer)
 
 
 def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:

@@ -139,8 +139,8 @@ def _as_function(trained: Any, receiver: Receiver) -> tuple[Callable[..., dict[s
 
 def _place(run: Path, rx: str, count: int) -> Path | None:
     folder = cache_folder()
-    words = f"{run.resolve()}\n{rx}\n{size_for(count)}"
-    return None if folder is None else folder / FOLDER / f"{hashlib.sha256(words.encode()).hexdigest()[:32]}.npz"
+    words = os.fsencode(run.resolve()) + f"\n{rx}\n{size_for(count)}".encode()
+    return None if folder is None else folder / FOLDER / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
 
 
 def _state(watched: Sequence[Path | str]) -> str:
@@ -150,4 +150,4 @@ def _state(watched: Sequence[Path | str]) -> str:
         for path in sorted(root.rglob("*")) if root.is_dir() else [root]:
             there = path.stat() if path.exists() else None
             words.append(f"{path} {there and (there.st_size, there.st_mtime_ns)}")
-    return hashlib.sha256("\n".join(words).encode()).hexdigest()
+    return hashlib.sha256(os.fsencode("\n".join(words))).hexdigest()

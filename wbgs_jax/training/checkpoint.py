@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +73,6 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
     it with the same state; the first one writes."""
     from orbax.checkpoint import v1 as ocp
 
-    target = (folder / str(step)).absolute()
     # Host arrays load on any device; Orbax refuses empty ones, which the metadata stand for.
     host = {key: np.asarray(leaf) for key, leaf in (_flatten(state) | _flatten(field, FIELD)).items()}
     empty = {key: [list(leaf.shape), leaf.dtype.name] for key, leaf in host.items() if not leaf.size}
@@ -83,17 +83,16 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
             metadata = metadata | {EMPTY: empty}
             metadata |= {DIGEST: digest(host, metadata)}
             _demand_room(folder, full)
-            with _small_files():
-                ocp.save(target, full, custom_metadata=metadata, overwrite=True)
+            with _small_files(), _plain(folder) as place:
+                ocp.save(place / str(step), full, custom_metadata=metadata, overwrite=True)
     except (OSError, ValueError) as error:  # ValueError: what TensorStore makes of a full disk
         for unfinished in folder.glob(f"{step}.*tmp*"):
             shutil.rmtree(unfinished, ignore_errors=True)
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0][:200]
         kept = [old for old in checkpoint_steps(folder) if old != step]
         left = f"the checkpoint of step {kept[-1]} is whole" if kept else "there is no checkpoint yet"
-        raise UserError(
-            f"cannot write checkpoint {target}: {reason}; {left}. Free some space and go on with --resume"
-        ) from error
+        where = f"cannot write checkpoint {folder.absolute() / str(step)}"
+        raise UserError(f"{where}: {reason}; {left}. Free some space and go on with --resume") from error
     if is_first():
         tidy(folder, keep)
 
@@ -125,12 +124,12 @@ def read(folder: Path, step: int) -> Saved:
 
     path = folder / str(step)
     with _explained(path), _quiet():
-        _read_every_value(path / STATE)
-        with _alone():
-            metadata = ocp.metadata(path.absolute()).custom_metadata
+        with _alone(), _plain(path) as place:
+            _read_every_value(place / STATE)
+            metadata = ocp.metadata(place).custom_metadata
             if not metadata:  # Orbax gives None for a file that it cannot read
                 raise ValueError("no metadata")
-            found = {key: np.asarray(value) for key, value in ocp.load(path.absolute()).items()}
+            found = {key: np.asarray(value) for key, value in ocp.load(place).items()}
         metadata = dict(metadata)
         expected = metadata.pop(DIGEST, None)  # older checkpoints have none
         found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.get(EMPTY, {}).items()}
@@ -189,6 +188,19 @@ def _alone() -> contextlib.AbstractContextManager[Any]:
     options = ocp.options.MultiprocessingOptions(primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"p{own}")
     context: contextlib.AbstractContextManager[Any] = ocp.Context(multiprocessing_options=options)
     return context
+
+
+@contextlib.contextmanager
+def _plain(folder: Path) -> Iterator[Path]:
+    """Gives an absolute path that leads to a folder and is UTF-8, which TensorStore demands of paths."""
+    path = folder.absolute()
+    if os.fsencode(path).decode(errors="ignore") == str(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as beside:
+        link = Path(beside) / "checkpoints"
+        link.symlink_to(path, target_is_directory=True)
+        yield link
 
 
 @contextlib.contextmanager
