@@ -181,14 +181,11 @@ def main(arguments: list[str] | None = None) -> None:
         where = measured_bounds(cells, walls)
         rows = answers(learned, places, where)
         for row, outside in zip(rows[1:], where.without_confidence(places), strict=True):
-            if outside:
-                found = (f"{r + 1}: {row[3 + 2 * r]}" for r in range(len(cells.receivers)))
-                print(
-                    f"TX ({', '.join(row[:3])}) m, mean dBm: receiver {', '.join(found)}; outside of the readings: no interval"
-                )
-                continue
-            found = (f"{r + 1}: {row[3 + 2 * r]} ± {row[4 + 2 * r]}" for r in range(len(cells.receivers)))
-            print(f"TX ({', '.join(row[:3])}) m, mean dBm, 90 % within: receiver {', '.join(found)}")
+            what = "mean dBm" if outside else "mean dBm, 90 % within"
+            powers = [row[3 + 2 * r] + ("" if outside else f" ± {row[4 + 2 * r]}") for r in range(len(cells.receivers))]
+            listed = ", ".join(f"{r}: {power}" for r, power in enumerate(powers, 1))
+            rest = "; outside of the readings: no interval" if outside else ""
+            print(f"TX ({', '.join(row[:3])}) m, {what}: receiver {listed}{rest}")
         if command.answers:
             write_csv(command.answers, rows)
             say(f"answers: {command.answers}")

@@ -69,6 +69,15 @@ def test_what_is_no_scenario(paths, tmp_path):
         read_deepmimo(tmp_path)
 
 
+def test_powers_that_are_no_decibels(rng, tmp_path):
+    arrays = as_deepmimo(two_rays(rng)[0])
+    write_deepmimo(tmp_path, {**arrays, "power": 10 ** (arrays["power"] / 10)}, 3.5e9)
+    with pytest.raises(UserError, match=r"power in .* is .* to .*; give decibels"):
+        load_deepmimo(tmp_path)
+    with pytest.raises(UserError, match=r"there is no scenario .*nowhere; check the path"):
+        load_deepmimo(tmp_path / "nowhere", 3.5e9)
+
+
 def two_rays(rng, n=30):
     """Line of sight and an image below a metal floor, isotropic antennas."""
     tx, users = np.array([[0.0, 0, 2]]), np.column_stack([rng.uniform(3, 40, n), rng.uniform(-5, 5, n), np.full(n, 1.5)])
@@ -145,6 +154,7 @@ def test_the_package_loads_it_and_computes_the_same_channel(rng, tmp_path, monke
     how = deepmimo.ChannelParameters()
     how.bs_antenna.shape = how.ue_antenna.shape = np.array([1, 1])
     how.ofdm.subcarriers, how.ofdm.selected_subcarriers = 1, np.array([0])
+    how.ofdm.bandwidth = 1e5  # longer delays than a symbol are left out
     theirs = loaded.compute_channels(how).reshape(-1)
     assert np.abs(20 * np.log10(np.abs(theirs) / np.abs(channel))).max() < 0.01
     assert abs(np.vdot(theirs, channel)) > 0.9999 * np.linalg.norm(theirs) * np.linalg.norm(channel)

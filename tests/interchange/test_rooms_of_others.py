@@ -54,6 +54,17 @@ def test_obj_names_of_an_unknown_encoding_stay_apart(tmp_path):
     assert len(read_objects(tmp_path / "a.obj")) == 2
 
 
+def test_obj_names_may_hold_signs_that_mean_something_elsewhere(tmp_path):
+    """A `#` within a name, and characters of Shift-JIS whose last byte is a backslash or a line's end in Unicode."""
+    (tmp_path / "a.obj").write_bytes(
+        b"# from C:\\rooms\\\n" + FLOOR.replace("floor", "desk#1").encode() + b"o desk#2\nf 1 2 3 # half\n"
+        b"o \x95\x5c\nv 0 0 3\nv 6 0 3\nf 1 2 6 5\no \x95\x85a\nf 1 2 6\n"
+    )
+    areas = {name: area for name, (area, _) in found(tmp_path / "a.obj").items()}
+    assert len(areas) == 4 and areas["desk#1"] == 30 and areas["desk#2"] == 15
+    assert sorted(areas.values()) == [9, 15, 18, 30]
+
+
 def test_obj_with_curved_surfaces_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text(FLOOR + "o vase\ncstype bspline\nsurf 0 1 0 1 1 2 3 4\n")
     with pytest.raises(UserError, match=r"object 'vase' .* curved surface"):
@@ -247,6 +258,14 @@ def test_mitsuba_spheres_and_cylinders_have_their_own_places(tmp_path):
     objects = found(tmp_path / "a.xml")
     assert objects["ball"] == (pytest.approx(np.pi, rel=5e-3), (1, 2, 3))
     assert objects["pipe"] == (pytest.approx(0.8 * np.pi, rel=5e-3), (0, 2, 0))
+
+
+def test_mitsuba_writes_names_and_vectors_for_ids_and_points(tmp_path):
+    ball = (
+        '<shape type="sphere" name="ball"><vector name="center" x="1" y="2" z="3"/><float name="radius" value="0.5"/></shape>'
+    )
+    (tmp_path / "a.xml").write_text(XML.format(ball))
+    assert found(tmp_path / "a.xml") == {"ball": (pytest.approx(np.pi, rel=5e-3), (1, 2, 3))}
 
 
 def test_mitsuba_names_that_nobody_fills_in_and_files_of_windows(tmp_path):

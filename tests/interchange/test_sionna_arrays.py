@@ -33,7 +33,8 @@ class Traced:
         images = self.sources[:, None] + rng.uniform(5, 30, (tx, PATHS, 3)) * np.array([1, 1, 0])
         images[:, 0] = self.sources
         offset = images - RX
-        longer = np.maximum(1, np.linalg.norm(self.sources - RX, axis=-1)[:, None] / np.linalg.norm(offset, axis=-1))
+        longer = np.maximum(1, 1.1 * np.linalg.norm(self.sources - RX, axis=-1)[:, None] / np.linalg.norm(offset, axis=-1))
+        longer[:, 0] = 1
         length = np.linalg.norm(offset, axis=-1) * longer
         direction = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
         gain = WAVELENGTH / (4 * np.pi * length) * np.exp(2j * np.pi * rng.random((tx, PATHS)))
@@ -137,6 +138,8 @@ def test_the_other_side(rng):
         (lambda arrays: {"a": arrays["a"][..., None]}, "6 axes, time among them"),
         (lambda arrays: {"a": arrays["a"][:, :7]}, "have 7 antennas|fit no"),
         (lambda arrays: {"sources": 1e3 * arrays["sources"]}, "positions in metres"),
+        (lambda arrays: {"theta_t": np.abs(np.pi / 2 - arrays["theta_t"])}, "theta_t, phi_t of lines of sight point .* theta from"),
+        (lambda arrays: {"sources": arrays["sources"][:, [0, 2, 1]]}, "are .* apart|degrees beside the other end"),
         (lambda arrays: {"a": arrays["a"][:, [*range(8), *range(15, 7, -1)]]}, "fit no 4x4 array"),
     ],
 )
@@ -144,6 +147,21 @@ def test_contradictions_are_refused(rng, change, words):
     arrays = Traced(rng).arrays
     with pytest.raises(UserError, match=words):
         scene_of_sionna(arrays | change(arrays), "street", shape=(4, 4))
+
+
+def test_lines_of_sight_have_the_length_of_the_line(rng):
+    """Places that are no row each may be nearer to each other than a path is long."""
+    arrays = Traced(rng).arrays
+    met = np.zeros((1, *arrays["tau"].shape), int)
+    met[..., 1:] = 1
+    known = arrays | {"interactions": met, "vertices": np.zeros((*met.shape, 3))}
+    assert len(scene_of_sionna(known, "street").tx_positions) == COUNT
+    nearer = {"sources": RX + 0.8 * (arrays["sources"] - RX)}
+    with pytest.raises(UserError, match="a path without interactions is .* m long where transmitter 1 and receiver 1 are"):
+        scene_of_sionna(known | nearer, "street")
+    del known["frequency_hz"]
+    with pytest.raises(UserError, match="street does not record its frequency; give --ghz"):
+        scene_of_sionna(known, "street")
 
 
 @pytest.mark.skipif(not CASES.exists(), reason="the small inputs are not beside the repository")

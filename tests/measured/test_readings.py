@@ -121,6 +121,11 @@ def test_the_terms_of_data_are_found(tmp_path):
         ),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,,,\n", "nothing was received anywhere"),
         ("readings.csv", "x;y;rssi_1;rssi_2;rssi_3\n1;1;-50;-60;-70\n", "separate them by commas"),
+        (
+            "readings.csv",
+            "x\ty\trssi_1\trssi_2\trssi_3\n1\t1\t-50\t-60\t-60\n",
+            "tabs between its cells; separate them by commas",
+        ),
         ("readings.csv", "x,y,rssi,rssi,rssi\n1,1,-50,-60,-70\n", "names two columns alike"),
     ],
 )
@@ -132,6 +137,28 @@ def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
         (tmp_path / file).write_text(content)
     with pytest.raises(UserError, match=says):
         load_readings(tmp_path, HEIGHT)
+
+
+def test_tables_in_utf_16_are_refused(tmp_path, rng):
+    folder(tmp_path, rng, n=20)
+    (tmp_path / "readings.csv").write_text("x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-60\n", encoding="utf-16")
+    with pytest.raises(UserError, match="readings.csv is no text in UTF-8; save it as CSV in UTF-8"):
+        load_readings(tmp_path, HEIGHT)
+
+
+def test_places_in_degrees_around_receivers_in_metres_are_refused(tmp_path, rng):
+    """Readings from one corner of a site are not."""
+    tx = places(rng, 30)
+    heard = powers(tx).round(2)
+    write_table(tmp_path / "receivers.csv", ["x", "y", "z"], RECEIVERS)
+    degrees = np.column_stack([8.54 + tx[:, 0] / 75e3, 47.37 + tx[:, 1] / 111e3])
+    for positions, refused in ((degrees, True), (degrees[:, ::-1], True), (tx[:, :2] / 30 + 5, False)):
+        write_table(tmp_path / "readings.csv", ["x", "y", "rssi_1", "rssi_2", "rssi_3"], np.hstack([positions, heard]))
+        if refused:
+            with pytest.raises(UserError, match="from the nearest receiver: degrees of longitude and latitude; project them"):
+                load_readings(tmp_path, HEIGHT)
+        else:
+            np.testing.assert_allclose(load_readings(tmp_path, HEIGHT).places[:, :2], positions)
 
 
 def test_a_folder_that_is_none(tmp_path):

@@ -57,6 +57,8 @@ def load_dataset(
         return load_layout(path, frequency_hz, seed, test_fraction, convention)
     if path.suffix == ".npz":
         return scene_dataset(load_scene(path))
+    if path.is_file():
+        raise UserError(f"{path} is of no known kind; give a scene file (.npz) or a folder of spectra (docs/formats.md)")
     known = ", ".join(released_scenes()) or f"none in {_scene_folder()} (make them with `make data`)"
     raise UserError(f"there is no scene {str(source)!r}; give a released one ({known}), an .npz scene file or a folder")
 

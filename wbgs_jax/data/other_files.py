@@ -7,6 +7,7 @@ from wbgs_jax._util.errors import UserError
 SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
 PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
 ROOM = "`wbgs-jax convert` makes a room of it beside measured data, data_gen makes spectra for it (docs/own_scene.md)"
+MODELS = (".usd", ".usda", ".usdc", ".usdz", ".stl", ".dae", ".fbx", ".blend", ".3ds", ".off", ".3mf", ".abc", ".vtk", ".vtp")
 KINDS = {
     ".h5": ("of HDF5", SNAPSHOTS),
     ".hdf5": ("of HDF5", SNAPSHOTS),
@@ -29,7 +30,9 @@ KINDS = {
     ".ifc": ("a building model", "export it as glTF or OBJ; then " + ROOM),
     ".dxf": ("a drawing", "export meshes as OBJ; then " + ROOM),
     ".svg": ("a drawing", "walls go into walls.csv (docs/measured.md)"),
+    **dict.fromkeys((".xls", ".xlsx", ".ods"), ("a workbook", "save its sheets as .csv (docs/measured.md)")),
     **dict.fromkeys((".glb", ".gltf", ".obj", ".ply", ".xml"), ("a model of a room", ROOM)),
+    **dict.fromkeys(MODELS, ("a model", "export it as glTF or OBJ; then " + ROOM)),
 }
 """Of files by their suffix: what they are, and what to do with them."""
 COLMAP = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")

@@ -65,6 +65,8 @@ def load_deepmimo(
         UserError: nothing is there, an array is missing, or the frequency is not known, or another.
     """
     path, known = Path(path), parameters(Path(path)).get("rt_params", {})
+    if not path.exists():
+        raise UserError(f"there is no scenario {path}; check the path")
     tracing = known if isinstance(known, dict) else {}
     found = tracing.get("frequency")
     recorded = float(found) if isinstance(found, int | float) else None
@@ -110,6 +112,9 @@ def _complete(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{path} has no {missing[0]}; it must hold a DeepMIMO scenario: {', '.join(NEEDED)}")
     _check_shapes(path, arrays)
+    power = np.asarray(arrays["power"], np.float64)
+    if np.isfinite(power).any() and np.nanmin(power) >= 0:
+        raise UserError(f"power in {path} is {np.nanmin(power):.3g} to {np.nanmax(power):.3g}; give decibels, 10 log10 of it")
     return arrays
 
 

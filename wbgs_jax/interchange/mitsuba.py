@@ -18,6 +18,8 @@ THICKNESS = 0.1
 """Metres: what Sionna RT takes where nothing is given."""
 SECTIONS = 64
 """Of what is round."""
+POINTS = ("point", "vector")
+"""What people write for places, and what Mitsuba writes."""
 MOVED = ("to_world", "toWorld")
 """Transforms of shapes, in versions from 2 on and before."""
 
@@ -48,7 +50,7 @@ def _fill_in(root: ET.Element, file: Path) -> None:
 
 
 def _body(shape: ET.Element, number: int, materials: dict[str | None, RadioMaterial | None], file: Path) -> Body:
-    name = (shape.get("id") or f"shape_{number}").removeprefix("mesh-")
+    name = (shape.get("id") or shape.get("name") or f"shape_{number}").removeprefix("mesh-")  # Mitsuba itself writes `name`
     kind = shape.get("type") or ""
     if kind in ("ply", "obj"):
         vertices, faces = _from_file(shape, name, kind, file)
@@ -130,7 +132,7 @@ def _value(shape: ET.Element, name: str, missing: float) -> float:
 
 
 def _point(shape: ET.Element, name: str, missing: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
-    found = shape.find(f"point[@name='{name}']")
+    found = next((one for one in shape if one.tag in POINTS and one.get("name") == name), None)
     return np.array(missing, np.float64) if found is None else np.array(_vector(found, 0.0))
 
 

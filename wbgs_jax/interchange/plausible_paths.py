@@ -2,15 +2,20 @@
 another unit, and refused by name."""
 
 import numpy as np
+from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.ray_paths import RayPaths
+from wbgs_jax.interchange.ray_paths import NONE, RayPaths, directions_of
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 LONGEST_M = 1e6
 """Of a path."""
 SLACK, SLACK_M = 1e-3, 0.1
 """By which a path may be shorter than the straight line: rounding, and arrays whose elements stand beside their centre."""
+SAME, SAME_M = 1e-4, 0.01
+"""By which the length of a path may differ from the straight line that is the line of sight."""
+ASIDE_DEGREES, NEAREST_M = 10.0, 0.5
+"""By which the angles of lines of sight may differ from those of their ends, and how far apart these are at least."""
 LARGEST_GAIN = 3.0
 """Of a path's amplitude: antennas a hand's breadth apart."""
 
@@ -39,3 +44,30 @@ def check_paths(paths: RayPaths, name: str) -> None:
             f"{straight[r, t]:.3g} m apart; give delays in seconds from the transmitter on (Sionna: normalize_delays=False), "
             "positions in metres, and a row of three numbers for every place"
         )
+    _check_sight(paths, name, length, straight[..., None])
+
+
+def _check_sight(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]) -> None:
+    """Raises a `UserError` where most lines of sight are of another length than the line between their ends, or come from
+    elsewhere."""
+    if len(paths.interactions):
+        direct = paths.valid & (paths.interactions == NONE).all(0)
+        other = direct & (np.abs(length - straight) > straight * SLACK + SLACK_M)
+        if other.sum() > direct.sum() / 2:
+            r, t, k = np.argwhere(other)[0]
+            raise UserError(
+                f"{name}: a path without interactions is {length[r, t, k]:.3g} m long where transmitter {t + 1} and receiver "
+                f"{r + 1} are {straight[r, t, 0]:.3g} m apart; give positions in metres, a row of three numbers for every place"
+            )
+    sight = paths.valid & (np.abs(length - straight) <= straight * SAME + SAME_M) & (straight > NEAREST_M)
+    if not sight.any():
+        return
+    towards = (paths.sources - paths.targets[:, None])[:, :, None] / np.maximum(straight, NEAREST_M)[..., None]
+    for end, sign in (("r", 1), ("t", -1)):
+        found = directions_of(getattr(paths, f"theta_{end}"), getattr(paths, f"phi_{end}"))
+        cosine = np.sum(found * sign * towards, -1)[sight]
+        if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > ASIDE_DEGREES:
+            raise UserError(
+                f"{name}: theta_{end}, phi_{end} of lines of sight point {aside:.0f} degrees beside the other end; give angles in "
+                "the frame of the positions, theta from +z, phi from +x, outwards at both ends"
+            )

@@ -90,6 +90,8 @@ def scene_of_sionna(
             arrays[end] = places_of(found, not isinstance(paths, Mapping), f"{end} of {what}")
     if (found := array_of(paths, "frequency_hz")) is not None:
         arrays["frequency_hz"] = found
+    elif frequency_hz is None:
+        raise UserError(f"{what} does not record its frequency; give --ghz, that of the scene that it was traced in")
     arrays = _swapped(arrays) if swap else arrays
     if arrays["a"].ndim < ARRAYS:
         single = from_sionna(arrays, frequency_hz)

@@ -37,6 +37,8 @@ FURTHEST = 1e4
 """Metres."""
 DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
 """Largest longitude and latitude; extent of a site in degrees; and how many times as far it lies from the origin."""
+FEWEST, ELSEWHERE = 5, 50.0
+"""Places of which some may be degrees, and how many times their extent is between them and the nearest receiver, in metres."""
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
@@ -86,4 +88,16 @@ def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
         raise UserError(
             f"{what} all lie within {extent:.2g}, {offset:.3g} from the origin: degrees of longitude and latitude; project "
             "them to metres (UTM, say), from an origin on the site"
+        )
+
+
+def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np.ndarray, "r 3"]) -> None:
+    """Raises a `UserError` for places in degrees around receivers in metres."""
+    plane = np.unique(places[:, :2], axis=0)
+    extent = np.ptp(plane, axis=0).max()
+    nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
+    if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
+        raise UserError(
+            f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and latitude; "
+            "project them to metres (UTM, say), from the origin of the receivers"
         )

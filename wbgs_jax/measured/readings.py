@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.measured.columns import match_columns
 from wbgs_jax.measured.nerf2 import is_nerf2, load_nerf2
-from wbgs_jax.measured.plausible import check_metres, check_positions, check_powers, not_received
+from wbgs_jax.measured.plausible import check_frame, check_metres, check_positions, check_powers, not_received
 from wbgs_jax.measured.tables import found, numbers, read_table
 
 READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
@@ -100,6 +100,7 @@ def _checked(readings: Readings, folder: Path) -> Readings:
     check_positions(f"{folder}: places", readings.places)
     check_positions(f"{folder}: receivers", readings.receivers)
     check_metres(f"{folder}: receivers and places", np.concatenate([readings.receivers, readings.places]))
+    check_frame(f"{folder}: places", readings.places, readings.receivers)
     if np.isnan(readings.powers).all():
         raise UserError(f"{folder}: nothing was received anywhere")
     return readings

@@ -14,7 +14,7 @@ def found(folder: Path, names: tuple[str, ...]) -> Path:
     for name in names:
         if (folder / name).exists():
             return folder / name
-    raise UserError(f"{folder} has no {' or '.join(names)}; docs/measured.md shows the layout")
+    raise UserError(f"{folder} has no {' or '.join(names)}; write it as docs/measured.md shows")
 
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -23,13 +23,16 @@ def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} cannot be read: {error}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text in UTF-8; save it as CSV in UTF-8") from None
+    except (OSError, csv.Error) as error:
+        raise UserError(f"{path} cannot be read: {error}; check the path, or save it again as CSV") from None
     if len(lines) < 2:
         raise UserError(f"{path} has no rows below its header")
     header = [name.lower() for name in lines[0][1]]
-    if len(header) == 1 and ";" in header[0]:
-        raise UserError(f"{path} has ';' between its cells; separate them by commas")
+    for sign, name in ((";", "';'"), ("\t", "tabs")):
+        if len(header) == 1 and sign in header[0]:
+            raise UserError(f"{path} has {name} between its cells; separate them by commas")
     if len(set(header)) < len(header):
         raise UserError(f"{path} names two columns alike: {', '.join(header)}")
     for number, row in lines[1:]:
