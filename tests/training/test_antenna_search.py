@@ -1,6 +1,8 @@
 """The search names the antennas of both ends from snapshots alone, and leaves what is right alone."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from synthetic import FREQUENCIES_HZ, tiny_settings
 from wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
-from wbgs_jax.training.antennas import antenna_candidates, search_antennas
+from wbgs_jax.training.antennas import antenna_candidates, gains_much, search_antennas
 from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX = 30
@@ -94,3 +96,40 @@ def test_an_antenna_of_any_length_of_quaternion_is_the_same(rng):
     k = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
     k = k / jnp.linalg.norm(k, axis=-1, keepdims=True)
     np.testing.assert_allclose(antenna_field(longer, k), antenna_field(antenna, k), atol=1e-5)
+
+
+STORED = json.loads((Path(__file__).parent / "antenna_scores.json").read_text())
+"""Scores of the first search in data sets, by candidate (the first one is what is there) and training transmitter."""
+
+
+def taken(scores, count, rng, draws=300):
+    """How often so many of the transmitters take another antenna, and how often one that is worse over all transmitters."""
+    another = worse = 0
+    for _ in range(draws):
+        few = scores[:, rng.choice(scores.shape[1], count, replace=False)]
+        best, over_all = 1 + few[1:].mean(1).argmin(), scores.mean(1)
+        much = gains_much(few, np.arange(count))
+        another, worse = another + much, worse + (much and over_all[best] > over_all[0] + 0.01)
+    return another / draws, worse / draws
+
+
+@pytest.mark.parametrize(("count", "least"), [(5, 0.25), (8, 0.4), (11, 0.65), (24, 0.98)])
+def test_few_transmitters_take_an_antenna_that_gains_much(count, least, rng):
+    """In the authors' sample transmitters look down; 11 of its transmitters at three errors take it in one draw of twenty."""
+    another, worse = taken(np.array(STORED["example1"]), count, rng)
+    assert another > least and worse == 0
+
+
+@pytest.mark.parametrize("count", [5, 8, 11, 24])
+def test_few_transmitters_seldom_take_a_wrong_antenna(count, rng):
+    harm = [taken(np.array(STORED[name]), count, rng)[1] for name in ("scene1", "scene2", "scene4")]
+    assert np.mean(harm) < 0.03  # 0.01 and less in 3,600 draws; three standard errors more in these
+    assert count < 24 or np.mean(harm) < 0.01
+
+
+def test_no_gain_by_the_choice_among_many(rng):
+    """Candidates that are alike: the best of them looks better by chance, and each time by another transmitter."""
+    noise, transmitters = rng.normal(size=(300, 15, 8)), np.arange(8)
+    assert np.mean([gains_much(one, transmitters) for one in noise]) < 0.2
+    noise[:, 7] -= 2
+    assert np.mean([gains_much(one, transmitters) for one in noise]) > 0.9

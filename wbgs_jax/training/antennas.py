@@ -11,18 +11,21 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.radio.patterns import PATTERN_EXPONENTS, Antenna
-from wbgs_jax.training.scores import Scores, surely_better
+from wbgs_jax.training.scores import Scores, by_transmitter, surely_better
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 ENDS = "transmitter", "element"
 """Whose antennas are searched."""
 UP = ("+x", "+y", "+z")
 """Axes that an antenna may stand along: upside down it differs by a sign."""
+LARGE, SURE_OF_LARGE = 0.3, 1.5
+"""A gain of so much (natural logarithm: a quarter less is left) is taken by as many standard errors. With few transmitters it
+costs far more to miss the antenna than to take a wrong one, which gains nothing: docs/decisions.md has the chances of both."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ def search_antennas(
     known_elements: bool,
 ) -> tuple[Any, AntennaReport]:
     """Returns parameters with the antennas whose scores are best, in turn for transmitters and elements, where they are surely
-    better than what is there; elements whose pattern the data say are left alone."""
+    better than what is there, or better by much; elements whose pattern the data say are left alone."""
     taken, settled, before, after = dict[str, str](), 0, np.zeros(1), np.zeros(1)
     ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
@@ -77,8 +80,20 @@ def search_antennas(
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before, after = before if turn else scores[0], scores[0]
         settled += 1
-        if surely_better(scores[0] - scores[best], tx_index, config.antenna_sure):
+        if surely_better(scores[0] - scores[best], tx_index, config.antenna_sure) or gains_much(scores, tx_index):
             taken[end], params, after, settled = list(candidates)[best - 1], tried[best], scores[best], 1
         if settled == len(ends):  # the other end is what it was when this one was looked at
             break
     return params, AntennaReport(float(before.mean()), float(after.mean()), taken)
+
+
+def gains_much(scores: Float[np.ndarray, "k n"], tx_index: Int[np.ndarray, " n"]) -> bool:
+    """Returns whether the best of several candidates gains `LARGE` over the first one.
+
+    For every transmitter the candidate is chosen by the others: so that it was chosen among many adds nothing to its gain.
+    """
+    of_tx = np.stack([by_transmitter(own, tx_index) for own in scores])
+    chosen = 1 + (of_tx.sum(1, keepdims=True) - of_tx)[1:].argmin(0)
+    transmitters = np.arange(of_tx.shape[1])
+    gains = of_tx[0] - of_tx[chosen, transmitters]
+    return bool(gains.mean() > LARGE and surely_better(gains, transmitters, SURE_OF_LARGE))
