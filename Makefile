@@ -13,6 +13,7 @@ PYTHON ?= python3
 
 VENV   := .venv
 PY     := $(VENV)/bin/python
+WRITERS := .venv-conformance
 PIP    := $(PY) -m pip install --quiet --disable-pip-version-check --no-compile
 READY  := $(VENV)/.ready
 CUDA   := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo cuda)
@@ -21,7 +22,7 @@ NAME   := $(if $(DATA),$(notdir $(patsubst %/,%,$(DATA))),$(if $(wildcard $(SCEN
 MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
-.PHONY: help setup train eval view measured test test-heavy test-slow test-faults lowest newest locks coverage simulator data lint \
+.PHONY: help setup train eval view measured test test-heavy test-slow test-faults conformance lowest newest locks coverage simulator data lint \
 	typecheck bench gpu-check experiments tables docs site notebooks package clean
 .DEFAULT_GOAL := help
 
@@ -67,6 +68,15 @@ test-slow: setup  ## run all tests in fully optimised code, among them larger ca
 
 test-faults: setup  ## run the tests of faults, count what was tried: make test-faults [ARGS="--only fuzz_readers --seed 1"]
 	$(PY) -m experiments.reliability $(ARGS)
+
+conformance: simulator  ## check files that other programs write: install these into .venv-conformance, read what they make, count it
+	@$(PY) -m venv $(WRITERS)
+	@$(PY) -c 'import site; print(*site.getsitepackages(), sep="\n")' > \
+		$$($(WRITERS)/bin/python -c 'import site; print(site.getsitepackages()[0])')/usual.pth
+	@grep -v '^#' tests/conformance/requirements.txt | while read -r wanted; do \
+		$(WRITERS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --only-binary :all: "$$wanted" || \
+			echo "conformance: $$wanted cannot be had here; its files are left out" >&2; done
+	$(WRITERS)/bin/python -m experiments.conformance $(ARGS)
 
 lowest:  ## run the tests with the lowest versions of the dependencies that pyproject.toml allows (needs uv)
 	$(call tested-with,lowest-direct)

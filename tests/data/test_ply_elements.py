@@ -51,6 +51,15 @@ def test_what_another_library_has_written(tmp_path, rng, order, alike, rows):
         np.testing.assert_allclose(found["face"][name].values, np.concatenate(lists[name]), rtol=1e-6)
 
 
+@pytest.mark.parametrize("first", [b"\n", b"\r", b"a"])
+@pytest.mark.parametrize("ends", [b"\n", b"\r\n", b"\r"])
+def test_headers_with_any_ends_of_lines(tmp_path, ends, first):
+    """Whatever byte the content begins with."""
+    header = [b"ply", b"format binary_little_endian 1.0", b"element point 2", b"property uchar x", b"end_header", b""]
+    (tmp_path / "x.ply").write_bytes(ends.join(header) + first + b"\n")
+    assert read_elements(tmp_path / "x.ply")["point"]["x"].tolist() == [first[0], 10]
+
+
 def test_what_another_library_reads(tmp_path, rng):
     rows = np.zeros(7, [("x", "<f4"), ("count", "u1"), ("list", "<i4", (4,)), ("y", ">f8")])
     for name in rows.dtype.names:

@@ -69,12 +69,14 @@ def test_what_is_no_scenario(paths, tmp_path):
         read_deepmimo(tmp_path)
 
 
-def test_powers_that_are_no_decibels(rng, tmp_path):
+@pytest.mark.parametrize("name", ["power", "phase", "aoa_el"])
+def test_arrays_of_other_units(rng, tmp_path, name):
     arrays = as_deepmimo(two_rays(rng)[0])
-    write_deepmimo(tmp_path, {**arrays, "power": 10 ** (arrays["power"] / 10)}, 3.5e9)
-    with pytest.raises(UserError, match=r"power in .* is .* to .*; give decibels"):
+    other = 10 ** (arrays[name] / 10) if name == "power" else np.radians(arrays[name])
+    write_deepmimo(tmp_path, {**arrays, name: other}, 3.5e9)
+    with pytest.raises(UserError, match=rf"{name} in .* is .* to .*; give (decibels|degrees)"):
         load_deepmimo(tmp_path)
-    with pytest.raises(UserError, match=r"there is no scenario .*nowhere; check the path"):
+    with pytest.raises(UserError, match=r"cannot read .*nowhere: there is no such scenario; check the path"):
         load_deepmimo(tmp_path / "nowhere", 3.5e9)
 
 

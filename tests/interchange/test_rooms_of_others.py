@@ -2,6 +2,7 @@
 
 import base64
 import json
+import urllib.parse
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,14 @@ def test_obj_names_may_hold_signs_that_mean_something_elsewhere(tmp_path):
 def test_obj_with_curved_surfaces_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text(FLOOR + "o vase\ncstype bspline\nsurf 0 1 0 1 1 2 3 4\n")
     with pytest.raises(UserError, match=r"object 'vase' .* curved surface"):
+        read_objects(tmp_path / "a.obj")
+
+
+def test_obj_that_calls_another_file_is_refused_and_outlines_are_faces(tmp_path):
+    (tmp_path / "a.obj").write_text(FLOOR.replace("f ", "fo "))
+    assert found(tmp_path / "a.obj")["floor"][0] == 30
+    (tmp_path / "a.obj").write_text(FLOOR + "call walls.obj\n")
+    with pytest.raises(UserError, match=r"a\.obj calls another file \(walls\.obj\); export it in one"):
         read_objects(tmp_path / "a.obj")
 
 
@@ -161,6 +170,14 @@ def test_gltf_accessors_of_every_kind(tmp_path):
     assert cabinet(sparse, tmp_path)[0] == pytest.approx(6)
     del sparse.document["accessors"][0]["bufferView"]  # from zeros
     assert cabinet(sparse, tmp_path)[0] < 6
+
+
+def test_gltf_buffers_inside_in_both_codings(tmp_path):
+    gltf = Gltf().mesh(VERTICES, FACES)
+    text = json.loads(gltf.write(tmp_path / "a.gltf").read_text())
+    text["buffers"][0]["uri"] = "data:application/octet-stream," + urllib.parse.quote_from_bytes(gltf.bytes)
+    (tmp_path / "a.gltf").write_text(json.dumps(text))
+    assert found(tmp_path / "a.gltf", up="z")["cabinet"] == (pytest.approx(6), (0, 0, 0))
 
 
 def test_gltf_instances_and_morph_targets(tmp_path):

@@ -116,6 +116,11 @@ def test_the_terms_of_data_are_found(tmp_path):
         ("readings.csv", "x,y,battery,rssi_1,rssi_2,rssi_3\n1,1,2,-55,-60,-70\n", "4 columns of powers"),
         (
             "readings.csv",
+            "x,y,rssi_1,rssi_2,rssi_3\n" + "".join(f"{i},1,-4{i},4{i},-5{i}\n" for i in range(5)),
+            r"powers of receiver 2 are all positive; give magnitudes their sign",
+        ),
+        (
+            "readings.csv",
             "x,y,kitchen,hall,office\n1,1,-55,-60,-70\n",
             "kitchen, hall, office.* name them rssi_1",
         ),
@@ -142,7 +147,7 @@ def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
 def test_tables_in_utf_16_are_refused(tmp_path, rng):
     folder(tmp_path, rng, n=20)
     (tmp_path / "readings.csv").write_text("x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-60\n", encoding="utf-16")
-    with pytest.raises(UserError, match="readings.csv is no text in UTF-8; save it as CSV in UTF-8"):
+    with pytest.raises(UserError, match=r"readings\.csv is no text in UTF-8; save it as CSV in UTF-8"):
         load_readings(tmp_path, HEIGHT)
 
 

@@ -148,7 +148,8 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
                 elements[-1].properties.append(_Property(name.decode(errors="replace"), _type(kind, order), None))
             case _:
                 raise _Damaged(f"its header says {b' '.join(words)[:60].decode(errors='replace')!r}")
-    body = content.find(b"\n", end)
+    ends = b"\n" if b"\n" in content[:end] else b"\r"  # of lines: binary content may begin with either
+    body = content.find(ends, end)
     return order, elements, content[body + 1 :] if body >= 0 else b""
 
 

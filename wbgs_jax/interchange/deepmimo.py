@@ -22,6 +22,8 @@ from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTIO
 PATHS = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 NEEDED = (*PATHS, "rx_pos", "tx_pos")
 ANGLES = {"theta_t": "aod_el", "phi_t": "aod_az", "theta_r": "aoa_el", "phi_r": "aoa_az"}
+IN_DEGREES, MANY = ("phase", "aod_el", "aoa_el"), 8
+"""Arrays that do not stay within three degrees, and how many values of one show it."""
 DIGITS = {SPECULAR: 1, DIFFRACTION: 2, DIFFUSE: 3, REFRACTION: 4}
 MOST_INTERACTIONS = 10
 WITHOUT_PROPAGATION = ("sionna",)
@@ -66,7 +68,7 @@ def load_deepmimo(
     """
     path, known = Path(path), parameters(Path(path)).get("rt_params", {})
     if not path.exists():
-        raise UserError(f"there is no scenario {path}; check the path")
+        raise UserError(f"cannot read {path}: there is no such scenario; check the path")
     tracing = known if isinstance(known, dict) else {}
     found = tracing.get("frequency")
     recorded = float(found) if isinstance(found, int | float) else None
@@ -112,9 +114,7 @@ def _complete(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{path} has no {missing[0]}; it must hold a DeepMIMO scenario: {', '.join(NEEDED)}")
     _check_shapes(path, arrays)
-    power = np.asarray(arrays["power"], np.float64)
-    if np.isfinite(power).any() and np.nanmin(power) >= 0:
-        raise UserError(f"power in {path} is {np.nanmin(power):.3g} to {np.nanmax(power):.3g}; give decibels, 10 log10 of it")
+    _check_units(path, arrays)
     return arrays
 
 
@@ -133,6 +133,18 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
         if len(shape) != 2 or found.shape not in allowed:
             expected = " or ".join(map(str, allowed))
             raise UserError(f"{name} in {path} has shape {found.shape}; expected {expected}: users, paths, ...")
+
+
+def _check_units(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raises a `UserError` for powers that are no decibels, and for many phases or elevations that are all radians."""
+    known = {name: np.asarray(arrays[name], np.float64) for name in ("power", *IN_DEGREES)}
+    known = {name: values[np.isfinite(values)] for name, values in known.items()}
+    if len(known["power"]) and known["power"].min() >= 0:
+        low, high = known["power"].min(), known["power"].max()
+        raise UserError(f"power in {path} is {low:.3g} to {high:.3g}; give decibels, 10 log10 of it")
+    for name in IN_DEGREES:
+        if len(np.unique(known[name])) >= MANY and np.abs(known[name]).max() <= np.pi + 1e-3:
+            raise UserError(f"{name} in {path} is {known[name].min():.3g} to {known[name].max():.3g}; give degrees, no radians")
 
 
 def _depth(arrays: dict[str, np.ndarray]) -> int:

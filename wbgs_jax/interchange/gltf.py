@@ -62,7 +62,9 @@ class _File:
             if uri is None:
                 self.buffers[number] = self.binary
             elif uri.startswith("data:"):
-                self.buffers[number] = base64.b64decode(uri.split(",", 1)[1])
+                kind, data = uri.split(",", 1)
+                plain = urllib.parse.unquote_to_bytes(data)
+                self.buffers[number] = base64.b64decode(plain) if kind.endswith(";base64") else plain
             else:
                 self.buffers[number] = (self.file.parent / urllib.parse.unquote(uri)).read_bytes()
         return self.buffers[number]

@@ -44,21 +44,33 @@ def check_paths(paths: RayPaths, name: str) -> None:
             f"{straight[r, t]:.3g} m apart; give delays in seconds from the transmitter on (Sionna: normalize_delays=False), "
             "positions in metres, and a row of three numbers for every place"
         )
+    _check_vertices(paths, name, length)
     _check_sight(paths, name, length, straight[..., None])
 
 
+def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"]) -> None:
+    """Raises a `UserError` where most paths are of another length than the line through their vertices, or between their ends
+    where they have none."""
+    if not len(paths.interactions):  # nobody has recorded them
+        return
+    here, along = np.broadcast_to(paths.sources[None, :, None], (*length.shape, 3)), np.zeros(length.shape)
+    for met, there in zip(paths.interactions != NONE, paths.vertices, strict=True):
+        along = along + np.where(met, np.linalg.norm(there - here, axis=-1), 0)
+        here = np.where(met[..., None], there, here)
+    along = along + np.linalg.norm(paths.targets[:, None, None] - here, axis=-1)
+    known = paths.valid & np.isfinite(along)
+    other = known & (np.abs(length - along) > length * SLACK + SLACK_M)
+    if other.sum() > known.sum() / 2:
+        r, t, k = np.argwhere(other)[0]
+        long, drawn = length[r, t, k], along[r, t, k]
+        raise UserError(
+            f"{name}: a path from transmitter {t + 1} to receiver {r + 1} is {long:.3g} m long, and {drawn:.3g} m "
+            "through its vertices; give positions in metres, in one frame, a row of three numbers for every place"
+        )
+
+
 def _check_sight(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]) -> None:
-    """Raises a `UserError` where most lines of sight are of another length than the line between their ends, or come from
-    elsewhere."""
-    if len(paths.interactions):
-        direct = paths.valid & (paths.interactions == NONE).all(0)
-        other = direct & (np.abs(length - straight) > straight * SLACK + SLACK_M)
-        if other.sum() > direct.sum() / 2:
-            r, t, k = np.argwhere(other)[0]
-            raise UserError(
-                f"{name}: a path without interactions is {length[r, t, k]:.3g} m long where transmitter {t + 1} and receiver "
-                f"{r + 1} are {straight[r, t, 0]:.3g} m apart; give positions in metres, a row of three numbers for every place"
-            )
+    """Raises a `UserError` where lines of sight come from elsewhere than the other end."""
     sight = paths.valid & (np.abs(length - straight) <= straight * SAME + SAME_M) & (straight > NEAREST_M)
     if not sight.any():
         return
@@ -68,6 +80,6 @@ def _check_sight(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"],
         cosine = np.sum(found * sign * towards, -1)[sight]
         if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > ASIDE_DEGREES:
             raise UserError(
-                f"{name}: theta_{end}, phi_{end} of lines of sight point {aside:.0f} degrees beside the other end; give angles in "
-                "the frame of the positions, theta from +z, phi from +x, outwards at both ends"
+                f"{name}: theta_{end}, phi_{end} of lines of sight point {aside:.0f} degrees beside the other end; give angles "
+                "in the frame of the positions, theta from +z, phi from +x, outwards at both ends"
             )

@@ -34,7 +34,10 @@ OTHERS = {
     ".blend": "of Blender's own form: export it as glTF",
     ".stl": "without names of objects: export it as OBJ or glTF",
     ".usd": "a stage of OpenUSD: export it as glTF",
-    ".usdz": "a stage of OpenUSD: export it as glTF",
+    **dict.fromkeys((".usda", ".usdc", ".usdz"), "a stage of OpenUSD: export it as glTF"),
+    ".off": "without names of objects: export it as OBJ or glTF",
+    ".3mf": "for printing: export it as glTF",
+    ".abc": "of Alembic: export it as glTF",
     ".dae": "of COLLADA: export it as glTF",
     ".3ds": "of 3D Studio: export it as glTF",
 }

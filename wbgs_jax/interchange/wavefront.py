@@ -35,7 +35,7 @@ def read_obj(file: Path) -> list[Body]:
         match words[0]:
             case "v":
                 vertices.append([float(word) for word in words[1:4]])
-            case "f":
+            case "f" | "fo":  # as it was called before
                 corners = [_corner(word, len(vertices), file) for word in words[1:]]
                 own, sizes = faces.setdefault(name, ([], []))
                 own += corners
@@ -43,6 +43,8 @@ def read_obj(file: Path) -> list[Body]:
             case "o" | "g" as kind:
                 latest = " ".join(words[1:]) or f"object_{number}"
                 name = latest if kind == begins else name
+            case "call":
+                raise UserError(f"{file} calls another file ({' '.join(words[1:])}); export it in one")
             case kind if kind in CURVED:
                 raise UserError(f"object {latest!r} of {file} has a curved surface ({kind}); export it as polygons")
     points = np.array(vertices, np.float64).reshape(-1, 3)

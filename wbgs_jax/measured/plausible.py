@@ -38,7 +38,8 @@ FURTHEST = 1e4
 DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
 """Largest longitude and latitude; extent of a site in degrees; and how many times as far it lies from the origin."""
 FEWEST, ELSEWHERE = 5, 50.0
-"""Places of which some may be degrees, and how many times their extent is between them and the nearest receiver, in metres."""
+"""Places that may be degrees, powers of a receiver that may lack their sign; and how many times the extent of such places lies
+between them and the nearest receiver, if that is in metres."""
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
@@ -68,6 +69,10 @@ def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
             f"{where}: powers are {heard.min():g} to {heard.max():g}, which no receiver has in dBm; convert milliwatts "
             "(10 log10), give magnitudes their sign, leave cells empty where nothing was received"
         )
+    for number, column in enumerate(powers.T, 1):
+        own = column[~np.isnan(column)]
+        if len(own) >= FEWEST and own.min() >= 0:
+            raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
     if not ((heard >= POWERS_DBM[0]) & (heard <= POWERS_DBM[1])).all():
         span = " to ".join(f"{power:g}" for power in POWERS_DBM)
         raise UserError(f"{where}: powers must be dBm, {span}; leave cells empty where nothing was received")
@@ -98,6 +103,6 @@ def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np
     nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
     if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
         raise UserError(
-            f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and latitude; "
-            "project them to metres (UTM, say), from the origin of the receivers"
+            f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
+            "latitude; project them to metres (UTM, say), from the origin of the receivers"
         )
