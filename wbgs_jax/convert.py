@@ -45,11 +45,11 @@ class Command:
     run: Path | None = None
     """... a run folder, or ..."""
     paths: Path | None = None
-    """... paths of another program: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
+    """... paths: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
     materials: Path | None = None
-    """Of a model: a .toml with the materials of its objects (docs/own_scene.md); without it each is of its own."""
+    """Of a model: a .toml with the materials of its objects (docs/own_scene.md)."""
     up: Literal["y", "z"] | None = None
-    """Of a model: the axis that points up, if not y in .glb and .gltf and z in others."""
+    """Of a model: the axis that points up (.glb, .gltf: y; others: z)."""
     scale: float | None = None
     """Of a model: metres in one unit of it."""
     tx: tuple[str, ...] = ()

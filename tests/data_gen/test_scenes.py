@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_gen import materials
 from data_gen.scenes import FREQUENCIES_21_HZ, FREQUENCIES_HZ, SCENES, get_scene
 from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
 from data_gen.scenes.geometry import crossings, winding_number
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
+from wbgs_jax.interchange import building_materials as materials
 
 MAX_TRIANGLES = 2500
 OPEN_ROOMS, FLATS = (1, 6), (2, 3, 4, 5)

@@ -39,7 +39,7 @@ from wbgs_jax.interchange.scenes import scene_of_paths
 from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
 from wbgs_jax.measured.floor_plan import load_walls
 from wbgs_jax.measured.readings import cell_means, load_readings
-from wbgs_jax.radio.array import planar_array
+from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.training import curves
 from wbgs_jax.training.manifest import write_manifest
 from wbgs_jax.training.run_folder import load_trained, read_config
@@ -59,18 +59,23 @@ class Readable:
 
 
 def _paths() -> RayPaths:
+    """Paths that meet one or two surfaces, as long as the lines through these places."""
     draw = np.random.default_rng(0)
-    shape, met = (6, 2, 3), draw.choice([0, 1, 4, 8], (2, 6, 2, 3)).astype(np.int32)
-    angles = {name: draw.uniform(0.1, 3, shape) for name in ("theta_t", "phi_t", "theta_r", "phi_r")}
+    shape, met = (6, 2, 3), draw.choice([1, 4, 8], (2, 6, 2, 3)).astype(np.int32)
+    met[1] *= draw.integers(0, 2, shape)
+    first, second = vertices = draw.normal(size=(*met.shape, 3))
+    sources, targets = 0.3 * draw.normal(size=(2, 3)), 0.3 * draw.normal(size=(6, 3))
+    second = np.where(met[1, ..., None] > 0, second, first)
+    legs = first - sources[None, :, None], second - first, targets[:, None, None] - second
     return RayPaths(
         a=0.1 * (draw.normal(size=shape) + 1j * draw.normal(size=shape)),
-        tau=draw.uniform(1e-8, 1e-7, shape),
-        **angles,
+        tau=sum(np.linalg.norm(leg, axis=-1) for leg in legs) / SPEED_OF_LIGHT,
+        **{name: draw.uniform(0.1, 3, shape) for name in ("theta_t", "phi_t", "theta_r", "phi_r")},
         interactions=met,
-        vertices=draw.normal(size=(*met.shape, 3)),
+        vertices=vertices,
         valid=np.ones(shape, bool),
-        sources=0.3 * draw.normal(size=(2, 3)),
-        targets=0.3 * draw.normal(size=(6, 3)),
+        sources=sources,
+        targets=targets,
         frequency_hz=28e9,
     )
 

@@ -31,8 +31,9 @@ class Room:
     """int32."""
     face_part: Int[np.ndarray, " faces"]
     """int32: the object that every triangle is of."""
-    parts: list[dict[str, Any]] = field(default_factory=list)
-    """Of every object "name", "material" and "thickness" (metres; 0: not known)."""
+    parts: Any = field(default_factory=list)
+    """A list: of every object a mapping of "name", "material" and "thickness" (metres; 0: not known). As a file has it:
+    `materials_of` checks it."""
 
 
 def save_room(path: Path | str, room: Room) -> None:
@@ -54,7 +55,7 @@ def load_room(path: Path | str) -> Room:
         raise UserError(f"{path} is no room file: it lacks {', '.join(missing)}; {advice}")
     with told(f"meta of room file {path}", advice):
         meta = json.loads(str(arrays.pop("meta")))
-        parts = list(meta.get("parts", []))
+        parts = meta.get("parts", [])
     room = Room(**check_mesh(arrays, str(path)), parts=parts)
     if not len(room.faces):
         raise UserError(f"{path} holds no triangles; {advice}")
