@@ -14,7 +14,7 @@ import re
 from pathlib import Path
 import jax, numpy as np
 assert jax.config.jax_enable_x64
-exec(re.findall(r"```python\n(.*?)```", Path("README.md").read_text(), re.S)[0])
+exec(re.findall(r"```python\n(.*?)```", Path("docs/concepts.md").read_text(), re.S)[0])
 pas = render(params, plan, wb.make_query([[1.0, 2.0, 1.5]], [2.4e9]))
 assert pas.dtype == np.float32 and all(leaf.dtype != np.float64 for leaf in jax.tree.leaves(params))
 assert np.isfinite(d_tx).all() and np.isfinite(d_frequency).all()

@@ -59,10 +59,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def readme(names: dict) -> None:
+    assert names["pas"].shape == (2, 90, 360) and names["slope"].shape == (3,)
+    assert bool(np.isfinite(names["slope"]).all())
+
+
+def concepts(names: dict) -> None:
     assert names["image"].shape == (1, 90, 360)
     assert names["d_tx"].shape == (3,) and float(abs(names["d_tx"]).max()) > 0
     assert float(abs(names["d_params"].gaussians.log_scales).max()) > 0  # nothing is frozen
-    assert names["pas"].shape == (2, 90, 360)
+    assert names["pas"].shape == (90, 360)
 
 
 def inference(names: dict) -> None:
@@ -122,7 +127,19 @@ ELSEWHERE = {"applications.md": ROOT / "tests" / "applications" / "test_guide.py
 """Pages whose blocks another test runs."""
 HOLDS: dict[str, Callable[[dict], None]] = {
     f"{check.__name__}.md": check
-    for check in (inference, new_field, recipes, start, own_scene, measured, formats, interchange, experiments, viewer)
+    for check in (
+        concepts,
+        inference,
+        new_field,
+        recipes,
+        start,
+        own_scene,
+        measured,
+        formats,
+        interchange,
+        experiments,
+        viewer,
+    )
 } | {"README.md": readme}
 """What must hold of the names that a page's blocks leave, by page."""
 
