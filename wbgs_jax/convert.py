@@ -41,7 +41,7 @@ class Command:
     out: Path
     """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). Else: a scene file or a room file, .npz."""
     model: tyro.conf.Positional[Path | None] = None
-    """A model of a room: .glb, .gltf, .obj, .ply, or the .xml of Sionna RT; or ..."""
+    """A room: .glb, .gltf, .obj, .ply, or Sionna RT's .xml; or ..."""
     run: Path | None = None
     """... a run folder, or ..."""
     paths: Path | None = None
@@ -67,7 +67,7 @@ class Command:
     tx_antenna: int | None = None
     """Of --paths whose transmitters have several antennas: which one, 1, 2, ..."""
     mesh: Path | None = None
-    """Of --paths: the scene's surfaces, a room file or a model in metres, which the coherent field needs."""
+    """Of --paths: the room, a room file or a model in metres."""
     swap: bool = False
     """Of --paths: train for the other side: the transmitters' of Sionna RT, the users' of DeepMIMO."""
     tx_set: int | None = None
