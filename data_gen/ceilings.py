@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import snapshot_to_pas
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from jaxtyping import Int
 
 from data_gen.ceilings import scaled, scaled_images
 from data_gen.report import table
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import SceneFile, load_scene
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import correlation
 

@@ -18,9 +18,9 @@ from data_gen.ceilings import scaled
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.radio.channel import correlation
 

@@ -23,9 +23,9 @@ from data_gen.llvm import CUDA, find_backend
 from data_gen.options import Options, make_job
 from data_gen.own_scene import describe
 from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.progress import CountProgress
+from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.data.scene_file import TEST, SceneFile, save_scene
 from wbgs_jax.data.splits import tx_disjoint_split
 

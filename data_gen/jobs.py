@@ -20,10 +20,9 @@ from jaxtyping import Float
 from data_gen.llvm import find_backend, use_backend
 from data_gen.scenes.base import SceneSpec
 from data_gen.settings import ArraySettings, SolverSettings
-from wbgs_jax._util.archives import read_arrays
-from wbgs_jax._util.cluster import LOCAL, connected, finished
+from wbgs_jax._util.dask_cluster import LOCAL, connected, finished
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, read_arrays
 
 if TYPE_CHECKING:
     from data_gen.solve import Simulator, TxPaths

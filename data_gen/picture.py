@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull
 
 from data_gen.options import SceneOptions
 from data_gen.scenes import Part, SceneSpec
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import atomic_write
 
 COLORS = {

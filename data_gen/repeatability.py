@@ -17,12 +17,12 @@ from data_gen.convergence import settings, some_tx, traced
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import ArraySettings
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.data.load import RELEASED
-from wbgs_jax.data.repeatability import FILE
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.evaluation.score import FILE
+from wbgs_jax.metrics import ssim
 
 if TYPE_CHECKING:
     from data_gen.scenes import SceneSpec

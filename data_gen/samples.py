@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.load import scene_dataset

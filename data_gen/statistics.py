@@ -7,7 +7,7 @@ from data_gen.jobs import Results
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.scene_file import TEST, SceneFile
 from wbgs_jax.evaluation.baselines import baselines
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.metrics import ssim
 
 DIGITS = 4
 """Decimals kept: far below the spread over transmitters, far above rounding noise."""

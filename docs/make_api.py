@@ -25,7 +25,7 @@ TITLES = {
     "inference": "A trained field",
     "training": "A trained field",
     "applications": "What a trained field is for",
-    "measured": "Measured powers",
+    "power_map": "Measured powers",
     "interchange": "Other programs",
     "_util": "Writing a field",
 }
@@ -104,7 +104,6 @@ def page() -> str:
     for module, name in public_names():
         room = module.split(".")[1]
         value = getattr(importlib.import_module(module), name, None)
-        value = importlib.import_module(f"{module}.{name}") if name in HIDDEN else value
         entry = module_entry(name, value) if isinstance(value, ModuleType) else document(name, value)
         parts[TITLES[room]].append(entry)
     return "\n".join([HEAD, *(f"## {title}\n\n" + "\n".join(entries) for title, entries in parts.items() if entries)])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile, save_scene
 

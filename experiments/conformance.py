@@ -19,7 +19,7 @@ import tyro
 
 from experiments.markdown import markdown
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
 from wbgs_jax.evaluation.report import environment

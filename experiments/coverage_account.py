@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import environment
 

@@ -17,19 +17,25 @@ from jaxtyping import Float
 
 from experiments.few import SHARED
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.fields import noise
-from wbgs_jax.fields.trust import SHARES
-from wbgs_jax.training import absent, clutter, geometry, idealisations, neighbours, thicknesses, tuning
-from wbgs_jax.training.mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
-from wbgs_jax.training.run import CALIBRATED
-from wbgs_jax.training.scores import surely_better
+from wbgs_jax.fields import mixture as noise
+from wbgs_jax.fields.mixture import SHARES
+from wbgs_jax.training import fit_kriging as neighbours
+from wbgs_jax.training.calibration import alignment as geometry
+from wbgs_jax.training.calibration import array_gains as tuning
+from wbgs_jax.training.calibration import obstacles as absent
+from wbgs_jax.training.calibration import obstacles as clutter
+from wbgs_jax.training.calibration import propagation_options as idealisations
+from wbgs_jax.training.calibration import thickness as thicknesses
+from wbgs_jax.training.calibration.objective import surely_better
+from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
+from wbgs_jax.training.loop import CALIBRATED
 
 COUNTS = (3, 10, 30, 100)
 """Transmitters that decide."""

@@ -19,9 +19,9 @@ import tyro
 
 from experiments.devices_paper import on_paper
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
+from wbgs_jax._util.devices import COORDINATOR, COUNT, NUMBER
 from wbgs_jax._util.files import read_json, write_json
-from wbgs_jax._util.processes import COORDINATOR, COUNT, NUMBER
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.training import curves
 

@@ -29,12 +29,12 @@ from jaxtyping import Float, Int
 
 from experiments.results import FOLDER
 from wbgs_jax import load_trained, locator, score_beams
-from wbgs_jax import train as training
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.applications.locate import pooled
+from wbgs_jax.commands import train as training
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.baselines import nearest_tx
 from wbgs_jax.evaluation.report import provenance

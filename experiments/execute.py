@@ -14,18 +14,17 @@ from jaxtyping import Float, Int, UInt8
 from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.settings import settings
-from wbgs_jax._util.archives import read_arrays
+from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, read_arrays
 from wbgs_jax.config import Settings
 from wbgs_jax.data import Dataset
-from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import default_field
 from wbgs_jax.inference.predictor import corrected, predict_spectra
+from wbgs_jax.training.fit_kriging import learn_neighbours
 from wbgs_jax.training.loop import train
-from wbgs_jax.training.neighbours import learn_neighbours
 from wbgs_jax.training.run_folder import RunConfig, prepare_folder
 
 CURVE_POINTS = 200

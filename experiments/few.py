@@ -20,23 +20,23 @@ import tyro
 from jaxtyping import Float, Int
 
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.commands.train import learn_beside
 from wbgs_jax.config import Settings
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation, training_links
-from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.evaluation.score import evaluate
 from wbgs_jax.fields import default_field, get_field
-from wbgs_jax.inference.confidence import LEVEL
+from wbgs_jax.inference.intervals import LEVEL
 from wbgs_jax.inference.mixture import Mixture
 from wbgs_jax.inference.predictor import predict_spectra
-from wbgs_jax.train import learn_beside
-from wbgs_jax.training.few import Training, cross_validated
+from wbgs_jax.metrics import ssim
+from wbgs_jax.training.cross_validation import Training, cross_validated
+from wbgs_jax.training.fit_mixture import HeldOut, Known, learn_members, predict_members, share_scores, simple_answers
 from wbgs_jax.training.loop import train
-from wbgs_jax.training.mixture import HeldOut, Known, learn_members, predict_members, share_scores, simple_answers
 from wbgs_jax.training.run_folder import RunConfig, load_trained, write_config
 
 ROWS = FOLDER / "few"

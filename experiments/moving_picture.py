@@ -22,14 +22,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.inference.floor import cut_at
 from wbgs_jax.inference.predictor import observe
+from wbgs_jax.inference.radio_map import cut_at
+from wbgs_jax.metrics import ssim
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.viewer.walk import stops
 

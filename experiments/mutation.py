@@ -20,7 +20,7 @@ from typing import Any
 import tyro
 
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import environment
@@ -28,9 +28,9 @@ from wbgs_jax.evaluation.report import environment
 ROOT = Path(__file__).parents[1]
 MODULES = {
     "splat/composite": ("splat",),
-    "splat/project": ("splat",),
+    "splat/projection": ("splat",),
     "radio/array": ("radio",),
-    "propagation/slab": ("propagation/test_slab.py", "propagation/test_transport.py"),
+    "propagation/materials": ("propagation/test_slab.py", "propagation/test_transport.py"),
     "propagation/utd": ("propagation/test_utd.py", "propagation/test_transport.py"),
     "propagation/image_method": ("propagation/test_paths.py", "propagation/test_transport.py"),
 }

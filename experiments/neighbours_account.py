@@ -14,7 +14,7 @@ import tyro
 
 from experiments.results import FOLDER
 from wbgs_jax import load_trained
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.evaluation.score import evaluate

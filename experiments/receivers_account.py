@@ -19,13 +19,13 @@ from jaxtyping import Float, Int
 
 from experiments.results import FOLDER
 from wbgs_jax import load_trained
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset, released_scenes
-from wbgs_jax.evaluation.metrics import score
 from wbgs_jax.evaluation.report import provenance
 from wbgs_jax.inference.predictor import at_receiver, observe_queries
+from wbgs_jax.metrics import score
 from wbgs_jax.training.run_folder import TrainedField
 
 KEPT = ("median_ssim", "mean_ssim", "p10_ssim")

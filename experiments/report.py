@@ -5,7 +5,7 @@ from typing import Any
 from experiments.catalogue import SERIES
 from experiments.markdown import markdown
 from experiments.results import FOLDER, Results
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import read_json
 
 

@@ -31,12 +31,12 @@ from experiments.execute import execute
 from experiments.jobs import Job
 from experiments.paper import DENSE_SCENE
 from experiments.results import FOLDER, Results
-from wbgs_jax._util.cluster import connected, finished
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.dask_cluster import connected, finished
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.training.lock import Taken, locked
 from wbgs_jax.training.loop import Interrupted
+from wbgs_jax.training.run_folder import Taken, locked
 
 RUNS = Path("runs/experiments")
 GO_ON = "the time is up: run the same command again to go on"

@@ -18,20 +18,19 @@ import tyro
 from jaxtyping import Float
 
 from experiments.results import FOLDER
-from wbgs_jax import WaveConfig, make_mesh, pas_directions, wave
-from wbgs_jax._util.command import run_command
+from wbgs_jax import WaveConfig, make_mesh, metrics, pas_directions, wave
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.sight import in_sight
-from wbgs_jax.evaluation import metrics
+from wbgs_jax.data.scene import in_sight
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.geometry import to_local
-from wbgs_jax.training.antennas import AntennaReport, search_antennas
-from wbgs_jax.training.data import training_data
-from wbgs_jax.training.scores import make_scores
+from wbgs_jax.training.batches import training_data
+from wbgs_jax.training.calibration.antennas import AntennaReport, search_antennas
+from wbgs_jax.training.calibration.objective import make_scores
 from wbgs_jax.types import Links
 
 CONFIG = WaveConfig(

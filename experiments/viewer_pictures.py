@@ -23,13 +23,13 @@ import numpy as np
 import tyro
 
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
+from wbgs_jax.commands.view import Command as ViewCommand
+from wbgs_jax.commands.view import start
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.view import Command as ViewCommand
-from wbgs_jax.view import start
 from wbgs_jax.viewer.app import Viewer
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 
 
 def call(main, *arguments) -> SimpleNamespace:

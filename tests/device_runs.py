@@ -13,12 +13,12 @@ import numpy as np
 from synthetic import tiny_dataset, tiny_settings
 from toys import GROWING
 
-from wbgs_jax._util.devices import Devices
-from wbgs_jax._util.processes import COORDINATOR, connect
+from wbgs_jax._util.devices import COORDINATOR, Devices, connect
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.inference import maps, predictor
+from wbgs_jax.inference import batching as maps
+from wbgs_jax.inference import predictor
 from wbgs_jax.training.loop import TrainResult, train
 from wbgs_jax.training.run_folder import TrainedField
 

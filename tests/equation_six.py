@@ -3,7 +3,7 @@
 import numpy as np
 
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
-from wbgs_jax.splat.project import SUPPORT
+from wbgs_jax.splat.projection import SUPPORT
 
 
 def pixel(splats, attenuation, signal, row, column):

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from wbgs_jax.fields import wave
-from wbgs_jax.fields.wave import WaveConfig
-from wbgs_jax.propagation.edges import Edges, edges_of_facets
-from wbgs_jax.propagation.facets import Facets, facets_from_mesh
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields.coherent import WaveConfig
+from wbgs_jax.mesh.edges import Edges, edges_of_facets
+from wbgs_jax.mesh.facets import Facets, facets_from_mesh
 from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.materials import Slabs, complex_permittivity
 from wbgs_jax.propagation.paths import TracedPaths, trace_paths
-from wbgs_jax.propagation.slab import Slabs, complex_permittivity
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.types import Mesh, Receiver, make_receiver

@@ -9,9 +9,9 @@ from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.dataset import Dataset, Kind
 from wbgs_jax.data.scene_file import SceneFile
 from wbgs_jax.fields import get_field
+from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.hybrid import HybridConfig
 from wbgs_jax.fields.nerf2 import Nerf2Config
-from wbgs_jax.fields.wave import WaveConfig
 from wbgs_jax.fields.wideband import WidebandConfig
 from wbgs_jax.fields.wrfgs import without_frequency
 from wbgs_jax.radio.array import planar_array

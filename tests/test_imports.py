@@ -99,12 +99,12 @@ def test_public_names_are_loaded_when_they_are_asked_for():
     ("words", "expected"),
     [
         (["python", "-m", "wbgs_jax", "train"], True),
-        (["python", "-m", "wbgs_jax.train"], True),
-        (["python", "-X", "dev", "-m", "wbgs_jax.data.layout"], True),
+        (["python", "-m", "wbgs_jax.commands.train"], True),
+        (["python", "-X", "dev", "-m", "wbgs_jax.commands.export_folder"], True),
         (["python", "/venv/bin/wbgs-jax", "train"], True),
-        (["python", "-c", "import wbgs_jax.train"], False),
-        (["python", "program.py", "wbgs_jax.train"], False),
-        (["python", "-m", "pytest", "--pyargs", "wbgs_jax.train"], False),
+        (["python", "-c", "import wbgs_jax.commands.train"], False),
+        (["python", "program.py", "wbgs_jax.commands.train"], False),
+        (["python", "-m", "pytest", "--pyargs", "wbgs_jax.commands.train"], False),
         (["python", "-m", "wbgs_jax_tools"], False),
     ],
 )

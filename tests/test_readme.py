@@ -11,7 +11,7 @@ import pytest
 from synthetic import tiny_scene
 
 import wbgs_jax as wb
-from wbgs_jax import train
+from wbgs_jax.commands import train
 from wbgs_jax.fields import base
 
 ROOT = Path(__file__).parents[1]

@@ -18,19 +18,17 @@ from commands import assert_error_for_people, call
 from synthetic import tiny_dataset, tiny_scene, tiny_settings
 from untrained import make_coherent_run
 
-from wbgs_jax import eval as evaluation
-from wbgs_jax import predict
-from wbgs_jax._util import archives
+from wbgs_jax._util import files as archives
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import safe_name
-from wbgs_jax._util.yaml_files import read_yaml
+from wbgs_jax._util.files import read_yaml, safe_name
+from wbgs_jax.commands import evaluate as evaluation
+from wbgs_jax.commands import predict
 from wbgs_jax.data import load_dataset, save_scene
-from wbgs_jax.data.checksum import checksum
+from wbgs_jax.data.dataset import checksum
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.lock import FILE, locked
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.training.run_folder import FILE, load_trained, locked
 
 SETTINGS = tiny_settings("wave")
 
@@ -242,7 +240,7 @@ def test_without_git_results_have_no_commit(tmp_path, monkeypatch):
 
 
 def test_a_reader_that_has_gone_is_no_traceback():
-    program = "import sys; from wbgs_jax._util.command import run_command\nrun_command(lambda: print('x' * 999_999))"
+    program = "import sys; from wbgs_jax._util.cli import run_command\nrun_command(lambda: print('x' * 999_999))"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.read(10)
     process.stdout.close()

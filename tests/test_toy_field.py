@@ -16,9 +16,9 @@ from synthetic import FREQUENCIES_HZ, tiny_scene
 from toys import metrics_of
 
 import wbgs_jax as wb
-from wbgs_jax import eval as eval_command
-from wbgs_jax import predict as predict_command
-from wbgs_jax import train as train_command
+from wbgs_jax.commands import evaluate as eval_command
+from wbgs_jax.commands import predict as predict_command
+from wbgs_jax.commands import train as train_command
 from wbgs_jax.config import PRESETS
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.data.splits import hold_out_validation, select_receivers

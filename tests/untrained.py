@@ -10,10 +10,10 @@ import numpy as np
 from synthetic import tiny_dataset, tiny_scene, tiny_settings
 
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.wave import WaveField
+from wbgs_jax.fields.coherent import WaveField
 from wbgs_jax.fields.wideband import WidebandField, WidebandParams
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.run_folder import RunConfig, TrainedField, write_config

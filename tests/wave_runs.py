@@ -9,9 +9,9 @@ from rooms import box, mesh_of, room
 from synthetic import tiny_scene
 
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.fields import wave
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.materials import ITU_MATERIALS
 from wbgs_jax.types import make_query
 
 RX = (1.0, 1.0, 1.2)

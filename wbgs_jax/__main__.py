@@ -1,5 +1,5 @@
 """`python -m wbgs_jax` is the console script `wbgs-jax`."""
 
-from wbgs_jax.cli import main
+from wbgs_jax.commands.main import main
 
 main()

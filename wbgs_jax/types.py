@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int, Key
 
 from wbgs_jax._util.checks import check_array, concrete
 from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.radio.antenna import pattern_exponents
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.radio.channel import received_power_db
-from wbgs_jax.radio.patterns import pattern_exponents
 
 ElementUnit = Literal["wavelengths", "metres"]
 """Unit of element positions: "wavelengths" is an array that scales with the frequency, "metres" one of fixed size."""

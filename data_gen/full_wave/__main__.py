@@ -17,8 +17,8 @@ from data_gen.full_wave.convergence import convergence
 from data_gen.full_wave.elements import cabin_model, digest, element_file, get_element, get_scale, sources
 from data_gen.full_wave.openems import run_openems, version
 from data_gen.generate import say_written, writable
-from wbgs_jax._util.command import run_command
-from wbgs_jax._util.progress import CountProgress
+from wbgs_jax._util.cli import run_command
+from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene_file import save_scene
 

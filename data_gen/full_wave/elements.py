@@ -18,7 +18,7 @@ from data_gen.full_wave.cabin import FREQUENCIES_HZ, RX_POSITION, cabin_blocks, 
 from data_gen.full_wave.calibration import CALIBRATION_DURATION, Scale, Solver, calibrate
 from data_gen.full_wave.model import MARGIN, MEDIA, PML_CELLS, REFERENCE_HZ, Model
 from data_gen.scenes.geometry import Vec3
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 from wbgs_jax._util.files import atomic_write
 
 

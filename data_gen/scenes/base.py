@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from data_gen.scenes.geometry import Vec3, crossings, distance, winding_number
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.building_materials import THICKNESS, check_material
+from wbgs_jax.interchange.room_materials import THICKNESS, check_material
 
 GAP = 0.01
 """Metres between furniture and the floor or wall it stands at; hides nothing and keeps surfaces apart."""

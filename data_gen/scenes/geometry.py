@@ -13,8 +13,8 @@ import trimesh
 from jaxtyping import Float, Int
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
-from wbgs_jax._util import solids
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.mesh import solids
 
 Vec3 = tuple[float, float, float]
 

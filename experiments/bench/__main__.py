@@ -22,7 +22,7 @@ from rich.console import Console
 
 from experiments.bench import gate, quality, queries, rays, renderer, training
 from experiments.bench.timing import Effort, Report
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import device_name, environment

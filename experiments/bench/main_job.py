@@ -16,7 +16,7 @@ import tyro
 
 from experiments.profiles import BY_ADAM, STEPS_BY_ADAM
 from experiments.results import FOLDER
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data import load_dataset

@@ -17,7 +17,7 @@ import jax
 
 from experiments.bench.timing import Effort, Report
 from experiments.bench.training import preset, settings, start_run
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 from wbgs_jax._util.errors import UserError
 
 TARGETS = (0.72, 0.80, 0.85)
@@ -83,7 +83,17 @@ def train(effort: Effort, folder: Path) -> Curve:
 def start_seconds(effort: Effort) -> tuple[float, float]:
     """Seconds of the training command for one epoch, with JAX's persistent compilation cache empty and filled."""
     steps = settings(effort).loop.epoch_steps
-    command = [sys.executable, "-m", "wbgs_jax.train", "--scene", "1", "--preset", preset(effort), "--optim.steps", str(steps)]
+    command = [
+        sys.executable,
+        "-m",
+        "wbgs_jax.commands.train",
+        "--scene",
+        "1",
+        "--preset",
+        preset(effort),
+        "--optim.steps",
+        str(steps),
+    ]
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         variables = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/cache", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}

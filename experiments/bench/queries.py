@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.bench.timing import Effort, Report, interleaved, timed
 from experiments.bench.training import start_run
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 from wbgs_jax.inference.predictor import BLOCK, render_pas
 
 QUERIES = 1000

@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from experiments.bench import tracers
 from experiments.bench.timing import Effort, Report, interleaved, timed
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.fields import wave
-from wbgs_jax.fields.wave import WaveConfig
-from wbgs_jax.fields.wave_settings import MAX_FACETS
+from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields.coherent import WaveConfig
+from wbgs_jax.fields.coherent_settings import MAX_FACETS
 from wbgs_jax.types import Mesh, make_query, make_receiver
 
 SCENES, RIVAL_SCENES = ("2", "3", "4", "5"), ("1", "2")

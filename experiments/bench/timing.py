@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 
 Seconds = Float[np.ndarray, " rounds"]
 Name = TypeVar("Name", bound=Hashable)

@@ -21,7 +21,7 @@ from torch import Tensor
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat import Splats
-from wbgs_jax.splat.footprint import CUT, GAIN
+from wbgs_jax.splat.projection import CUT, GAIN
 
 GROUP_ELEMENTS = 2**19
 """(tile, query, Gaussian, pixel) values blended at a time by `groups`: more leave the cache, fewer cost calls."""

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.fields import wave
+from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.fields import coherent as wave
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.training.materials import ITU_MATERIALS, with_entry
+from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, with_entry
 from wbgs_jax.types import make_receiver
 
 ORDERS = (0, 1, 2)

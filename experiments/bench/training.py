@@ -16,15 +16,15 @@ import optax
 
 from experiments.bench.timing import Effort, Report, interleaved
 from experiments.profiles import TINY
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
+from wbgs_jax.commands.train import default_preset
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
-from wbgs_jax.train import default_preset
-from wbgs_jax.training.data import limited
+from wbgs_jax.training.batches import limited
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients
 

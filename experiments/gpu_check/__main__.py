@@ -28,7 +28,7 @@ import tyro
 
 from experiments.gpu_check import progress
 from experiments.gpu_check.record import PART, PIECES, TRAININGS, Name, State, begin, parity_holds
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json
 

@@ -20,11 +20,11 @@ from experiments.bench.scene import random_scene
 from experiments.profiles import TINY
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.data.rssi_folder import Readings
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import field_names, get_field
-from wbgs_jax.inference.confidence import FEATURES, POWER_FEATURES, Confidence, PowerConfidence
-from wbgs_jax.measured.readings import Readings
-from wbgs_jax.training.data import TrainingData, training_data
+from wbgs_jax.inference.intervals import FEATURES, POWER_FEATURES, Confidence, PowerConfidence
+from wbgs_jax.training.batches import TrainingData, training_data
 from wbgs_jax.training.run_folder import RunConfig, TrainedField
 
 ON_THE_HOST = frozenset(

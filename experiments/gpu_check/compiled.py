@@ -20,7 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from experiments.bench.scene import gradient_of, random_scene
 from experiments.gpu_check.record import rounded
-from wbgs_jax._util.command import run_command, say
+from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.files import write_json
 from wbgs_jax.config import changed
 from wbgs_jax.data import load_dataset

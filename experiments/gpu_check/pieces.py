@@ -16,10 +16,10 @@ import jax.monitoring
 
 from experiments.gpu_check import parity, renderer, training
 from experiments.gpu_check.record import PART, TRAININGS, Record
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax.evaluation.report import device_name, environment
-from wbgs_jax.training.interrupts import Interrupted
+from wbgs_jax.training.progress import Interrupted
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's name of the time that XLA takes for a program, or the cache of programs."""

@@ -23,13 +23,13 @@ import numpy as np
 from experiments.gpu_check.progress import figures_of
 from experiments.gpu_check.record import Record
 from experiments.paper import GHZ_10
-from wbgs_jax import train
+from wbgs_jax.commands import train
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.evaluation.metrics import ssim
 from wbgs_jax.fields import get_field
 from wbgs_jax.inference.predictor import observe
+from wbgs_jax.metrics import ssim
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.data import limited
+from wbgs_jax.training.batches import limited
 from wbgs_jax.training.run_folder import MANIFEST, TrainedField, load_trained
 
 WRFGS_GHZ = 37

@@ -16,7 +16,7 @@ from experiments.results import FOLDER, Results
 from experiments.tables import faults, summary
 from experiments.tables.page import page
 from experiments.tables.plots import save
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import atomic_write
 
 DOCS = Path(__file__).parents[2] / "docs"

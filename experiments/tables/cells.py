@@ -10,8 +10,8 @@ from experiments.jobs import Job
 from experiments.results import Results
 from experiments.statistics import compare, estimate, level
 from wbgs_jax.data import released_scenes
-from wbgs_jax.data.repeatability import repeatability
 from wbgs_jax.data.scene_file import load_scene
+from wbgs_jax.evaluation.score import repeatability
 
 NOT_RUN = "not run yet"
 Scores = Float[np.ndarray, "seeds tx ghz"]

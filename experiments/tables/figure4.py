@@ -12,7 +12,7 @@ from experiments.results import Results
 from experiments.tables import table1
 from experiments.tables.cells import NAMES, NOT_RUN
 from experiments.tables.plots import save
-from wbgs_jax.evaluation import metrics
+from wbgs_jax import metrics
 
 TITLE = "Figure 4: predicted spectra"
 

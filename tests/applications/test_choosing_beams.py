@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax.applications.beams import RIGHT_DB, beam_directions, choose_beams, rank_beams, score_beams
-from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.radio.codebook import codebook
+from wbgs_jax.radio.array import codebook, pas_directions
 
 
 def test_beams_are_ranked_as_a_search_through_all_of_them_ranks_them(rng):

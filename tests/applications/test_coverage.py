@@ -8,7 +8,7 @@ from rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
 from untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.coverage import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
+from wbgs_jax.applications.antenna_placement import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
 
 HZ = 2.4e9
 BOX = np.array([[0.5, -1.0, 0.9], [3.5, 1.0, 1.1]])

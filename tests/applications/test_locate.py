@@ -12,9 +12,9 @@ from synthetic import RX
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.applications.descent import best_apart, gauss_newton, grid_over, in_blocks
 from wbgs_jax.applications.locate import Locator, locator
-from wbgs_jax.fields.noise import with_floor
+from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks
+from wbgs_jax.fields.mixture import with_floor
 from wbgs_jax.types import Query, make_receiver
 
 HZ = np.array([1e9, 10e9])

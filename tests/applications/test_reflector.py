@@ -8,7 +8,7 @@ from mirrors import Blind
 from rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.coverage import power_at_users
+from wbgs_jax.applications.antenna_placement import power_at_users
 from wbgs_jax.applications.reflector import place_reflector, plate_axes, reflector, straight_powers
 
 HZ = 10e9

@@ -8,7 +8,7 @@ from mirrors import Blind
 from rooms import METAL, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.turning import arrivals_anywhere, boresight_quaternion, power_when_turned, turn_array
+from wbgs_jax.applications.array_orientation import arrivals_anywhere, boresight_quaternion, power_when_turned, turn_array
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.types import Query, make_receiver

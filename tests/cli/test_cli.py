@@ -8,10 +8,10 @@ from synthetic import tiny_scene
 from toys import RippleField, registered
 
 import wbgs_jax
-from wbgs_jax import cli
-from wbgs_jax import train as train_command
+from wbgs_jax.commands import main as cli
+from wbgs_jax.commands import train as train_command
 from wbgs_jax.config import sections
-from wbgs_jax.data.layout import load_layout
+from wbgs_jax.data.image_folder import load_layout
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import field_names, get_field
 

@@ -6,7 +6,7 @@ import trimesh
 from commands import assert_error_for_people, call
 from untrained import make_coherent_run, make_run
 
-from wbgs_jax import convert as convert_command
+from wbgs_jax.commands import convert as convert_command
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.room_file import load_room
 from wbgs_jax.interchange.deepmimo import read_deepmimo

@@ -8,7 +8,7 @@ import pytest
 
 PROBE = """
 import contextlib, io, json, sys
-from wbgs_jax import cli
+from wbgs_jax.commands import main as cli
 sys.argv = ["wbgs-jax", *sys.argv[1:]]
 with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
     cli.dispatch()

@@ -10,12 +10,12 @@ from PIL import Image
 from synthetic import tiny_dataset
 from untrained import make_coherent_run, make_run
 
-from wbgs_jax import map as map_command
-from wbgs_jax import predict as predict_command
+from wbgs_jax.commands import map as map_command
+from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.inference.answers import bounds_of
-from wbgs_jax.inference.floor import BEST_BEAM, cut_at, pieces, plane_over
-from wbgs_jax.inference.map_pictures import LOOKS
-from wbgs_jax.radio.codebook import codebook
+from wbgs_jax.inference.radio_map import BEST_BEAM, cut_at, pieces, plane_over
+from wbgs_jax.plotting import LOOKS
+from wbgs_jax.radio.array import codebook
 from wbgs_jax.training.run_folder import load_trained
 
 AREA = ["--area", "-1,0:1,1", "--height", "1.3"]

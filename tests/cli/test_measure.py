@@ -8,7 +8,7 @@ import trimesh
 from commands import assert_error_for_people, call
 from flats import LAW, folder, powers
 
-from wbgs_jax.measure import main
+from wbgs_jax.commands.measure import main
 
 
 @pytest.mark.heavy

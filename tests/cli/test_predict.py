@@ -14,14 +14,14 @@ from synthetic import tiny_scene
 from toys import RippleConfig, RippleField, registered, toy_settings
 from untrained import SETTINGS, State, make_coherent_run, make_run
 
-from wbgs_jax import map as map_command
-from wbgs_jax import predict as predict_command
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.commands import map as map_command
+from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
-from wbgs_jax.inference import asking
-from wbgs_jax.inference.confidence import PowerConfidence, write_confidence
+from wbgs_jax.inference import evaluate_quantities as asking
 from wbgs_jax.inference.export import load_exported
+from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.run_folder import RunConfig, write_config
 

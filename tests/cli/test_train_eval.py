@@ -11,9 +11,9 @@ from synthetic import tiny_dataset, tiny_scene
 from toys import RippleField, registered
 
 import wbgs_jax
-from wbgs_jax import eval as eval_command
-from wbgs_jax import train as train_command
-from wbgs_jax.data.layout import export_layout
+from wbgs_jax.commands import evaluate as eval_command
+from wbgs_jax.commands import train as train_command
+from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.training import curves
@@ -310,5 +310,7 @@ def test_a_damaged_checkpoint_in_a_process_of_its_own(run, what):
 
 @pytest.mark.heavy
 def test_an_unknown_scene_in_a_process_of_its_own(tmp_path):
-    assert_error_for_people(in_a_process("wbgs_jax.train", "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene")
+    assert_error_for_people(
+        in_a_process("wbgs_jax.commands.train", "--scene", "no-such-scene", "--out", tmp_path / "run"), "no scene"
+    )
     assert list(tmp_path.iterdir()) == []

@@ -14,8 +14,7 @@ from by_sionna import Setup, response, trace
 from entries import entries
 
 from wbgs_jax.interchange.deepmimo import as_deepmimo, load_deepmimo, write_deepmimo
-from wbgs_jax.interchange.plausible_paths import check_paths
-from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths
+from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, check_paths
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 HERTZ = 3.5e9

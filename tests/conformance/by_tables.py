@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from entries import entries
 
-from wbgs_jax.measured.readings import load_readings
+from wbgs_jax.data.rssi_folder import load_readings
 
 HEIGHT = 1.3
 RECEIVERS = {"AP-03": (0.5, 0.5, 2.4), "AP-01": (9.0, 1.0, 2.0), "AP-12": (4.0, 6.5, 2.2)}

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from wbgs_jax.interchange.room_files import read_objects
+from wbgs_jax.mesh.importers import read_objects
 
 
 class Extent(NamedTuple):

@@ -11,11 +11,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from synthetic import tiny_scene
 
-from wbgs_jax import train as train_command
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.commands import train as train_command
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.conventions import array_of, find_convention, to_pas
-from wbgs_jax.data.layout import export_layout, load_layout
+from wbgs_jax.data.image_folder import export_layout, load_layout
 from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.training.run_folder import read_config
 from wbgs_jax.types import make_receiver

@@ -8,7 +8,7 @@ from synthetic import tiny_dataset, tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, save_scene
-from wbgs_jax.data.join import join
+from wbgs_jax.data.load import join
 from wbgs_jax.data.splits import select_receivers
 
 

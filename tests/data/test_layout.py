@@ -14,10 +14,10 @@ from synthetic import tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, scene_dataset
-from wbgs_jax.data.layout import NOMINAL_FREQUENCY_HZ, export_layout, load_layout, mesh_to_world, world_to_mesh
-from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.image_folder import NOMINAL_FREQUENCY_HZ, export_layout, load_layout, mesh_to_world, world_to_mesh
 from wbgs_jax.data.room_file import Room, save_room
 from wbgs_jax.data.scene_file import SceneFile, save_scene
+from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import planar_array
 
 N = 6
@@ -392,7 +392,7 @@ def test_a_split_without_test_has_no_form_in_the_layout(tmp_path, scene):
 @pytest.mark.heavy
 def test_command_line(tmp_path, scene):
     save_scene(tmp_path / "s.npz", scene)
-    command = [sys.executable, "-m", "wbgs_jax.data.layout", str(tmp_path / "s.npz"), str(tmp_path / "out")]
+    command = [sys.executable, "-m", "wbgs_jax.commands.export_folder", str(tmp_path / "s.npz"), str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert_same(load_layout(tmp_path / "out"), scene_dataset(scene))

@@ -3,10 +3,10 @@
 import pytest
 from commands import assert_error_for_people, call
 
-from wbgs_jax import convert as convert_command
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.commands import convert as convert_command
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.other_files import KINDS
+from wbgs_jax.data.load import KINDS
 
 
 @pytest.mark.parametrize("suffix", KINDS)

@@ -7,11 +7,9 @@ import pytest
 import trimesh
 from synthetic import tiny_dataset
 
-from wbgs_jax._util.solids import ClosedBody, inside
-from wbgs_jax.data.places import closed_bodies
-from wbgs_jax.inference.answers import bounds_of
-from wbgs_jax.inference.bounds import Bounds
-from wbgs_jax.inference.opened import _masked
+from wbgs_jax.data.scene import closed_bodies
+from wbgs_jax.inference.answers import Bounds, _masked, bounds_of
+from wbgs_jax.mesh.solids import ClosedBody, inside
 
 BESIDE = np.array([3.0, 3, 0])
 

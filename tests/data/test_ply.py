@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.mesh.ply import read_ply, write_ply
 
 HEADER = """ply
 format ascii 1.0

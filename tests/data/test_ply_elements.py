@@ -5,7 +5,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.ply_elements import Ragged, read_elements, write_elements
+from wbgs_jax.mesh.ply import Ragged, read_elements, write_elements
 
 KINDS = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
 

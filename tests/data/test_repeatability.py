@@ -3,7 +3,7 @@
 import pytest
 
 from wbgs_jax.data.load import load_dataset, released_scenes
-from wbgs_jax.data.repeatability import repeatability
+from wbgs_jax.evaluation.score import repeatability
 
 
 @pytest.mark.parametrize("number", [n for n in released_scenes() if n.isdecimal()])

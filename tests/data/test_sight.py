@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from synthetic import RX, tiny_dataset
 
-from wbgs_jax.data import sight
-from wbgs_jax.data.sight import in_sight
+from wbgs_jax.data import scene as sight
+from wbgs_jax.data.scene import in_sight
 
 
 def with_mesh(mesh, tx):

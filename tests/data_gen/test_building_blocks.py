@@ -25,8 +25,8 @@ from data_gen.scenes.furniture import (
 )  # fmt: skip
 from data_gen.scenes.geometry import box, crossings, distance, winding_number
 from data_gen.scenes.walls import Door, inner_wall, wall
-from wbgs_jax._util import solids
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.mesh import solids
 
 MORE = [bed(1.6), bench(1.5), cabinet(1, 0.5, 1), counter(2), desk(1.5), monitor(0.7), office_chair(), wardrobe(1.2)]
 

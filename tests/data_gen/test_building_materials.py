@@ -5,8 +5,8 @@ import math
 import pytest
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange import building_materials as materials
-from wbgs_jax.interchange.building_materials import Law, check_material_frequencies, own_law, own_material
+from wbgs_jax.interchange import room_materials as materials
+from wbgs_jax.interchange.room_materials import Law, check_material_frequencies, own_law, own_material
 
 
 def test_materials_of_the_released_scenes_cover_the_whole_band():

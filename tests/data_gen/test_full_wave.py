@@ -22,10 +22,10 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
-from wbgs_jax.propagation.slab import complex_permittivity, slab_coefficients
+from wbgs_jax.propagation.materials import complex_permittivity, slab_coefficients
+from wbgs_jax.radio.antenna import dipole_gain
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, snapshot_to_pas, steering_vector
-from wbgs_jax.radio.patterns import dipole_gain
-from wbgs_jax.training.materials import ITU_MATERIALS
+from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS
 
 CELL, DURATION = 0.03, 5e-9
 

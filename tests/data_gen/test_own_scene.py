@@ -65,7 +65,7 @@ def test_the_guide_shows_the_example():
 
 
 def test_the_guide_lists_every_material():
-    from wbgs_jax.interchange.building_materials import ITU
+    from wbgs_jax.interchange.room_materials import ITU
 
     text = GUIDE[GUIDE.index("The materials of ITU-R P.2040") :]
     for name, (thickness, low, _) in ITU.items():

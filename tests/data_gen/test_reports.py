@@ -13,7 +13,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.evaluation.baselines import baselines
-from wbgs_jax.evaluation.metrics import ssim
+from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import planar_array
 
 

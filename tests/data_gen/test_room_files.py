@@ -9,7 +9,7 @@ import trimesh
 from own_room import WRITERS, Y_UP, load, meshes, refused, toml, write_glb, write_xml
 
 from data_gen.example.make_room import OBJECTS, obj
-from wbgs_jax.interchange.room_files import read_objects
+from wbgs_jax.mesh.importers import read_objects
 
 
 @pytest.mark.parametrize("kind", WRITERS)

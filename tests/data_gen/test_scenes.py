@@ -14,7 +14,7 @@ from data_gen.scenes.base import RX_CLEARANCE, TX_CLEARANCE
 from data_gen.scenes.geometry import crossings, winding_number
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
-from wbgs_jax.interchange import building_materials as materials
+from wbgs_jax.interchange import room_materials as materials
 
 MAX_TRIANGLES = 2500
 OPEN_ROOMS, FLATS = (1, 6), (2, 3, 4, 5)

@@ -13,7 +13,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import select_frequencies, select_receivers
 from wbgs_jax.evaluation import baselines as module
 from wbgs_jax.evaluation.baselines import baselines
-from wbgs_jax.evaluation.metrics import score
+from wbgs_jax.metrics import score
 from wbgs_jax.radio.array import pas_directions, snapshot_to_pas, steering_vector
 from wbgs_jax.types import make_receiver, stack_receivers
 

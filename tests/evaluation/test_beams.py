@@ -4,9 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.evaluation.beams import FAINTEST_DB, angle_error_deg, beam_loss_db, plane_normal
-from wbgs_jax.radio.array import pas_directions, planar_array, snapshot_to_pas
-from wbgs_jax.radio.codebook import RINGS, SECTORS, best_beams, codebook
+from wbgs_jax.metrics import FAINTEST_DB, angle_error_deg, beam_loss_db, plane_normal
+from wbgs_jax.radio.array import RINGS, SECTORS, best_beams, codebook, pas_directions, planar_array, snapshot_to_pas
 
 
 def spot(row, column, width=200.0):

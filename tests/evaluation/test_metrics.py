@@ -8,8 +8,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.evaluation.beams import angle_error_deg, beam_loss_db
-from wbgs_jax.evaluation.metrics import PSNR_LIMIT_DB, mae, psnr_db, score, ssim
+from wbgs_jax.metrics import PSNR_LIMIT_DB, angle_error_deg, beam_loss_db, mae, psnr_db, score, ssim
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ from PIL import Image
 from synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, select_frequencies
-from wbgs_jax.evaluation.metrics import score
-from wbgs_jax.evaluation.pictures import draw_all, draw_curves, draw_frequencies, draw_motion, draw_spectra, spread
+from wbgs_jax.metrics import score
+from wbgs_jax.plotting import draw_all, draw_curves, draw_frequencies, draw_motion, draw_spectra, spread
 
 CURVE = [
     {"step": 2, "loss": 0.3, "batch_ssim": 0.2, "gaussians": 60, "seconds": 1.0},

@@ -9,7 +9,7 @@ from synthetic import tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.evaluation.power import free_space, nearest_power, power_figures, score_power
+from wbgs_jax.evaluation.score import free_space, nearest_power, power_figures, score_power
 
 
 def test_powers_are_scored_in_decibels():

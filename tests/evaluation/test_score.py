@@ -11,19 +11,18 @@ import pytest
 from synthetic import FREQUENCIES_HZ, tiny_dataset
 from toys import NoisyField, RippleConfig, RippleField
 
+from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.sight import in_sight
+from wbgs_jax.data.scene import in_sight
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.evaluation import metrics
 from wbgs_jax.evaluation.baselines import baselines
-from wbgs_jax.evaluation.beams import plane_normal
-from wbgs_jax.evaluation.power import power_figures
 from wbgs_jax.evaluation.report import closing_lines, table
-from wbgs_jax.evaluation.score import evaluate, held_out, score_snapshots, watch
+from wbgs_jax.evaluation.score import evaluate, held_out, power_figures, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.metrics import plane_normal
 
 
 @pytree

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.bench import __main__ as command_line
 from experiments.bench import gate, quality, renderer, timing
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 
 FIELDS = {"value", "unit", "direction", "spread", "tolerance"}

@@ -8,8 +8,8 @@ from synthetic import tiny_dataset
 
 from experiments.bench import rays, timing, tracers
 from experiments.bench.tracers import Found, compare
-from wbgs_jax.fields import wave
-from wbgs_jax.fields.wave import WaveConfig
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields.coherent import WaveConfig
 
 
 @pytest.mark.parametrize("facets", [30, 500])

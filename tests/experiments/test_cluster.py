@@ -17,7 +17,7 @@ from experiments import runner
 from experiments.jobs import Job
 from experiments.paper import GHZ_10
 from experiments.results import Results
-from wbgs_jax._util import cluster
+from wbgs_jax._util import dask_cluster as cluster
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import save_scene
 

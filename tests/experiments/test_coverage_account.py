@@ -13,7 +13,7 @@ def test_shares_are_of_all_lines_of_a_room(tmp_path):
         return {"summary": values}
 
     files = {
-        "wbgs_jax/train.py": file(9, 10, 0, 0),
+        "wbgs_jax/commands/train.py": file(9, 10, 0, 0),
         "wbgs_jax/splat/a.py": file(1, 2, 1, 4),
         "wbgs_jax/splat/b.py": file(8, 8, 3, 4),
     }

@@ -10,7 +10,7 @@ import pytest
 from experiments.gpu_check import __main__ as command_line
 from experiments.gpu_check.progress import figures_of
 from experiments.gpu_check.record import NEEDED_OF_STAND_IN, PIECES, TRAININGS, begin, parity_holds
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 
 DEVICE = {"name": "cpu", "platform": "cpu", "environment": {"commit": "abc", "jax": "1"}}
 HOLDS = {"pinned": True, "values": 0.0, "gradients": 0.0, "holds": True}
@@ -162,7 +162,7 @@ def test_figures_of_a_training_that_is_not_finished(tmp_path):
 def test_the_arguments_of_the_trainings_are_what_they_claim():
     from experiments.gpu_check.training import LEFT_OUT_GHZ, WRFGS_GHZ
     from experiments.gpu_check.training import TRAININGS as DEFINED
-    from wbgs_jax import train
+    from wbgs_jax.commands import train
     from wbgs_jax.fields.wideband import PAPER
     from wbgs_jax.fields.wrfgs import without_frequency
 

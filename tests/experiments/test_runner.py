@@ -14,7 +14,7 @@ from experiments import runner
 from experiments.jobs import Job
 from experiments.results import Results
 from experiments.variants import VARIANTS
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 
 JOB = Job("1", "wideband", profile="smoke")
 VALUES = {

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.fields import encoding
+from wbgs_jax.fields import networks as encoding
 
 positional_encoding = jax.jit(encoding.positional_encoding, static_argnums=1)
 scale_frequency = jax.jit(encoding.scale_frequency, static_argnums=1)

@@ -16,11 +16,12 @@ from synthetic import FIELDS
 
 from wbgs_jax import fields
 from wbgs_jax._util.pytree import replaced, with_leaves
-from wbgs_jax.data.surface import surface_from_points
-from wbgs_jax.fields import get_field, wave, wideband
+from wbgs_jax.data.scene import surface_from_points
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
+from wbgs_jax.propagation.materials import Slabs
 from wbgs_jax.propagation.paths import Paths
-from wbgs_jax.propagation.slab import Slabs
 from wbgs_jax.propagation.transport import arrivals
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.splat import TileLimits

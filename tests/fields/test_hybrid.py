@@ -10,10 +10,10 @@ from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.fields import get_field, hybrid, noise
+from wbgs_jax.fields import get_field, hybrid
+from wbgs_jax.fields import mixture as noise
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed, _Seen
-from wbgs_jax.fields.noise import with_floor, without_floor
-from wbgs_jax.fields.trust import FEATURES, Opinions, Shares, constant, reported
+from wbgs_jax.fields.mixture import FEATURES, Opinions, Shares, constant, reported, with_floor, without_floor
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.training.loop import Run, train

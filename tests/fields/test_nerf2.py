@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from synthetic import FIELDS, tiny_dataset, tiny_scene, tiny_settings
 
-from wbgs_jax import train as train_command
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.commands import train as train_command
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import nerf2
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.inference.predictor import predict_spectra
 from wbgs_jax.radio.array import PAS_SHAPE, pas_directions
-from wbgs_jax.training.data import training_data
+from wbgs_jax.training.batches import training_data
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.training.step import loss_and_gradients

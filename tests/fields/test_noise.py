@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.fields.noise import at_least_floor, floor_of, observed_opinions, with_floor, without_floor
-from wbgs_jax.fields.trust import Opinions
+from wbgs_jax.fields.mixture import Opinions, at_least_floor, floor_of, observed_opinions, with_floor, without_floor
 from wbgs_jax.radio.array import pas_directions, planar_array, snapshot_to_pas, steering_vector
 
 ARRAY = planar_array(4, 4, 0.5)

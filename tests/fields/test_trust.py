@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax.fields.base import Observation
-from wbgs_jax.fields.trust import (
+from wbgs_jax.fields.mixture import (
     FEATURES,
     SHARES,
     Opinions,

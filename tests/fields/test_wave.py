@@ -11,15 +11,17 @@ import pytest
 from rooms import box, field_of, mesh_of, rectangle, room
 from synthetic import FIELDS, tiny_dataset, tiny_scene
 
-from wbgs_jax import fields, predict, train
+from wbgs_jax import fields
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.commands import predict, train
 from wbgs_jax.data.load import scene_dataset
+from wbgs_jax.data.scene import DatasetScene, make_mesh
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.data.surface import DatasetScene, make_mesh
-from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.fields import get_field, wave
-from wbgs_jax.fields.wave import WaveConfig, WaveField
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import get_field
+from wbgs_jax.fields.coherent import WaveConfig, WaveField
 from wbgs_jax.inference.predictor import at_receiver, observe_links, predictor
+from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
 from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
 from wbgs_jax.training.run_folder import load_trained

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 from synthetic import FIELDS
 
-from wbgs_jax.data.surface import surface_from_points
+from wbgs_jax.data.scene import surface_from_points
 from wbgs_jax.fields import wideband
 from wbgs_jax.fields.em_features import DARK, MAX_ATTENUATION, given_features
 from wbgs_jax.fields.wideband import INITIAL_ATTENUATION, WidebandField, make_field

@@ -11,9 +11,9 @@ import pytest
 from commands import call
 from synthetic import ROOM, RX, tiny_scene
 
-from wbgs_jax import eval as eval_command
-from wbgs_jax import predict as predict_command
-from wbgs_jax import train as train_command
+from wbgs_jax.commands import evaluate as eval_command
+from wbgs_jax.commands import predict as predict_command
+from wbgs_jax.commands import train as train_command
 from wbgs_jax.data.scene_file import SceneFile, save_scene
 
 SMALL = ["--optim.steps", "4", "--optim.batch", "2"]

@@ -19,15 +19,15 @@ from untrained import STEP, make_field, make_params, make_run, make_trained
 import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.fields import get_field
+from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.hybrid import HybridConfig
-from wbgs_jax.fields.wave import WaveConfig
-from wbgs_jax.inference.confidence import write_confidence
 from wbgs_jax.inference.export import export_field, load_exported
+from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.predictor import predictor
-from wbgs_jax.training.confidence import learn_confidence
+from wbgs_jax.training.fit_intervals import learn_confidence
 
 
 @pytree

@@ -12,9 +12,9 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
-from wbgs_jax.inference.links import SIGHT, as_rows, ask_mimo, ask_paths, ask_response
+from wbgs_jax.data.tables import read_table
+from wbgs_jax.inference.evaluate_quantities import SIGHT, as_rows, ask_mimo, ask_paths, ask_response
 from wbgs_jax.inference.predictor import observe_queries
-from wbgs_jax.measured.tables import read_table
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
 from wbgs_jax.types import make_query
 

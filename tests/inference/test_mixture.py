@@ -9,9 +9,9 @@ import pytest
 from synthetic import RX, tiny_dataset
 
 from wbgs_jax.evaluation.baselines import line_of_sight, nearest_tx
+from wbgs_jax.inference.kriging import correct, for_receiver, read_neighbours, without_asked, write_neighbours
 from wbgs_jax.inference.mixture import MEMBERS, answer, field_share, member_spectra, member_weights
-from wbgs_jax.inference.neighbours import correct, for_receiver, read_neighbours, without_asked, write_neighbours
-from wbgs_jax.training.mixture import Known, start_mixture
+from wbgs_jax.training.fit_mixture import Known, start_mixture
 from wbgs_jax.types import make_query, make_receiver
 
 SOME = 0.3

@@ -11,9 +11,9 @@ from synthetic import RX, tiny_dataset
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.inference import neighbours as asked
-from wbgs_jax.inference.neighbours import NEAREST, NOISE, correct, for_receiver, read_neighbours, write_neighbours
-from wbgs_jax.training.neighbours import Choice, choices, images_of, make_neighbours
+from wbgs_jax.inference import kriging as asked
+from wbgs_jax.inference.kriging import NEAREST, NOISE, correct, for_receiver, read_neighbours, write_neighbours
+from wbgs_jax.training.fit_kriging import Choice, choices, images_of, make_neighbours
 from wbgs_jax.types import make_query, make_receiver
 
 

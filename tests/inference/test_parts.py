@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.inference.parts import Answers, open_parts, write_archive
+from wbgs_jax.inference.results_file import Answers, open_parts, write_archive
 
 QUESTION = {"what": "power", "numbers": [1, 2]}
 

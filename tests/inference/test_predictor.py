@@ -8,10 +8,10 @@ from jax.extend.core import jaxprs_in_params
 from synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene, tiny_settings
 from untrained import make_trained
 
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field
 from wbgs_jax.inference import predictor as inference
-from wbgs_jax.inference.maps import map_queries, predict_blocks, predict_many, predict_map
+from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
 from wbgs_jax.inference.predictor import predictor
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.types import Query, make_query, make_receiver

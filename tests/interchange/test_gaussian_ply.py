@@ -6,8 +6,8 @@ import pytest
 from plyfile import PlyData
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.ply import write_ply
 from wbgs_jax.interchange.gaussian_ply import NAMES, read_gaussians, write_gaussians
+from wbgs_jax.mesh.ply import write_ply
 from wbgs_jax.radio.geometry import covariance_factor, rotation_matrix
 from wbgs_jax.types import Gaussians
 

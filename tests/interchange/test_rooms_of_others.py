@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.interchange.room_files import read_objects
+from wbgs_jax.mesh.importers import read_objects
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 BOX = trimesh.creation.box((1, 1, 1))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from wbgs_jax.data.polygons import triangulate
-from wbgs_jax.data.sight import _obstructed
-from wbgs_jax.interchange.walls import walls_as_sheets
+from wbgs_jax.data.scene import _obstructed
+from wbgs_jax.mesh.polygons import triangulate
+from wbgs_jax.mesh.walls import walls_as_sheets
 
 
 def block(low, high):

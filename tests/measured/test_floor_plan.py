@@ -7,7 +7,7 @@ import pytest
 from flats import RECEIVERS, WALL, places, walls_between, write_table
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.measured.floor_plan import NO_WALLS, ON_WALL, Walls, crossings, extruded, load_walls
+from wbgs_jax.data.floor_plan import NO_WALLS, ON_WALL, Walls, crossings, extruded, load_walls
 
 SINGLE = Walls(WALL, np.ones(1))
 

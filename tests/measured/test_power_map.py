@@ -11,10 +11,10 @@ import pytest
 from flats import LAW, RECEIVERS, WALL, places, powers, walls_between
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.measured.floor_plan import NO_WALLS, Walls
-from wbgs_jax.measured.held_out import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores
-from wbgs_jax.measured.power_map import LENGTH, MAX_PLACES, Scales, learn_map, received_power
-from wbgs_jax.measured.readings import Readings
+from wbgs_jax.data.floor_plan import NO_WALLS, Walls
+from wbgs_jax.data.rssi_folder import Readings
+from wbgs_jax.power_map.model import LENGTH, MAX_PLACES, Scales, learn_map, received_power
+from wbgs_jax.power_map.validation import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores
 
 GUIDE = Path(__file__).parents[2] / "docs" / "measured.md"
 WALLS = Walls(WALL, np.ones(1))

@@ -8,9 +8,8 @@ import pytest
 from flats import HEIGHT, RECEIVERS, folder, places, powers, write_table
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.measured.columns import match_columns, tokens
-from wbgs_jax.measured.plausible import not_received
-from wbgs_jax.measured.readings import Readings, attribution, cell_means, load_readings
+from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
+from wbgs_jax.data.tables import match_columns, not_received, tokens
 
 
 def test_a_folder_of_tables(tmp_path, rng):

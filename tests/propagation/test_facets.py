@@ -11,8 +11,8 @@ import trimesh
 from rooms import box, edges_of, facets_of, mesh_of, rectangle, room
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.propagation.edges import edges_of_facets
-from wbgs_jax.propagation.facets import areas, facets_from_mesh, outline_of
+from wbgs_jax.mesh.edges import edges_of_facets
+from wbgs_jax.mesh.facets import areas, facets_from_mesh, outline_of
 
 
 def segments(edges):

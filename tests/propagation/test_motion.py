@@ -9,10 +9,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from rooms import box, facets_of, room, search_of, trace
 
-from wbgs_jax.propagation.edges import edges_of_facets
-from wbgs_jax.propagation.facets import moved
-from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.motion import (
+from wbgs_jax.mesh.edges import edges_of_facets
+from wbgs_jax.mesh.facets import moved
+from wbgs_jax.propagation.displacement import (
     Motion,
     coherence,
     length_changes,
@@ -21,6 +20,7 @@ from wbgs_jax.propagation.motion import (
     path_coherence,
     still,
 )
+from wbgs_jax.propagation.image_method import make_search
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from rooms import box, edges_of, facets_of, mesh_of, room, trace
 
-from wbgs_jax.fields.wave import WaveConfig, make_field
-from wbgs_jax.propagation.edges import edges_of_facets
+from wbgs_jax.fields.coherent import WaveConfig, make_field
+from wbgs_jax.mesh.edges import edges_of_facets, padded_edges, padded_size
 from wbgs_jax.propagation.image_method import make_search
-from wbgs_jax.propagation.padding import padded_edges, padded_size
 from wbgs_jax.types import make_receiver
 
 SIZE = np.array([6.0, 4.0, 3.0])

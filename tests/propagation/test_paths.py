@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rooms import box, edges_of, facets_of, rectangle, room, search_of, trace
 
+from wbgs_jax.mesh.facets import areas
 from wbgs_jax.propagation import image_method
-from wbgs_jax.propagation.facets import areas
 from wbgs_jax.propagation.image_method import make_search
 from wbgs_jax.propagation.paths import DIFFRACTED, NONE, REFLECTED, TRANSMITTED
 

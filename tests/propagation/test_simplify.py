@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from rooms import box, mesh_of, rectangle
 
-from wbgs_jax.propagation import simplify
-from wbgs_jax.propagation.facets import areas, facets_from_mesh
-from wbgs_jax.propagation.simplify import decimated, distance_from, distances, facets_that_fit, simplified, welded
+from wbgs_jax.mesh import simplification as simplify
+from wbgs_jax.mesh.facets import areas, facets_from_mesh
+from wbgs_jax.mesh.simplification import decimated, distance_from, distances, facets_that_fit, simplified, welded
 
 
 def fine(part, times):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.propagation.slab import DAMPING, complex_permittivity, slab_coefficients
+from wbgs_jax.propagation.materials import DAMPING, complex_permittivity, slab_coefficients
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 FREQUENCY = 10e9

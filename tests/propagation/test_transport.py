@@ -22,11 +22,11 @@ from rooms import (
     trace,
 )
 
-from wbgs_jax.propagation.slab import Slabs, complex_permittivity, slab_coefficients
+from wbgs_jax.propagation.materials import Slabs, complex_permittivity, slab_coefficients
 from wbgs_jax.propagation.transport import _across, element_voltages, snapshots_from_paths
 from wbgs_jax.radio import channel
+from wbgs_jax.radio.antenna import Antenna, antenna_field, element_gain
 from wbgs_jax.radio.array import planar_array, snapshot_to_pas
-from wbgs_jax.radio.patterns import Antenna, antenna_field, element_gain
 from wbgs_jax.types import make_receiver
 
 FREQUENCIES = [1e9, 10e9, 94e9]

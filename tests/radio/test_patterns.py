@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wbgs_jax.radio.patterns import Antenna, antenna_field, dipole_gain, element_gain, pattern_exponents, upright, zenith_vector
+from wbgs_jax.radio.antenna import Antenna, antenna_field, dipole_gain, element_gain, pattern_exponents, upright, zenith_vector
 
 
 def directions(rng, n=50):

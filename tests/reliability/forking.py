@@ -65,7 +65,7 @@ class Forks:
 def _child(work: str, folder: Path, fault: Fault, counter: Counter) -> None:
     from works import WORKS
 
-    from wbgs_jax._util.command import run_command
+    from wbgs_jax._util.cli import run_command
 
     os.setsid()
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))

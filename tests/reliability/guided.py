@@ -12,9 +12,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import atheris
 
-with atheris.instrument_imports(
-    include=["wbgs_jax.data", "wbgs_jax.interchange", "wbgs_jax.measured", "wbgs_jax._util", "yaml"]
-):
+with atheris.instrument_imports(include=["wbgs_jax.data", "wbgs_jax.interchange", "wbgs_jax.mesh", "wbgs_jax._util", "yaml"]):
     sys.path.insert(0, str(Path(__file__).parents[1]))
     from readables import READABLES
 

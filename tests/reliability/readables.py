@@ -21,24 +21,23 @@ from data_gen.example.make_room import OBJECTS
 from data_gen.own_scene import own_scene
 from experiments.jobs import Job
 from experiments.results import Results
-from wbgs_jax._util.files import read_json
-from wbgs_jax._util.yaml_files import read_yaml
+from wbgs_jax._util.files import read_json, read_yaml
 from wbgs_jax.data import load_dataset, save_scene
-from wbgs_jax.data.layout import export_layout
-from wbgs_jax.data.ply import read_ply, write_ply
+from wbgs_jax.data.floor_plan import load_walls
+from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.data.room_file import Room, load_room, save_room
-from wbgs_jax.inference.confidence import read_confidence, read_power_confidence
+from wbgs_jax.data.rssi_folder import cell_means, load_readings
 from wbgs_jax.inference.export import export_field, load_exported
-from wbgs_jax.inference.neighbours import read_neighbours
-from wbgs_jax.inference.parts import open_parts
+from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
+from wbgs_jax.inference.kriging import read_neighbours
 from wbgs_jax.inference.queries import read_queries
+from wbgs_jax.inference.results_file import open_parts
 from wbgs_jax.interchange.deepmimo import as_deepmimo, is_deepmimo, load_deepmimo, write_deepmimo
 from wbgs_jax.interchange.gaussian_ply import read_gaussians, write_gaussians
 from wbgs_jax.interchange.ray_paths import RayPaths, read_paths, save_paths
 from wbgs_jax.interchange.scenes import scene_of_paths
 from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
-from wbgs_jax.measured.floor_plan import load_walls
-from wbgs_jax.measured.readings import cell_means, load_readings
+from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.training import curves
 from wbgs_jax.training.manifest import write_manifest

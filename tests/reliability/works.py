@@ -9,17 +9,17 @@ import numpy as np
 from synthetic import FIELDS, tiny_scene, tiny_settings
 from untrained import make_coherent_run
 
-import wbgs_jax.convert
-import wbgs_jax.eval
-import wbgs_jax.map
-import wbgs_jax.measure
-import wbgs_jax.predict
-import wbgs_jax.train
+import wbgs_jax.commands.convert
+import wbgs_jax.commands.evaluate
+import wbgs_jax.commands.map
+import wbgs_jax.commands.measure
+import wbgs_jax.commands.predict
+import wbgs_jax.commands.train
 from data_gen import generate, jobs
 from data_gen.settings import ArraySettings, SolverSettings
 from wbgs_jax._util import files
+from wbgs_jax.commands import export_folder as layout
 from wbgs_jax.config import sections
-from wbgs_jax.data import layout
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.evaluation import report
 from wbgs_jax.training import checkpoint
@@ -55,7 +55,7 @@ def options(field: str) -> list[str]:
 def train(field: str, folder: Path) -> None:
     """Trains to the end, from wherever it was."""
     words = ["--data", str(folder / "box.npz"), "--out", str(folder / "run"), "--field", field, "--preset", "smoke", "--resume"]
-    wbgs_jax.train.main([*words, *options(field)])
+    wbgs_jax.commands.train.main([*words, *options(field)])
 
 
 def checkpoints(folder: Path) -> None:
@@ -69,9 +69,9 @@ def checkpoints(folder: Path) -> None:
 
 def predict(folder: Path) -> None:
     """Answers queries in eight blocks."""
-    wbgs_jax.predict.BLOCK = BLOCK
+    wbgs_jax.commands.predict.BLOCK = BLOCK
     words = ["--run", str(folder / "run"), "--queries", str(folder / "queries.csv"), "--what", "power"]
-    wbgs_jax.predict.main([*words, "--out", str(folder / "powers.npz"), "--resume"])
+    wbgs_jax.commands.predict.main([*words, "--out", str(folder / "powers.npz"), "--resume"])
 
 
 class StandIn:
@@ -124,7 +124,7 @@ def experiments(folder: Path) -> None:
     wanted = [Job(str(folder / "box.npz"), "nerf2", seed=seed, profile="smoke") for seed in (0, 1)]
     command = runner.Command(profile="smoke", results=folder / "results", runs=folder / "runs")
     if failures := runner.run(wanted, command):
-        raise wbgs_jax.train.UserError("; ".join(failures))
+        raise wbgs_jax.commands.train.UserError("; ".join(failures))
 
 
 def prepare(folder: Path) -> None:
@@ -146,7 +146,7 @@ def _asked(folder: Path) -> list[str]:
 
 
 def _convert(folder: Path, out: str) -> None:
-    wbgs_jax.convert.main([*_asked(folder), "--out", str(folder / out)])
+    wbgs_jax.commands.convert.main([*_asked(folder), "--out", str(folder / out)])
 
 
 WORKS: dict[str, Callable[[Path], None]] = {
@@ -156,17 +156,21 @@ WORKS: dict[str, Callable[[Path], None]] = {
     "generate data": data,
     "run experiments": experiments,
     "prepare": prepare,
-    "evaluate": lambda folder: wbgs_jax.eval.main(["--run", str(folder / "run"), "--results", str(folder / "results")]),
-    "predict spectra": lambda f: wbgs_jax.predict.main([*_asked(f), "--out", str(f / "x.npz"), "--picture", str(f / "x.png")]),
-    "predict powers": lambda f: wbgs_jax.predict.main([*_asked(f), "--what", "power", "--out", str(f / "x.csv")]),
-    "export": lambda f: wbgs_jax.predict.main(["--run", str(f / "run"), "--export", str(f / "field.zip")]),
-    "map": lambda f: wbgs_jax.map.main(
+    "evaluate": lambda folder: wbgs_jax.commands.evaluate.main(
+        ["--run", str(folder / "run"), "--results", str(folder / "results")]
+    ),
+    "predict spectra": lambda f: wbgs_jax.commands.predict.main(
+        [*_asked(f), "--out", str(f / "x.npz"), "--picture", str(f / "x.png")]
+    ),
+    "predict powers": lambda f: wbgs_jax.commands.predict.main([*_asked(f), "--what", "power", "--out", str(f / "x.csv")]),
+    "export": lambda f: wbgs_jax.commands.predict.main(["--run", str(f / "run"), "--export", str(f / "field.zip")]),
+    "map": lambda f: wbgs_jax.commands.map.main(
         ["--run", str(f / "run"), "--ghz", "28", "--step", "1", "--out", str(f / "map.npz"), "--picture", str(f / "map.png")]
     ),
     "convert to paths": lambda f: _convert(f, "paths.npz"),
     "convert to DeepMIMO": lambda f: _convert(f, "scenario"),
     "lay out": lambda f: layout.main([str(f / "box.npz"), str(f / "layout")]),
-    "measure": lambda f: wbgs_jax.measure.main(
+    "measure": lambda f: wbgs_jax.commands.measure.main(
         ["--data", str(f), "--mesh", str(f / "walls.ply"), "--tx", "1,1,1", "--answers", str(f / "answers.csv")]
     ),
 }
@@ -178,7 +182,8 @@ def warm() -> None:
     from matplotlib import pyplot
     from orbax.checkpoint import v1
 
-    from wbgs_jax.inference import opened, pictures
+    from wbgs_jax import plotting as pictures
+    from wbgs_jax.inference import answers as opened
 
     assert pyplot and v1 and opened and pictures
     assert not xla_bridge.backends_are_initialized(), "JAX runs already: a fork would hang"

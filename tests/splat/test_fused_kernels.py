@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from test_splat import random_case, receiver_at
 
-from wbgs_jax.splat import composite, fused_kernels, gpu_arithmetic, project, render_dense, tiles
+from wbgs_jax.splat import composite, fused_kernels, project, render_dense, tiles
+from wbgs_jax.splat import fused_kernels as gpu_arithmetic
 from wbgs_jax.splat.composite import assembled
 from wbgs_jax.splat.tiles import CHUNK, CPU_TILING, GPU_TILING, TileLimits, Tiling
 from wbgs_jax.types import Gaussians

@@ -11,8 +11,8 @@ from rooms import box
 from synthetic import tiny_settings
 from wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
-from wbgs_jax.training.absent import absent_movers, search_absent
-from wbgs_jax.training.scores import Told
+from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.obstacles import absent_movers, search_absent
 
 N_TX, FREQUENCIES = 60, np.array([1e9, 4e9, 16e9])
 PLACES = places(N_TX, 0.4)

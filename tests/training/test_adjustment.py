@@ -12,9 +12,9 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
-from wbgs_jax.propagation.motion import Motion, length_changes, length_terms
-from wbgs_jax.training import adjustment
-from wbgs_jax.training.adjustment import adjust, adjusted_numbers, length_variances, normal_equations
+from wbgs_jax.propagation.displacement import Motion, length_changes, length_terms
+from wbgs_jax.training.calibration import gauss_newton as adjustment
+from wbgs_jax.training.calibration.gauss_newton import adjust, adjusted_numbers, length_variances, normal_equations
 
 N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
 RECEIVERS = RX, (5.2, 2.9, 1.6)

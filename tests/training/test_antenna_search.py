@@ -11,9 +11,9 @@ import pytest
 from synthetic import FREQUENCIES_HZ, tiny_settings
 from wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.radio.patterns import Antenna, antenna_field, upright
-from wbgs_jax.training.antennas import antenna_candidates, gains_much, search_antennas
-from wbgs_jax.training.scores import make_scores, surely_better
+from wbgs_jax.radio.antenna import Antenna, antenna_field, upright
+from wbgs_jax.training.calibration.antennas import antenna_candidates, gains_much, search_antennas
+from wbgs_jax.training.calibration.objective import make_scores, surely_better
 
 N_TX = 30
 SETTINGS = tiny_settings(

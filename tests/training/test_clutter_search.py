@@ -9,12 +9,12 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.fields.wave import WaveConfig, WaveField
-from wbgs_jax.fields.wave_channel import densities, stored
-from wbgs_jax.training.clutter import search_clutter
+from wbgs_jax.fields.coherent import WaveConfig, WaveField
+from wbgs_jax.fields.coherent_model import densities, stored
+from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.obstacles import search_clutter
 from wbgs_jax.training.curves import read
 from wbgs_jax.training.loop import train
-from wbgs_jax.training.scores import Told
 
 N_TX, FREQUENCIES = 80, np.array([2e9, 10e9])
 PLACES = places(N_TX, 0.4)

@@ -12,11 +12,8 @@ from untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.evaluation.calibration import calibration
-from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.evaluation.power import calibrate_power
-from wbgs_jax.evaluation.score import expectations
-from wbgs_jax.inference.confidence import (
+from wbgs_jax.evaluation.score import calibrate_power, calibration, expectations
+from wbgs_jax.inference.intervals import (
     FILE,
     MARGIN,
     POWER_MARGIN_DB,
@@ -31,9 +28,10 @@ from wbgs_jax.inference.confidence import (
     read_power_confidence,
     write_confidence,
 )
-from wbgs_jax.inference.neighbours import for_receiver
+from wbgs_jax.inference.kriging import for_receiver
 from wbgs_jax.inference.predictor import observe_links, predict_spectra
-from wbgs_jax.training.confidence import POWER_SETS, SETS, fit, interval, learn_confidence, left_out, regress, upper_end
+from wbgs_jax.metrics import ssim
+from wbgs_jax.training.fit_intervals import POWER_SETS, SETS, fit, interval, learn_confidence, left_out, regress, upper_end
 from wbgs_jax.types import Query, make_receiver
 
 

@@ -17,7 +17,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import DensityConfig, SearchConfig
 from wbgs_jax.fields import Group
 from wbgs_jax.training import loop
-from wbgs_jax.training.controls import Context, Control, Edit
+from wbgs_jax.training.hooks import Context, Control, Edit
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
 

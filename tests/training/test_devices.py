@@ -13,9 +13,20 @@ import numpy as np
 import pytest
 from toys import RippleField, registered, toy_settings
 
-from wbgs_jax._util.devices import devices_for, over_all_links, own_devices
+from wbgs_jax._util.devices import (
+    COORDINATOR,
+    COUNT,
+    NUMBER,
+    any_process,
+    by_first,
+    check_alike,
+    connect,
+    devices_for,
+    is_first,
+    over_all_links,
+    own_devices,
+)
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.processes import COORDINATOR, COUNT, NUMBER, any_process, by_first, check_alike, connect, is_first
 from wbgs_jax.training import curves
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.loop import Run, train
@@ -140,15 +151,15 @@ def test_an_error_of_the_first_process_stops_all(monkeypatch):
 
     with pytest.raises(UserError, match="no space"):
         by_first(fails)
-    monkeypatch.setattr("wbgs_jax._util.processes.is_first", lambda: False)
-    monkeypatch.setattr("wbgs_jax._util.processes.any_process", lambda flag: True)
+    monkeypatch.setattr("wbgs_jax._util.devices.is_first", lambda: False)
+    monkeypatch.setattr("wbgs_jax._util.devices.any_process", lambda flag: True)
     with pytest.raises(UserError, match="the first one could not go on"):
         by_first(fails)
 
 
 def test_processes_that_differ_are_told_so(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
-    monkeypatch.setattr("wbgs_jax._util.processes._gathered", lambda own: np.stack([own, own + 1]))
+    monkeypatch.setattr("wbgs_jax._util.devices._gathered", lambda own: np.stack([own, own + 1]))
     with pytest.raises(UserError, match="the state of process 1 and of the first one differ"):
         check_alike({"a": np.zeros(2)}, "the state")
 

@@ -3,8 +3,8 @@
 import pytest
 
 from wbgs_jax.fields import Field, default_field, get_field
-from wbgs_jax.training import estimate
-from wbgs_jax.training.estimate import duration_words, expected_seconds
+from wbgs_jax.training import progress as estimate
+from wbgs_jax.training.progress import duration_words, expected_seconds
 
 
 def test_a_slower_machine_takes_longer(monkeypatch):

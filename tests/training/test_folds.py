@@ -8,8 +8,8 @@ from synthetic import tiny_dataset
 from toys import RippleField, registered, toy_settings
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
-from wbgs_jax.training import folds
-from wbgs_jax.training.folds import FOLDS, blocks, held_out_blocks, shortened
+from wbgs_jax.training import cross_validation as folds
+from wbgs_jax.training.cross_validation import FOLDS, blocks, held_out_blocks, shortened
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -10,24 +10,26 @@ import pytest
 from synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
-from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.fields.trust import SHARES
+from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.inference.mixture import answer
-from wbgs_jax.training import mixture as module
-from wbgs_jax.training import stacking
-from wbgs_jax.training.mixture import (
+from wbgs_jax.metrics import ssim
+from wbgs_jax.training import fit_mixture as module
+from wbgs_jax.training import fit_mixture as stacking
+from wbgs_jax.training.fit_mixture import (
     ERRORS,
     ERRORS_WITH_PATHS,
     HeldOut,
     Known,
     choose_share,
+    fit_weights,
     learn_members,
     learn_mixture,
     left_out,
     lower_bound,
+    moments_of,
     predict_members,
+    ssim_of,
 )
-from wbgs_jax.training.stacking import fit_weights, moments_of, ssim_of
 
 STORED = Path(__file__).parent / "few_scores.json"
 

@@ -10,10 +10,10 @@ from synthetic import tiny_dataset
 from toys import NoisyField, RippleConfig, RippleField
 
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.evaluation.metrics import ssim
-from wbgs_jax.inference.neighbours import correct
-from wbgs_jax.training import neighbours as module
-from wbgs_jax.training.neighbours import FEWEST, MOST, Choice, choices, choose, learn_neighbours
+from wbgs_jax.inference.kriging import correct
+from wbgs_jax.metrics import ssim
+from wbgs_jax.training import fit_kriging as module
+from wbgs_jax.training.fit_kriging import FEWEST, MOST, Choice, choices, choose, learn_neighbours
 
 
 @pytest.fixture(scope="module")

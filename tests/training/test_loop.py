@@ -12,14 +12,14 @@ from synthetic import tiny_dataset, tiny_settings
 from toys import GROWING, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.data.surface import DatasetScene
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.wideband import WidebandField
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.data import check_data
+from wbgs_jax.training.batches import check_data
 from wbgs_jax.training.loop import Interrupted, Run, train
 from wbgs_jax.training.step import run_epoch as epoch_programs
 

@@ -11,12 +11,12 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, THICKNESS, places, run_in, snapshots
 
 from wbgs_jax.config import changed
-from wbgs_jax.fields import wave
+from wbgs_jax.fields import coherent as wave
 from wbgs_jax.radio.channel import received_power_db
-from wbgs_jax.training import search as search_module
+from wbgs_jax.training.calibration import pipeline as search_module
+from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, search_materials, with_entry
+from wbgs_jax.training.calibration.objective import Told
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.materials import ITU_MATERIALS, search_materials, with_entry
-from wbgs_jax.training.scores import Told
 
 FREQUENCIES = np.array([1e9, 94e9])
 N_TX = 40
@@ -110,7 +110,7 @@ def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_
 
     noise = rng.normal(0, 0.1, 48)  # much more than the gain
     noise -= noise.mean()
-    monkeypatch.setattr("wbgs_jax.training.scores.make_scores", scores)
+    monkeypatch.setattr("wbgs_jax.training.calibration.objective.make_scores", scores)
     materials = with_entry(run.state.params.materials, 0, "concrete")
     params = dataclasses.replace(run.state.params, materials=materials)
     told = Told(run.field, run.cache, run.data, np.asarray(run.dataset.train))
@@ -135,7 +135,7 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
 
         return score
 
-    monkeypatch.setattr("wbgs_jax.training.scores.make_scores", scores)
+    monkeypatch.setattr("wbgs_jax.training.calibration.objective.make_scores", scores)
     monkeypatch.setattr(search_module, "search_idealisations", lambda params, *_: (params, {}))
     run.control()
     count = len(PARTS)

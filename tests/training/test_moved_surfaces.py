@@ -11,14 +11,15 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
 
-from wbgs_jax.fields import wave
-from wbgs_jax.training import geometry, search
-from wbgs_jax.training.antennas import AntennaReport, antenna_candidates
-from wbgs_jax.training.controls import silent
-from wbgs_jax.training.geometry import GeometryReport, Place, frequencies_apart, learn_geometry
-from wbgs_jax.training.placement import SPREADS_M, search_placement
-from wbgs_jax.training.scores import make_scores
-from wbgs_jax.training.thicknesses import Slab
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.training.calibration import alignment as geometry
+from wbgs_jax.training.calibration import pipeline as search
+from wbgs_jax.training.calibration.alignment import GeometryReport, Place, frequencies_apart, learn_geometry
+from wbgs_jax.training.calibration.antennas import AntennaReport, antenna_candidates
+from wbgs_jax.training.calibration.objective import make_scores
+from wbgs_jax.training.calibration.thickness import Slab
+from wbgs_jax.training.calibration.uncertainty import SPREADS_M, search_placement
+from wbgs_jax.training.hooks import silent
 from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])

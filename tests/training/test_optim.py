@@ -10,7 +10,7 @@ import pytest
 from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax.config import OptimConfig
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Group, get_field
 from wbgs_jax.training.optim import ADAMS_RMS, make_muon, make_optimizer, schedule
 

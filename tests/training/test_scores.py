@@ -10,10 +10,10 @@ from synthetic import tiny_scene, tiny_settings
 from wave_runs import PARTS, places, run_in
 
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.training import scores
+from wbgs_jax.training.calibration import objective as scores
+from wbgs_jax.training.calibration.material_fit import with_entry
+from wbgs_jax.training.calibration.objective import make_scores, surely_better
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.materials import with_entry
-from wbgs_jax.training.scores import make_scores, surely_better
 
 N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
 SETTINGS = tiny_settings(

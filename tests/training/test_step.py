@@ -11,11 +11,11 @@ from toys import GROWING, CuspField, RippleField, Room, SwellingField, registere
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.data.layout import export_layout, load_layout
+from wbgs_jax.data.image_folder import export_layout, load_layout
 from wbgs_jax.fields.wideband import WidebandParams
 from wbgs_jax.splat import TileLimits, project
 from wbgs_jax.splat.tiles import build_tile_jobs
-from wbgs_jax.training.data import training_data
+from wbgs_jax.training.batches import training_data
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients, run_epoch

@@ -9,9 +9,9 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.training.materials import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
-from wbgs_jax.training.scores import Told
-from wbgs_jax.training.thicknesses import ONCE_MORE, Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
+from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
+from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.thickness import ONCE_MORE, Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
 SETTINGS = tiny_settings(
@@ -112,8 +112,8 @@ def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     heard = told(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
     heard = dataclasses.replace(heard, data=dataclasses.replace(heard.data, snapshots=None))
     nothing = SearchReport(0.0, 0.0, {})
-    monkeypatch.setattr("wbgs_jax.training.thicknesses.search_materials", lambda params, *_, **__: (params, nothing))
-    monkeypatch.setattr("wbgs_jax.training.thicknesses._sized", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr("wbgs_jax.training.calibration.thickness.search_materials", lambda params, *_, **__: (params, nothing))
+    monkeypatch.setattr("wbgs_jax.training.calibration.thickness._sized", lambda *_: pytest.fail("searched"))
     found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
     assert found is start and report is nothing
 

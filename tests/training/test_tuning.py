@@ -9,9 +9,9 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
 
-from wbgs_jax.fields import wave
-from wbgs_jax.training.scores import Told
-from wbgs_jax.training.tuning import least_squares, search_tuning
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning
+from wbgs_jax.training.calibration.objective import Told
 from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])

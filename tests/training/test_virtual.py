@@ -10,21 +10,20 @@ from synthetic import tiny_dataset, tiny_settings
 from toys import RippleField, registered, toy_settings
 
 from wbgs_jax.config import limit_steps
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field
 from wbgs_jax.radio.channel import NOT_HEARD_DB
-from wbgs_jax.training import virtual as module
-from wbgs_jax.training.data import training_data
-from wbgs_jax.training.loop import train
-from wbgs_jax.training.run import Run
-from wbgs_jax.training.virtual import (
+from wbgs_jax.training import batches as module
+from wbgs_jax.training.batches import (
     BESIDE,
     BEYOND,
     data_with_virtual,
     kriging_weights,
+    training_data,
     virtual_links,
     with_virtual_drawn,
 )
+from wbgs_jax.training.loop import Run, train
 
 
 @pytest.fixture(autouse=True, scope="module")

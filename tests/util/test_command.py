@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from commands import assert_error_for_people, call
 
-from wbgs_jax._util.command import option_value, run_command, say
+from wbgs_jax._util.cli import option_value, run_command, say
 from wbgs_jax._util.errors import UserError
 
 

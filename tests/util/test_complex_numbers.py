@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax._util.complex_numbers import phasor, quotient, root
+from wbgs_jax._util.complex_math import phasor, quotient, root
 
 
 def complex_normal(rng, n):

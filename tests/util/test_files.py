@@ -3,7 +3,7 @@
 import pytest
 
 from wbgs_jax._util import files
-from wbgs_jax._util.command import run_command
+from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json, write_json
 

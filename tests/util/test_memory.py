@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wbgs_jax._util.memory import give_back
+from wbgs_jax._util.compilation import give_back
 
 PIECES, SIZE = 3000, 100_000
 """In all 300 MB, each below the size from which glibc asks the operating system for every array by itself."""

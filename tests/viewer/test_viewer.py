@@ -9,13 +9,13 @@ from commands import assert_error_for_people, call
 from untrained import make_coherent_run, make_run
 
 from experiments.viewer_pictures import chromium, drag, window
-from wbgs_jax import view
+from wbgs_jax.commands import view
 from wbgs_jax.inference.predictor import predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.viewer import drawing, panel, walk
 from wbgs_jax.viewer.app import Latest
-from wbgs_jax.viewer.asking import Asker
+from wbgs_jax.viewer.session import Asker
 
 PLACE, HZ = np.array([0.4, -0.3, 1.2]), 10e9
 DRAGS = 10

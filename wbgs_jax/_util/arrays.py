@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wbgs_jax._util.archives import read_arrays, told
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, read_arrays, told
 
 T = TypeVar("T")
 SMALL = (np.uint8, np.float16)

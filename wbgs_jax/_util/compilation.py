@@ -4,6 +4,7 @@ The library never switches this on by itself; other JAX pipelines have their own
 """
 
 import contextlib
+import ctypes
 import hashlib
 import os
 import platform
@@ -122,3 +123,13 @@ def _machine() -> str:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
     return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:8]}"
+
+
+def give_back() -> None:
+    """Returns what was freed to the operating system. glibc keeps it, in pieces that large arrays do not fit into: gigabytes
+    after a search. Other C libraries do without."""
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):  # not glibc
+        return
+    trim(0)

@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax.evaluation.beams import beam_loss_db
-from wbgs_jax.inference.maps import predict_many
+from wbgs_jax.inference.batching import predict_many
 from wbgs_jax.inference.predictor import Predictor
-from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.radio.codebook import ALIKE, codebook
+from wbgs_jax.metrics import beam_loss_db
+from wbgs_jax.radio.array import ALIKE, codebook, pas_directions
 
 AnyArray = Array | np.ndarray
 RIGHT_DB = float(-20 * np.log10(1 - ALIKE))

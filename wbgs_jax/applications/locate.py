@@ -16,8 +16,8 @@ from jaxtyping import Array, Complex, Float
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static
-from wbgs_jax.applications.descent import best_apart, gauss_newton, grid_over, in_blocks, shrinking
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks, shrinking
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.inference.predictor import Trained, check_power

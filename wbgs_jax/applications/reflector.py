@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.coverage import NARROWEST_M, Powers, soft_minimum
-from wbgs_jax.applications.descent import Descended, best_apart, descend, grid_over, in_blocks, shrinking
+from wbgs_jax.applications.antenna_placement import NARROWEST_M, Powers, soft_minimum
+from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.propagation.paths import TRANSMITTED
+from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import decibels, free_space_db
-from wbgs_jax.radio.patterns import zenith_vector
 from wbgs_jax.types import Query, make_receiver
 
 STEPS = 60

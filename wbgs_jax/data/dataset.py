@@ -1,5 +1,7 @@
 """What a trainer, an evaluation or an experiment sees of any data: links, observations, receivers, surface, split."""
 
+import dataclasses
+import hashlib
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -157,3 +159,25 @@ class Dataset:
         positions = own.element_wavelengths(jnp.asarray(self.frequencies_hz[index], jnp.float32))
         _, first, which = np.unique(np.asarray(positions), axis=0, return_index=True, return_inverse=True)
         return positions[first], which.reshape(-1)
+
+
+NAMES = ("name", "convention")
+
+
+def checksum(dataset: Dataset) -> str:
+    """Returns a checksum (SHA-256) of all numbers of a data set, its split included; names do not count."""
+    found = hashlib.sha256()
+    parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
+    parts["materials"] = None if dataset.materials is None else dataclasses.asdict(dataset.materials) | {"names": ()}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(parts):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{jax.tree_util.keystr(path)} {array.dtype.str} {array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def check_data(dataset: Dataset, expected: str, where: str) -> Dataset:
+    """Returns a data set whose checksum is the expected one (empty: not known); any other is a `UserError`."""
+    if expected and checksum(dataset) != expected:
+        raise UserError(f"the data of {where} are not those that it was trained on; put them back, or train again")
+    return dataset

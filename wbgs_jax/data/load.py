@@ -2,22 +2,141 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
-from wbgs_jax.data.join import join
-from wbgs_jax.data.other_files import check_kind
 from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
+
+SURFACES = ("vertices", "faces", "face_part")
+OBSERVED = ("snapshots", "images", "power_db")
+
+
+def join(datasets: Sequence[Dataset]) -> Dataset:
+    """Returns the links of all data sets in their order.
+
+    Receivers are numbered on, and a place where several data sets have a transmitter is one transmitter. It is of the test if
+    one of them tests it, and else of the validation if one of them validates it: its other receivers would give it away. Links
+    that are in no part of their data set are in none here.
+
+    Raises:
+        UserError: they are not of one scene, or of different kinds or arrays.
+    """
+    first, *others = datasets
+    for other in others:
+        _check_alike(first, other)
+    tx_positions = np.concatenate([one.tx_positions for one in datasets])
+    tx_index = group_transmitters(tx_positions)
+    before = np.cumsum([0, *(len(one) for one in datasets)])
+    receivers = np.cumsum([0, *(one.n_receivers for one in datasets)])
+    named = {
+        part: np.concatenate([getattr(one, part) + start for one, start in zip(datasets, before, strict=False)])
+        for part in ("train", "validation", "test")
+    }
+    listed = np.isin(np.arange(len(tx_index)), np.concatenate(list(named.values())))
+    tested, validated = (np.isin(tx_index, np.unique(tx_index[index])) for index in (named["test"], named["validation"]))
+    arrays: dict[str, Any] = {name: _together(datasets, name) for name in OBSERVED}
+    arrays |= {name: getattr(first, name) for name in SURFACES}
+    return Dataset(
+        name="+".join(one.name for one in datasets),
+        receivers=jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(one.receivers for one in datasets)),
+        tx_positions=tx_positions,
+        frequencies_hz=np.concatenate([one.frequencies_hz for one in datasets]),
+        receiver_index=_numbered_on(datasets, receivers),
+        tx_index=tx_index,
+        train=np.flatnonzero(listed & ~tested & ~validated),
+        validation=np.flatnonzero(listed & validated & ~tested),
+        test=np.flatnonzero(listed & tested),
+        **arrays,
+        materials=first.materials,
+    )
+
+
+def _check_alike(first: Dataset, other: Dataset) -> None:
+    where = f"{first.name} and {other.name} cannot be joined"
+    if first.kind != other.kind:
+        raise UserError(f"{where}: one holds {first.kind} and the other {other.kind} observations")
+    arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
+    if arrays[0] != arrays[1]:
+        raise UserError(f"{where}: their arrays differ in the number or the unit of their elements")
+    if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in SURFACES):
+        raise UserError(f"{where}: their surfaces differ; give data sets of one scene")
+
+
+def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"]) -> Int[np.ndarray, " n"]:
+    return np.concatenate([one.receiver_index + start for one, start in zip(datasets, receivers, strict=False)])
+
+
+def _together(datasets: Sequence[Dataset], name: str) -> np.ndarray | None:
+    values = [getattr(one, name) for one in datasets]
+    return None if values[0] is None else np.concatenate(values)
+
+
+SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
+PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
+ROOM = "`wbgs-jax convert` makes a room of it beside measured data, data_gen makes spectra for it (docs/own_scene.md)"
+MODELS = (".usd", ".usda", ".usdc", ".usdz", ".stl", ".dae", ".fbx", ".blend", ".3ds", ".off", ".3mf", ".abc", ".vtk", ".vtp")
+KINDS = {
+    ".h5": ("of HDF5", SNAPSHOTS),
+    ".hdf5": ("of HDF5", SNAPSHOTS),
+    ".parquet": ("of Parquet", PATHS),
+    ".mat": (
+        "of MATLAB",
+        "give DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.scene_of_snapshots` (docs/formats.md)",
+    ),
+    ".npy": (
+        "a single array of NumPy",
+        "make a folder of images, or a scene file of snapshots, with places and receiver (docs/formats.md)",
+    ),
+    ".pkl": ("a pickle, which can run any program", "save its arrays as .npz"),
+    ".pt": ("a pickle of PyTorch, which can run any program", "save its arrays as .npz"),
+    ".p2m": ("of Wireless InSite", PATHS),
+    ".uan": ("an antenna pattern of Wireless InSite", "patterns are named: tr38901, iso, dipole, hw_dipole (docs/formats.md)"),
+    ".ffd": ("an antenna pattern of HFSS", "patterns are named: tr38901, iso, dipole, hw_dipole (docs/formats.md)"),
+    ".csv": ("a table", "readings of powers go to `wbgs-jax measure --data FOLDER` (docs/measured.md)"),
+    ".geojson": ("a map", "walls go into walls.csv (docs/measured.md)"),
+    ".ifc": ("a building model", "export it as glTF or OBJ; then " + ROOM),
+    ".dxf": ("a drawing", "export meshes as OBJ; then " + ROOM),
+    ".svg": ("a drawing", "walls go into walls.csv (docs/measured.md)"),
+    **dict.fromkeys((".xls", ".xlsx", ".ods"), ("a workbook", "save its sheets as .csv (docs/measured.md)")),
+    **dict.fromkeys((".glb", ".gltf", ".obj", ".ply", ".xml"), ("a model of a room", ROOM)),
+    **dict.fromkeys(MODELS, ("a model", "export it as glTF or OBJ; then " + ROOM)),
+}
+"""Of files by their suffix: what they are, and what to do with them."""
+COLMAP = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
+"""Of a folder of RF-3DGS: the cameras of its images."""
+
+
+def check_kind(path: Path) -> None:
+    """Raises a `UserError` for a file of another program, or a folder of another layout, that says what is missing."""
+    kind = KINDS.get(path.suffix.lower())
+    if path.is_file() and kind is not None:
+        raise UserError(f"{path} is {kind[0]}, not a scene file; {kind[1]}")
+    if not path.is_dir() or (path / "spectrum").exists():
+        return
+    if any((path / name).exists() for name in COLMAP):
+        raise UserError(
+            f"{path} is a folder of RF-3DGS: pictures by cameras of COLMAP, without the places of transmitters; give "
+            "spectrum/, tx_pos.csv and gateway_info.yml (docs/formats.md)"
+        )
+    if any(path.glob("*.npy")):
+        raise UserError(
+            f"{path} holds arrays of NumPy; make a folder of images of them, spectrum/00001.png ..., with tx_pos.csv and "
+            "gateway_info.yml, or a scene file of snapshots (docs/formats.md)"
+        )
+
 
 DATA_VARIABLE = "WBGS_DATA"
 """Environment variable: a folder of scene files to use instead of those released with the package."""
@@ -38,14 +157,16 @@ def load_dataset(
     convention: ConventionName | None = None,
 ) -> Dataset:
     """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
-    from several of one scene, with commas between them, as one data set of several receivers (`wbgs_jax.data.join`).
+    from several of one scene, with commas between them, as one data set of several receivers (`wbgs_jax.data.load`).
 
-    The other arguments are for folders that do not record them (`wbgs_jax.data.layout.load_layout`); scene files do.
+    The other arguments are for folders that do not record them (`wbgs_jax.data.image_folder.load_layout`); scene files do.
 
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.
     """
-    from wbgs_jax.data.layout import load_layout  # here: `python -m wbgs_jax.data.layout` must not find itself imported
+    from wbgs_jax.data.image_folder import (
+        load_layout,  # here: `python -m wbgs_jax.data.image_folder` must not find itself imported
+    )
 
     if (path := released_scenes().get(str(source))) is not None:
         return scene_dataset(load_scene(path))

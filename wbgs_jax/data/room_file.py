@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax._util.archives import read_arrays, told
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
-from wbgs_jax.data.scene_checks import check_mesh
+from wbgs_jax._util.files import atomic_write, read_arrays, told
+from wbgs_jax.data.scene_file import check_mesh
 
 ARRAYS = ("vertices", "faces", "face_part")
 FORMAT = "room 1"

@@ -2,28 +2,176 @@
 
 import dataclasses
 import time
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.stats import rankdata
 
+from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_json
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.repeatability import repeatability
-from wbgs_jax.data.sight import in_sight
+from wbgs_jax.data.load import RELEASED
+from wbgs_jax.data.scene import in_sight
 from wbgs_jax.data.splits import with_validation_trained
-from wbgs_jax.evaluation import metrics
-from wbgs_jax.evaluation.baselines import baselines, can_lend
-from wbgs_jax.evaluation.beams import plane_normal
-from wbgs_jax.evaluation.calibration import calibration
-from wbgs_jax.evaluation.power import calibrate_power, power_figures, score_heard
+from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.confidence import Confidence, Expected, expect_many
-from wbgs_jax.inference.neighbours import for_receiver, without_asked
+from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
+from wbgs_jax.inference.kriging import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, Trained, as_observed, observe, observe_links, render_pas
+from wbgs_jax.metrics import plane_normal
 from wbgs_jax.radio import channel
+from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
+
+FILE = "repeatability.json"
+
+
+def repeatability(scene: str, ghz: Iterable[float]) -> float | None:
+    """Returns the truth's median SSIM to itself in a released scene (`scene4`), averaged over frequencies (GHz); None where it
+    is not known for all of them."""
+    known = read_json(RELEASED / FILE).get(scene, {}).get("median_ssim", {})
+    names = [f"{f:g}" for f in ghz]
+    return float(np.mean([known[name] for name in names])) if names and all(name in known for name in names) else None
+
+
+COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
+"""Shares of the answers, the surest ones, whose mean score is reported."""
+
+
+def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
+    """Returns how the expected SSIM of answers compares with what they scored: `coverage` of the intervals and their mean
+    `width`, the mean `expected` and true `scored` SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the
+    mean SSIM of the surest share."""
+    expectation, low, high = (np.asarray(values, np.float64) for values in expected)
+    held = (low <= scores) & (scores <= high)
+    return _figures(expectation, scores, -expectation, held, level) | {"width": float(np.mean(np.minimum(high, 1) - low))}
+
+
+def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
+    """Returns how the expected errors of received powers compare with the true absolute ones (dB): `coverage` of what they were
+    to stay within, its mean `within_db`, the mean `expected` and true `scored` error, their rank `correlation`, and the
+    `risk_coverage` curve: the mean error of the surest share."""
+    expectation, within = (np.asarray(values, np.float64) for values in expected)
+    return _figures(expectation, errors_db, expectation, errors_db <= within, level) | {"within_db": float(within.mean())}
+
+
+def _figures(
+    expectation: Float[np.ndarray, " n"],
+    truth: Float[np.ndarray, " n"],
+    doubt: Float[np.ndarray, " n"],
+    held: Bool[np.ndarray, " n"],
+    level: float,
+) -> dict[str, Any]:
+    """Returns what both have in common; `doubt` orders the answers, the surest first, and those of equal doubt count as their
+    mean."""
+    ranks, equal = np.unique(doubt, return_inverse=True)
+    means = np.bincount(equal, truth, len(ranks)) / np.bincount(equal, minlength=len(ranks))
+    surest = means[np.sort(equal)]
+    return {
+        "level": round(level, 4),
+        "coverage": float(held.mean()),
+        "expected": float(expectation.mean()),
+        "scored": float(truth.mean()),
+        "correlation": _rank_correlation(expectation, truth),
+        "risk_coverage": {f"{share:g}": float(surest[: max(1, round(share * len(truth)))].mean()) for share in COVERAGES},
+    }
+
+
+def _rank_correlation(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
+    """Returns Spearman's; 0 where one of both is constant."""
+    ranks = [rankdata(values) for values in (a, b)]
+    return float(np.corrcoef(*ranks)[0, 1]) if min(map(np.ptp, ranks)) > 0 else 0.0
+
+
+def score_power(
+    predicted: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"], frequencies_hz: Float[np.ndarray, " n"]
+) -> dict[str, Any]:
+    """Returns a report of received powers (dB), ready for JSON: n, power_error_db (median absolute error), power_mae_db (mean),
+    and the same in per_frequency, a list by ascending frequency_ghz.
+
+    Raises:
+        UserError: there is no link, or a prediction is NaN or infinite.
+    """
+    if len(predicted) == 0:
+        raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
+    error = np.abs(predicted.astype(np.float64) - truth)
+    if not np.isfinite(error).all():
+        raise UserError(
+            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged"
+        )
+    rows = [{"frequency_ghz": float(f / 1e9)} | _summary(error[frequencies_hz == f]) for f in np.unique(frequencies_hz)]
+    return _summary(error) | {"per_frequency": rows}
+
+
+def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
+    """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
+    line) and, where there is training data of the receivers, nearest_tx (the power of the nearest training transmitter at the
+    same frequency). None where the data know no power.
+
+    Raises:
+        UserError: as `score_power`.
+    """
+    report = score_heard(predicted, dataset, index)
+    if report is None:
+        return None
+    others = {"free_space": free_space(dataset, index)}
+    if can_lend(dataset, index):
+        others["nearest_tx"] = nearest_power(dataset, index)
+    return report | {"baselines": {name: score_heard(values, dataset, index) for name, values in others.items()}}
+
+
+def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
+    """Returns the report of predicted powers of some links, those without any power left out; None where the data know none, or
+    are snapshots in which nothing was heard."""
+    truth = dataset.received_db(index)
+    if truth is None:
+        return None
+    heard = truth > NOT_HEARD_DB
+    if dataset.kind != "power" and not heard.any():
+        return None
+    return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
+
+
+def calibrate_power(
+    confidence: PowerConfidence, predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]
+) -> dict[str, Any] | None:
+    """Returns how sure predicted powers of some links were, and should have been (`calibration.power_calibration`); None where
+    the data know no power."""
+    truth = dataset.received_db(index)
+    if truth is None:
+        return None
+    heard = truth > NOT_HEARD_DB
+    receivers = jnp.asarray(dataset.rx_positions(index[heard]), jnp.float32)
+    expected = _expected_power(confidence, jnp.asarray(predicted[heard], jnp.float32), dataset.query(index[heard]), receivers)
+    return power_calibration(expected, np.abs(predicted[heard].astype(np.float64) - truth[heard]), float(confidence.level))
+
+
+_expected_power = jax.jit(expected_power)
+
+
+def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Returns the power (dB) over the straight line, whatever stands in its way."""
+    distance = np.linalg.norm(dataset.tx_positions[index] - dataset.rx_positions(index), axis=-1)
+    return np.asarray(free_space_db(jnp.asarray(np.maximum(distance, 1e-3)), jnp.asarray(dataset.frequencies_hz[index])))
+
+
+def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver; where a
+    receiver heard none, of the nearest one."""
+    everything = dataset.received_db(np.arange(len(dataset)))
+    assert everything is not None
+    heard = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
+    all_hear = np.isin(dataset.receiver_index[index], dataset.receiver_index[heard]).all()
+    return everything[nearest_links(dataset, index, heard if all_hear else dataset.train)]
+
+
+def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
+    return {"n": len(error), "power_error_db": float(np.median(error)), "power_mae_db": float(error.mean())}
+
 
 Part = Literal["test", "validation"]
 """What is held out: for the final figures, or for choices."""

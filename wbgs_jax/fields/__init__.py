@@ -1,6 +1,7 @@
 """The models, one file each, behind one seam (`base.Field`). docs/new_field.md shows how to write another."""
 
-from wbgs_jax.fields import hybrid, nerf2, wave, wideband, wrfgs
+from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import hybrid, nerf2, wideband, wrfgs
 from wbgs_jax.fields.base import (
     Aux,
     Field,

@@ -9,13 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.fields.encoding import frequency_encoding, legendre, positional_encoding, scale_frequency
 from wbgs_jax.fields.networks import (
     AttenuationNetwork,
     GaussianSums,
     PowerNetwork,
     RadianceNetwork,
     attenuation_activation,
+    frequency_encoding,
+    legendre,
+    positional_encoding,
+    scale_frequency,
     signal_activation,
 )
 from wbgs_jax.fields.wideband_settings import WidebandConfig

@@ -24,21 +24,24 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
 from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
-from wbgs_jax.fields.noise import floor_of, observed_opinions, with_floor, without_floor
-from wbgs_jax.fields.prepared_paths import PreparedPaths
-from wbgs_jax.fields.trust import (
+from wbgs_jax.fields.coherent import WaveConfig, WaveField
+from wbgs_jax.fields.coherent_model import PreparedPaths
+from wbgs_jax.fields.mixture import (
     Opinions,
     Shares,
     at_first,
     coherent_alone,
     features,
+    floor_of,
     learn_shares,
     mixed,
     nearness,
+    observed_opinions,
     reported,
     similarity,
+    with_floor,
+    without_floor,
 )
-from wbgs_jax.fields.wave import WaveConfig, WaveField
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Links, Query, Receiver, Scene

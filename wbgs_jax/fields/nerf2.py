@@ -19,9 +19,15 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.config import PRESETS, check_positive
 from wbgs_jax.fields.base import Aux, Field, Group, Observation, Optimizer, register, with_field
-from wbgs_jax.fields.encoding import check_octaves, frequency_encoding, positional_encoding
 from wbgs_jax.fields.losses import pixel_loss
-from wbgs_jax.fields.networks import AttenuationNetwork, RadianceNetwork, signal_activation
+from wbgs_jax.fields.networks import (
+    AttenuationNetwork,
+    RadianceNetwork,
+    check_octaves,
+    frequency_encoding,
+    positional_encoding,
+    signal_activation,
+)
 from wbgs_jax.radio.array import EXACT, PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
 from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
 from wbgs_jax.types import Batch, Query, Receiver, Scene, check_query, check_receiver

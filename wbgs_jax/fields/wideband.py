@@ -33,7 +33,7 @@ from wbgs_jax.fields.em_features import (
     query_features,
     received_power_db,
 )
-from wbgs_jax.fields.encoding import check_octaves, positional_encoding
+from wbgs_jax.fields.networks import check_octaves, positional_encoding
 from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, OPTIM, PAPER, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
 from wbgs_jax.types import (

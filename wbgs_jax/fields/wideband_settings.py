@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings, setting
 from wbgs_jax.fields.base import Optimizer
-from wbgs_jax.fields.encoding import FrequencyScale
-from wbgs_jax.fields.networks import Precision
+from wbgs_jax.fields.networks import FrequencyScale, Precision
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.types import SurfaceSampling
 

@@ -26,8 +26,8 @@ import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.data.surface import DatasetScene
-from wbgs_jax.inference.neighbours import correct, for_receiver
+from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, Trained, trained_band
 from wbgs_jax.types import Query, Receiver
 

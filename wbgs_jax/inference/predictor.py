@@ -16,8 +16,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.confidence import Confidence, PowerConfidence
-from wbgs_jax.inference.neighbours import SAME_PLACE_M, Beside, correct, for_receiver
+from wbgs_jax.inference.intervals import Confidence, PowerConfidence
+from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 

@@ -14,7 +14,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Quantity
-from wbgs_jax.inference.confidence import PowerConfidence, expected_power
+from wbgs_jax.inference.intervals import PowerConfidence, expected_power
 from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, check_spectra, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from wbgs_jax._util.command import parse_vector
+from wbgs_jax._util.cli import parse_vector
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text
 

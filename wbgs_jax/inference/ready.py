@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from wbgs_jax._util.archives import opened_archive
 from wbgs_jax._util.compilation import cache_folder, load_program, source_digest, trace_program
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.files import atomic_write, opened_archive
 from wbgs_jax.types import Query, Receiver
 
 MOST = 16
@@ -115,8 +114,8 @@ def make_ready(
 
 def _as_function(trained: Any, receiver: Receiver) -> tuple[Callable[..., dict[str, Any]], tuple[np.ndarray, ...], str]:
     """Returns a function of arrays and of a query, the arrays, and what it follows from beside their shapes."""
-    from wbgs_jax.inference.confidence import expected_power, expected_ssim
-    from wbgs_jax.inference.neighbours import correct, for_receiver
+    from wbgs_jax.inference.intervals import expected_power, expected_ssim
+    from wbgs_jax.inference.kriging import correct, for_receiver
 
     known = (for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence))
     plan = trained.field.plan(trained.params, receiver)

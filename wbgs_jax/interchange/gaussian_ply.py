@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.ply_elements import read_elements, write_elements
+from wbgs_jax.mesh.ply import read_elements, write_elements
 from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wbgs_jax._util.archives import MOST_BYTES, check_file, told
+from wbgs_jax._util.files import MOST_BYTES, check_file, told
 
 HEADER, MATRIX, COMPRESSED = 128, 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

@@ -9,9 +9,9 @@ import trimesh
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.room_file import Room, load_room
-from wbgs_jax.interchange.material_files import Slab, slabs_of
-from wbgs_jax.interchange.room_files import FileObject, read_objects
-from wbgs_jax.interchange.walls import walls_as_sheets
+from wbgs_jax.interchange.room_materials import Slab, slabs_of
+from wbgs_jax.mesh.importers import FileObject, read_objects
+from wbgs_jax.mesh.walls import walls_as_sheets
 
 EXTENT = (0.5, 200.0)
 """Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody gives it, ..."""

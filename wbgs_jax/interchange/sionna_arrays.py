@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import SceneFile
-from wbgs_jax.interchange.plausible_paths import check_paths
 from wbgs_jax.interchange.ray_paths import (
     ARRAYS,
     OF_PATHS,
     array_of,
     carrier,
     check_arrays,
+    check_paths,
     directions_of,
     from_sionna,
     places_of,

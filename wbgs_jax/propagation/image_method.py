@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree, to_device
-from wbgs_jax.propagation.crossings import planes_of
-from wbgs_jax.propagation.edges import Edges
-from wbgs_jax.propagation.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
-from wbgs_jax.propagation.padding import filled
+from wbgs_jax.mesh.edges import Edges, filled
+from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
+from wbgs_jax.propagation.occlusion import planes_of
 
 SIDE = 1e-4
 """Metres: points nearer to a plane than this are on neither side."""

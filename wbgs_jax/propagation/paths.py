@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.propagation.crossings import NEAR, WORD, counted, crossed, crossing_share, first_of
-from wbgs_jax.propagation.edges import Edges
-from wbgs_jax.propagation.facets import AnyArray, Outline
+from wbgs_jax.mesh.edges import Edges
+from wbgs_jax.mesh.facets import AnyArray, Outline
 from wbgs_jax.propagation.image_method import Chains, Search
+from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of
 from wbgs_jax.radio.array import EXACT
 
 MAX_ORDER = 3

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from wbgs_jax._util.complex_numbers import phasor
-from wbgs_jax.propagation.edges import Edges
+from wbgs_jax._util.complex_math import phasor
+from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.propagation.image_method import Surfaces
+from wbgs_jax.propagation.materials import Slabs, slab_coefficients
 from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
-from wbgs_jax.propagation.slab import Slabs, slab_coefficients
 from wbgs_jax.propagation.utd import wedge_coefficients
+from wbgs_jax.radio.antenna import Antenna, antenna_field, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import to_local
-from wbgs_jax.radio.patterns import Antenna, antenna_field, upright, zenith_vector
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax._util.complex_numbers import quotient
+from wbgs_jax._util.complex_math import quotient
 
 _TERMS = 16
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from wbgs_jax._util.complex_numbers import phasor
+from wbgs_jax._util.complex_math import phasor
 from wbgs_jax._util.pytree import pytree
 
 PAS_HEIGHT, PAS_WIDTH = 90, 360
@@ -217,3 +217,28 @@ def lag_basis(element_positions: Float[np.ndarray, "elements 3"], tolerance: flo
 def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
     """Returns |z|^2, with a gradient that is finite at 0."""
     return z.real**2 + z.imag**2
+
+
+ALIKE = 0.05
+"""Share by which the amplitudes of beams ahead and behind may differ: pixels are not quite symmetric."""
+RINGS, SECTORS = 4, 16
+"""Beams on four rings of equal zenith angle, sixteen on each."""
+
+
+@functools.cache
+def codebook() -> Int[np.ndarray, " beams"]:
+    """Returns the pixels, in row-major order, that the codebook's beams point at."""
+    rows = (np.arange(RINGS) + 0.5) * (PAS_HEIGHT - 1) / RINGS
+    columns = np.arange(SECTORS) * (PAS_WIDTH - 1) / SECTORS
+    return (rows.round().astype(int)[:, None] * PAS_WIDTH + columns.round().astype(int)).reshape(-1)
+
+
+def best_beams(spectra: Float[np.ndarray, "n 90 360"]) -> Int[np.ndarray, " n"]:
+    """Returns which beam hears most in every spectrum. A planar array in the local y-z plane hears the same ahead and behind:
+    there the beam ahead, at local +x, where directional elements look."""
+    heard = spectra.reshape(len(spectra), -1)[:, codebook()]
+    best = heard.argmax(1)
+    ring, sector = np.divmod(best, SECTORS)
+    twin = ring * SECTORS + (SECTORS // 2 - sector) % SECTORS
+    ahead, row = pas_directions().reshape(-1, 3)[codebook(), 0], np.arange(len(heard))
+    return np.where((heard[row, twin] >= (1 - ALIKE) * heard[row, best]) & (ahead[twin] > ahead[best]), twin, best)

@@ -3,7 +3,7 @@
 `reference.py` is the dense, readable oracle of the same image.
 """
 
-from wbgs_jax.splat.project import Splats, project
+from wbgs_jax.splat.projection import Splats, project
 from wbgs_jax.splat.reference import render_dense
 from wbgs_jax.splat.render import GeometryPlan, geometry_plan, measure_limits, render_splats
 from wbgs_jax.splat.tiles import TileLimits, fit_limits, grown_slots, slots_for

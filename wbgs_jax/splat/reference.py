@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.splat.footprint import footprint, mahalanobis2, wrap_azimuth
-from wbgs_jax.splat.project import Splats
+from wbgs_jax.splat.projection import Splats, footprint, mahalanobis2, wrap_azimuth
 
 
 def render_dense(splats: Splats, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:

@@ -12,7 +12,7 @@ from wbgs_jax._util.checks import check_array
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.splat.composite import composite
-from wbgs_jax.splat.project import Splats, project
+from wbgs_jax.splat.projection import Splats, project
 from wbgs_jax.splat.tiles import TileJobs, TileLimits, Tiling, build_tile_jobs, fit_limits
 from wbgs_jax.types import Gaussians, Receiver
 

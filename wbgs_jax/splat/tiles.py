@@ -20,8 +20,7 @@ from wbgs_jax._util.per_platform import per_platform
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
-from wbgs_jax.splat.footprint import CUT
-from wbgs_jax.splat.project import TILE_ROOM, Splats
+from wbgs_jax.splat.projection import CUT, TILE_ROOM, Splats
 
 CHUNK = 16
 """Gaussians in a job."""

@@ -21,8 +21,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
+from wbgs_jax._util.devices import is_first
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.processes import is_first
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16

@@ -3,21 +3,377 @@
 A newcomer can read it top to bottom: `train` builds a `Run` (run.py), then repeats `Run.epoch` until the last step.
 """
 
+import dataclasses
+import threading
+import time
+import warnings
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
-from wbgs_jax._util.memory import give_back
-from wbgs_jax._util.processes import any_process, check_alike, is_first
+from wbgs_jax._util.compilation import give_back
+from wbgs_jax._util.devices import any_process, by_first, check_alike, devices_for, is_first
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, checksum
+from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.data.splits import training_links, without_test
+from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, get_field
-from wbgs_jax.training.data import check_data, limited
-from wbgs_jax.training.interrupts import Interrupted, deferred_interrupt
-from wbgs_jax.training.progress import TrainingProgress
-from wbgs_jax.training.run import CONTROLS, Run, crosses
+from wbgs_jax.training import checkpoint, curves
+from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
+from wbgs_jax.training.calibration.pipeline import Search
+from wbgs_jax.training.density import DensityControl
+from wbgs_jax.training.hooks import Context, Control, Edit, OfPart, Say, map_moments, silent
+from wbgs_jax.training.optim import make_optimizer
+from wbgs_jax.training.progress import Interrupted, TrainingProgress, deferred_interrupt
+from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
+
+
+class Precompilation:
+    """Programs that threads of the background compile, each once."""
+
+    def __init__(self) -> None:
+        self._threads: dict[Hashable, threading.Thread] = {}
+        self._ready: set[Hashable] = set()
+        self.seconds = 0.0
+        """What compiling took, of what is ready."""
+
+    def begin(self, key: Hashable, call: Callable[[], object]) -> None:
+        """Starts a call whose programs have this key, unless it has been started before."""
+        if key not in self._threads:
+            self._threads[key] = threading.Thread(target=self._run, args=(key, call))  # a process ends after it: XLA demands it
+            self._threads[key].start()
+
+    def wait(self, key: Hashable) -> bool:
+        """Waits for a call that is under way; returns whether its programs are ready."""
+        if key in self._threads:
+            self._threads[key].join()
+        return key in self._ready
+
+    def _run(self, key: Hashable, call: Callable[[], object]) -> None:
+        begin = time.perf_counter()
+        call()
+        self.seconds += time.perf_counter() - begin
+        self._ready.add(key)
+
+
+CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": Search}
+"""Host controls by the names that fields and settings give them."""
+CALIBRATED, BLOCK = 720, 16
+"""Validation links that a field is calibrated by, at most, and how many at a time."""
+
+
+def make_control(name: str, settings: Settings) -> Control | None:
+    """Returns the host control that a field asks for by this name; None where the settings switch it off."""
+    part, _, kind = name.rpartition(".")
+    config = getattr(settings, kind)
+    if not config:
+        return None
+    control = CONTROLS[kind](config)
+    return OfPart(part, control) if part else control
+
+
+@dataclass(frozen=True)
+class Launched:
+    """An epoch that the device has been given."""
+
+    step: int
+    """At which it begins."""
+    batches: Int[np.ndarray, "k b"]
+    report: EpochReport
+    """Not waited for yet."""
+
+
+class Run:
+    """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
+
+    def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, devices: int = 0):
+        self.numbers = training_links(dataset)  # of the links, as the data count them
+        self.checksum = checksum(dataset)
+        dataset = without_test(dataset)  # nothing in a training can look at the test
+        self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
+        kind, self.key = get_field(field), jax.random.key(seed)
+        self.controls = tuple(control for name in kind.controls if (control := make_control(name, settings)))
+        self.optimizer = make_optimizer(kind, settings.field, settings.optim)
+        self.checkpoints = folder / "checkpoints"
+        self.seconds, self.compilations, self.compile_seconds = 0.0, 1, 0.0
+        self.launched: list[Launched] = []
+        self.precompilation = Precompilation()
+        self._known: set[Any] = set()  # programs that have run
+        self.field = kind.make(settings.field, DatasetScene(dataset), seed)
+        self.state = init_state(self.field.init(self.key), self.optimizer, self.controls)
+        self.limits = self.field.limits(self.state.params, dataset.receivers)
+        self.data, self.virtual = data_with_virtual(dataset, kind, seed if settings.optim.virtual else None)
+        rng = np.random.default_rng([seed, 1])
+        watched = min(settings.loop.evaluate_spectra, len(dataset.validation))
+        self.watched = np.sort(rng.choice(dataset.validation, watched, replace=False))
+        self.devices, idle = devices_for(self.batch, devices)
+        if idle and is_first():
+            warnings.warn(idle, stacklevel=2)
+
+    @cached_property
+    def cache(self) -> Any:
+        """What the field has prepared of all links: when it is first asked for, since a checkpoint may bring another field."""
+        return self.field.prepare(self.data.links, self.data.receivers)
+
+    @property
+    def batch(self) -> int:
+        """Links a step."""
+        return min(self.settings.optim.batch, len(self.dataset.train))
+
+    @property
+    def step(self) -> int:
+        """Steps done, whose figures are known."""
+        return self.launched[0].step if self.launched else int(self.state.step)
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """How large the field is: host controls alone change that."""
+        return self.field.sizes(self.state.params)
+
+    def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
+        """Returns the batches of an epoch, each of one receiver: a function of seed and epoch alone, so that a resumed run sees
+        the same ones."""
+        rng = np.random.default_rng([self.seed, 2, epoch])
+        pool = self.pool(epoch * steps / self.settings.optim.steps)
+        return np.stack([self._draw(rng, pool, self.batch) for _ in range(steps)]).astype(np.int32)
+
+    def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, " n"], batch: int) -> Int[np.ndarray, " b"]:
+        if self.dataset.n_receivers > 1:  # a receiver as often as its share of the links
+            of_receiver = self.dataset.receiver_index[pool]
+            pool = pool[of_receiver == rng.choice(of_receiver)]
+        drawn = rng.choice(pool, batch, replace=len(pool) < batch)
+        virtual = self.virtual[self.dataset.receiver_index[drawn[0]]]
+        return with_virtual_drawn(drawn, virtual, self.settings.optim.virtual, rng)
+
+    def pool(self, progress: float) -> Int[np.ndarray, " n"]:
+        """Returns the training links that batches are drawn from after this share of the steps: low frequencies first, if
+        asked."""
+        train, curriculum = self.dataset.train, self.settings.optim.curriculum
+        frequencies = self.dataset.frequencies_hz[train]
+        if progress >= curriculum:
+            return train
+        low, high = frequencies.min(), frequencies.max()
+        return train[frequencies <= low * (high / low) ** (progress / curriculum) * (1 + 1e-6)]
+
+    def epoch(self, go_on: bool = False) -> dict[str, float]:
+        """Runs one block of steps and returns means of the loss and of the metrics. Overflowed steps are repeated with larger
+        limits.
+
+        `go_on` gives the device the next block before it waits for the figures of this one: nothing may be due between them.
+        """
+        begin, length = time.perf_counter(), self.settings.loop.epoch_steps
+        resized = not self._known
+        if not self.launched:
+            self._launch(self.step)
+        if go_on:
+            self._launch(self.launched[-1].step + length)
+        done, figures = 0, dict[str, list[float]]()
+        while done < length:
+            report = self.launched[0].report
+            ran = slice(done, done + int(report.good_steps))
+            for name, values in ({"loss": report.loss} | report.metrics).items():
+                figures.setdefault(name, []).extend(np.asarray(values)[ran].tolist())
+            done = ran.stop
+            if report.stopped:
+                given, self.launched, resized = self.launched, [], True
+                self._recover(report, given[0].batches[done])
+                for old in given:  # those after the first have done nothing
+                    self._launch(old.step, done if old is given[0] else 0)
+        self.launched.pop(0)
+        if resized:
+            self._compile_next()
+        self.seconds += time.perf_counter() - begin
+        return {name: float(np.mean(values)) for name, values in figures.items()}
+
+    def _launch(self, step: int, first: int = 0) -> None:
+        """Gives the device the epoch that begins at a step, from its batch number `first` on."""
+        length, program, cache = self.settings.loop.epoch_steps, self._program(self.state.params, self.limits), self.cache
+        batches = self.batches(step // length, length)
+        stopped = self.launched[-1].report.stopped if self.launched else jnp.zeros((), bool)
+        ready, begin = self.precompilation.wait(program), time.perf_counter()
+        self.state, report = self._run_epoch(self.state, cache, batches, first, self.limits, stopped)
+        self.launched.append(Launched(step, batches, report))
+        if not ready and program not in self._known:
+            self.compile_seconds += time.perf_counter() - begin  # the call returns before a step is done
+        self._known.add(program)
+
+    def _run_epoch(
+        self, state: TrainState, cache: Any, batches: Any, first: int, limits: Any, stopped: Any
+    ) -> tuple[TrainState, EpochReport]:
+        given = state, (jnp.asarray(batches), jnp.asarray(first, jnp.int32), self.key), stopped
+        state, rest, stopped = self.devices.replicated(given)
+        results = run_epoch(
+            state,
+            *self.devices.kept(self.field, cache, self.data),
+            *rest,
+            optimizer=self.optimizer,
+            controls=self.controls,
+            limits=limits,
+            mesh=self.devices.mesh,
+            stopped=stopped,
+            branches=jax.default_backend() == "cpu",
+        )
+        return self.devices.own(results)
+
+    def _program(self, params: Any, limits: Any) -> Any:
+        """Returns what distinguishes the compiled epochs of a run."""
+        return limits, tuple(_shapes(params)), jax.tree.structure(self.field)
+
+    def _compile_next(self) -> None:
+        """Begins to compile the epoch for the next size of the field, where one is near; of one process and device alone."""
+        if self.devices.mesh is not None or jax.process_count() > 1:
+            return
+        for control in self.controls:
+            found = control.next_size(self.state.params, self.step, self.settings.optim.steps)
+            if found is None:
+                continue
+            params, limits, cache = found[0], self._grown(found[1]), self.cache
+            shapes = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
+            batches = np.zeros((self.settings.loop.epoch_steps, self.batch), np.int32)
+
+            def call(shapes: Any = shapes, cache: Any = cache, limits: Any = limits, batches: Any = batches) -> None:
+                state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+                self._run_epoch(state, cache, batches, len(batches), limits, jnp.zeros((), bool))
+
+            self.precompilation.begin(self._program(params, limits), call)
+
+    def _grown(self, growth: float) -> Any:
+        """Returns the limits of the field once it has grown: a function of those that checkpoints keep."""
+        return self.limits if self.limits is None or growth == 1 else self.limits.scaled(growth)
+
+    def _recover(self, report: EpochReport, batch: Int[np.ndarray, " b"]) -> None:
+        """Grows the limits after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
+        if report.overflow:
+            self.limits = self.field.grow(self.limits, np.asarray(report.required))
+            self.compilations += 1
+            return
+        saved = checkpoint.checkpoint_steps(self.checkpoints)
+        last = f"the last good checkpoint is {self.checkpoints / str(saved[-1])}" if saved else "there is no checkpoint yet"
+        spectra = self.numbers[np.unique(batch[batch < len(self.numbers)])].tolist()
+        raise UserError(
+            f"the loss of step {self.step} or its gradient is not finite; {last}. Check spectra {spectra}, counted from 0, or "
+            "start again with smaller learning rates"
+        )
+
+    def control(self, say: Say = silent) -> bool:
+        """Lets every host control act that is due, and returns whether any was; `say` is told of long work."""
+        acted = False
+        for number, control in enumerate(self.controls):
+            if control.due(self.step, self.settings.optim.steps):
+                begin, step = time.perf_counter(), self.step
+                rng = np.random.default_rng([self.seed, control.stream, step])
+                context = Context(self.data, self.cache, self.dataset.train, say)
+                edit = control.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
+                self._commit(number, edit)
+                check_alike(self.state, f"what the {type(control).__name__} made of the parameters")
+                self.seconds += time.perf_counter() - begin
+                if edit.report:
+                    self.log({"step": step} | edit.report)
+                acted = True
+        if acted:
+            give_back()
+            self._compile_next()
+        return acted
+
+    def due(self, step: int) -> bool:
+        """Returns whether anything is to be done after a step but to go on: controls, curves, a checkpoint, the end."""
+        loop, total = self.settings.loop, self.settings.optim.steps
+        before, shown = step - loop.epoch_steps, len(self.watched) > 0
+        return (
+            step >= total
+            or any(control.due(step, total) for control in self.controls)
+            or (shown and crosses(before, step, loop.evaluate_every))
+            or crosses(before, step, loop.checkpoint_every)
+        )
+
+    def _commit(self, number: int, edit: Edit) -> None:
+        """Puts a control's edit into the state, moments and all."""
+        old, statistics = self.state, list(self.state.statistics)
+        self.__dict__.pop("sizes", None)
+        if _shapes(edit.params) != _shapes(old.params):
+            self.compilations += 1
+            self.limits = self._grown(edit.growth)
+            statistics = [control.statistics(edit.params) for control in self.controls]  # what others saw is of other shapes
+        follow = edit.moments
+        moments = map_moments(old.optimizer, old.params, follow) if follow else self.optimizer.init(edit.params)
+        statistics[number] = edit.statistics
+        self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
+        if edit.field is not None:
+            self.field, self.cache = edit.field, edit.cache
+
+    def calibrate(self) -> None:
+        """Lets the field learn what only the validation part can say."""
+        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:CALIBRATED]
+        receiver = self.dataset.receiver_index[chosen]
+        blocks = [
+            own[i : i + BLOCK]
+            for number in np.unique(receiver)
+            for own in [chosen[receiver == number]]
+            for i in range(0, len(own), BLOCK)
+        ]
+        batches = [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
+        params, report = self.field.calibrate(self.state.params, self.cache, batches)
+        self.state = dataclasses.replace(self.state, params=params)
+        if report:
+            self.log({"step": self.step} | report)
+
+    def evaluate(self) -> dict[str, float]:
+        """Returns figures of the watched validation spectra."""
+        return watch(self.field, self.state.params, self.dataset, self.watched)
+
+    def log(self, entry: dict[str, Any]) -> None:
+        """Appends a line to metrics.jsonl."""
+        if is_first():
+            curves.append(self.folder / "metrics.jsonl", entry)
+
+    def save(self) -> None:
+        """Writes a checkpoint of the present step."""
+        limits = dataclasses.asdict(self.limits) if self.limits else None
+        compiled = {"compilations": self.compilations, "compile_seconds": self.compile_seconds + self.precompilation.seconds}
+        metadata = {"limits": limits, "seconds": self.seconds, "data": self.checksum} | compiled
+        keep = self.settings.loop.keep_checkpoints
+        check_alike(self.state, f"the state of step {self.step}")
+        checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, keep)
+
+    def restore(self) -> bool:
+        """Loads the newest checkpoint, if there is one, and returns whether there was."""
+        by_first(lambda: checkpoint.tidy(self.checkpoints, self.settings.loop.keep_checkpoints))
+        steps = checkpoint.checkpoint_steps(self.checkpoints)
+        by_first(lambda: curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1))
+        if not steps:
+            return False
+        saved = checkpoint.read(self.checkpoints, steps[-1])
+        if saved.metadata.get("data", self.checksum) != self.checksum:
+            raise UserError(f"the data of {self.folder} are not those that it was trained on; put them back, or train again")
+        self.field = type(self.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), self.settings.field)
+        params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
+        like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
+        self.state = checkpoint.fill_like(saved, like)
+        self.seconds = float(saved.metadata["seconds"])
+        if saved.metadata["limits"]:
+            self.limits = type(self.limits)(**saved.metadata["limits"])
+        for derived in ("cache", "sizes"):
+            self.__dict__.pop(derived, None)
+        return True
+
+
+def _shapes(tree: Any) -> list[tuple[int, ...]]:
+    return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def crosses(before: int, after: int, interval: int) -> bool:
+    """Returns whether a multiple of the interval lies between two steps, the second one included."""
+    return before // interval != after // interval
+
 
 __all__ = ["CONTROLS", "Interrupted", "Run", "TrainResult", "train"]
 

@@ -1,9 +1,16 @@
 """What a person sees of a training: a live bar on a terminal, a plain line now and then in a log."""
 
+import contextlib
+import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -13,7 +20,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from wbgs_jax._util.progress import LOG_INTERVAL, Bar
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.progress_lines import LOG_INTERVAL, Bar
+from wbgs_jax.fields import Field
 
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
 """Figures that are measured now and then, and shown until they are measured again."""
@@ -73,3 +82,73 @@ class TrainingProgress:
             print(f"step {step}/{self.total}  {status}{left}", file=sys.stderr, flush=True)
         if not self.compiled:  # neither searches nor compilation come again: what they took tells no rate
             self.compiled, self.started, self.start_step = True, time.monotonic(), step
+
+
+PROBE_SECONDS = 0.0095
+"""What `_probe` takes there: two cores of an AMD EPYC."""
+SIZE, PRODUCTS, TRIALS = 512, 8, 15
+
+
+def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> float | None:
+    """Returns about how long a training takes here; None where no training like it has been timed.
+
+    Args:
+        field: what is trained.
+        preset: by name.
+        share: of the preset's steps that are still to do.
+    """
+    known = field.seconds.get(preset)
+    return None if known is None or jax.default_backend() != "cpu" else known * share * _probe() / PROBE_SECONDS
+
+
+def duration_words(seconds: float) -> str:
+    """Returns "about 12 minutes"."""
+    if seconds < 90:
+        return "about a minute"
+    minutes = seconds / 60
+    return f"about {minutes:.0f} minutes" if minutes < 90 else f"about {minutes / 60:.1f} hours"
+
+
+def _probe() -> float:
+    """Returns the median time of a few matrix products: other programs that run count too."""
+
+    def products(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, PRODUCTS, lambda _, y: jnp.tanh(y @ x) / SIZE, x)
+
+    run, x, times = jax.jit(products), jnp.ones((SIZE, SIZE)), []
+    run(x).block_until_ready()
+    for _ in range(TRIALS):
+        start = time.perf_counter()
+        run(x).block_until_ready()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+class Interrupted(UserError):
+    """Ctrl-C: the state is saved, the message says how to go on."""
+
+
+@contextlib.contextmanager
+def deferred_interrupt() -> Iterator[dict[str, bool]]:
+    """Turns the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once. One that comes too
+    late to be looked at is passed on at the end.
+
+    Signals reach the main thread only; elsewhere the flag is never set.
+    """
+    flag, received = {"set": False}, list[int]()
+
+    def handler(signum, frame):
+        if flag["set"]:
+            raise KeyboardInterrupt
+        flag["set"] = True
+        received.append(signum)
+
+    signals = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    previous = {s: signal.signal(s, handler) for s in signals}
+    try:
+        yield flag
+    finally:
+        for s, old in previous.items():
+            signal.signal(s, old)
+    for number in received:  # nobody was told
+        signal.raise_signal(number)

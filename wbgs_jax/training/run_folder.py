@@ -4,9 +4,11 @@ config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pi
 neighbours.npz   confidence.npz   power_confidence.npz
 """
 
+import contextlib
 import dataclasses
 import os
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,8 @@ from wbgs_jax._util.files import left_by_killed, read_json, write_json
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax._util.typed import misfit
 from wbgs_jax.config import Settings, check, from_dict, sections, to_dict
-from wbgs_jax.data.checksum import check_data
 from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.dataset import Dataset, check_data
 from wbgs_jax.data.load import load_dataset, source_paths
 from wbgs_jax.data.splits import (
     VALIDATION,
@@ -33,9 +34,10 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.inference import confidence, neighbours
-from wbgs_jax.inference.confidence import Confidence, PowerConfidence, read_confidence, read_power_confidence
-from wbgs_jax.inference.neighbours import Beside, read_neighbours
+from wbgs_jax.inference import intervals as confidence
+from wbgs_jax.inference import kriging as neighbours
+from wbgs_jax.inference.intervals import Confidence, PowerConfidence, read_confidence, read_power_confidence
+from wbgs_jax.inference.kriging import Beside, read_neighbours
 from wbgs_jax.training import checkpoint
 
 FIRST_PRESET = "cpu"
@@ -211,3 +213,39 @@ def load_trained(folder: Path | str) -> TrainedField:
     seconds = float(saved.metadata["seconds"])
     beside = read_neighbours(folder), read_confidence(folder), read_power_confidence(folder)
     return TrainedField(config, field, params, steps[-1], seconds, *beside, data=saved.metadata.get("data", ""))
+
+
+try:
+    import fcntl
+except ImportError:  # not on Windows, where nobody is kept out
+    fcntl = None  # type: ignore[assignment]
+
+FILE = "training.lock"
+
+
+class Taken(UserError):
+    """Another process has the folder."""
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps a run folder for this process while the block runs; the lock goes with the process, however that ends.
+
+    Raises:
+        Taken: another process has it; the message says which.
+    """
+    with (folder / FILE).open("a+") as stream:
+        if fcntl is not None:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                stream.seek(0)
+                holder = stream.read(200).strip() or "another process"
+                raise Taken(f"{folder} is being trained by {holder}; wait for it, or choose another OUT") from None
+            except OSError:  # some clusters' file systems know no locks
+                warnings.warn(f"{folder} cannot be locked on its file system; train one run there at a time", stacklevel=3)
+        stream.truncate(0)
+        stream.write(f"process {os.getpid()}")
+        stream.flush()
+        yield
+    (folder / FILE).unlink(missing_ok=True)

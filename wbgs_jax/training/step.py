@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from wbgs_jax._util.devices import averaged
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields import Aux, Field
-from wbgs_jax.training.controls import Control
-from wbgs_jax.training.data import TrainingData
+from wbgs_jax.training.batches import TrainingData
+from wbgs_jax.training.hooks import Control
 
 
 @pytree

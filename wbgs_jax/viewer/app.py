@@ -12,12 +12,12 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from wbgs_jax._util.command import say
+from wbgs_jax._util.cli import say
 from wbgs_jax._util.files import atomic_write
-from wbgs_jax.inference.floor import plane_over
+from wbgs_jax.inference.radio_map import plane_over
 from wbgs_jax.viewer import drawing, panel, walk
-from wbgs_jax.viewer.asking import Answer, Asker
-from wbgs_jax.viewer.scene import SceneView
+from wbgs_jax.viewer.session import Answer, Asker
+from wbgs_jax.viewer.surroundings import SceneView
 
 STEPS_A_SECOND = 20
 """Of a walk."""

@@ -8,11 +8,11 @@ import viser
 from jaxtyping import Float
 from viser import uplot
 
-from wbgs_jax.data.surface import DatasetScene
+from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.inference.answers import lowest_answered
 from wbgs_jax.types import MAX_FREQUENCY_HZ
 from wbgs_jax.viewer import drawing
-from wbgs_jax.viewer.asking import Answer, Asker, PathList, Sample
+from wbgs_jax.viewer.session import Answer, Asker, PathList, Sample
 
 BLACK = np.zeros((90, 360))
 MOST_PATHS = 200

@@ -1,0 +1,215 @@
+"""Hand a trained field to other programs, and their channels and rooms to a training:
+
+wbgs-jax convert --run RUN --tx x,y,z --ghz 28 --out gaussians.ply          Gaussians, for splat viewers
+wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths, as sionna.rt.Paths has them
+wbgs-jax convert --run RUN --grid LOW:HIGH:NXxNYxNZ --ghz 28 --out folder   a DeepMIMO scenario
+wbgs-jax convert --paths sionna.npz --array 4x4 --out scene.npz             paths of Sionna RT as a scene file
+wbgs-jax convert --paths scenario --ghz 28 --array 4x4 --out scene.npz      a DeepMIMO scenario as a scene file
+wbgs-jax convert room.glb --materials materials.toml --out data/room.npz    a model of a room, beside measured spectra
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from wbgs_jax._util.cli import parse_positions, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable
+from wbgs_jax.inference.queries import parse_array, parse_grid
+
+# What takes JAX is imported where it is wanted, as in predict.py.
+
+COLORS = "viridis"
+BRIGHT = 0.99
+"""Share of the Gaussians that are no brighter than the end of the colours."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Hand a trained field to other programs, and their channels and rooms to a training."""
+
+    out: Path
+    """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). Else: a scene file or a room file, .npz."""
+    model: tyro.conf.Positional[Path | None] = None
+    """A room: .glb, .gltf, .obj, .ply, or Sionna RT's .xml; or ..."""
+    run: Path | None = None
+    """... a run folder, or ..."""
+    paths: Path | None = None
+    """... paths: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
+    materials: Path | None = None
+    """Of a model: a .toml with the materials of its objects (docs/own_scene.md)."""
+    up: Literal["y", "z"] | None = None
+    """Of a model: the axis that points up (.glb, .gltf: y; others: z)."""
+    scale: float | None = None
+    """Of a model: metres in one unit of it."""
+    tx: tuple[str, ...] = ()
+    """Of a run: transmitters, each as x,y,z in metres."""
+    grid: str = ""
+    """Or a grid of them, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
+    ghz: float | None = None
+    """Frequency; of --paths where these do not say it."""
+    rx: str = ""
+    """Of a run: another receiver than the first (`wbgs-jax predict --help`)."""
+    array: str = ""
+    """Of --paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart; by default the paths' own, else 4x4."""
+    port: int | None = None
+    """Of --paths with two polarisations: which one, 1 or 2."""
+    tx_antenna: int | None = None
+    """Of --paths whose transmitters have several antennas: which one, 1, 2, ..."""
+    mesh: Path | None = None
+    """Of --paths: the room, a room file or a model in metres."""
+    swap: bool = False
+    """Of --paths: train for the other side: the transmitters' of Sionna RT, the users' of DeepMIMO."""
+    tx_set: int | None = None
+    """Of a DeepMIMO scenario: the set of base stations, ..."""
+    tx_index: int | None = None
+    """... one of them (0, 1, ...; by default all), ..."""
+    rx_set: int | None = None
+    """... and the set of users."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that cannot work."""
+    if [command.run, command.paths, command.model].count(None) != 2:
+        raise UserError(
+            "give one of --run RUN, to hand a field on, --paths FILE, to make a scene file of other paths, or a model such as "
+            "room.glb, to make a room file of it"
+        )
+    if command.run is None and command.out.suffix != ".npz":
+        raise UserError(f"--out {command.out} does not end in .npz; scene files and room files do")
+    if command.run is None:
+        return
+    if bool(command.tx) == bool(command.grid) or command.ghz is None:
+        raise UserError("a run is asked for transmitters at a frequency: give --tx x,y,z or --grid, and --ghz 28")
+    if command.out.suffix not in (".ply", ".npz", ""):
+        raise UserError(f"--out {command.out} is of no known kind; give gaussians.ply, paths.npz, or a folder for DeepMIMO")
+
+
+def hand_on(command: Command) -> str:
+    """Writes what a field knows, and returns a line about it."""
+    from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at
+    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.training.run_folder import open_run
+
+    assert command.run is not None and command.ghz is not None, "checked"
+    positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
+    hertz = frequencies((command.ghz,))
+    trained = open_run(command.run)
+    dataset = trained.dataset()
+    receiver = receiver_at(command.rx, dataset)
+    trained = at_receiver(trained, receiver, dataset)
+    check_frequencies(trained, dataset, float(hertz[0]))
+    for line in doubts(dataset, np.asarray(receiver.position), positions, hertz)[:3]:
+        say(f"warning: {line}")
+    write = _write_gaussians if command.out.suffix == ".ply" else _write_paths
+    return write(command, trained, receiver, positions, float(hertz[0]))
+
+
+def _write_gaussians(
+    command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
+) -> str:
+    """Writes the Gaussians: brighter colours send more towards the receiver, opacity is their attenuation."""
+    from matplotlib import colormaps
+
+    from wbgs_jax.interchange.gaussian_ply import write_gaussians
+    from wbgs_jax.types import make_query
+
+    plan = trained.field.plan(trained.params, receiver)
+    query = make_query(positions, np.full(len(positions), frequency_hz))
+    seen = trained.field.splatted(trained.params, plan, query)
+    if seen is None:
+        raise UserError(
+            f"the {trained.field.name} field of this run has no Gaussians; train a field that has (docs/which_field.md)"
+        )
+    signal, attenuation = (np.abs(np.asarray(values)).mean(1) for values in (seen.signal, seen.attenuation))
+    brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], BRIGHT)), 1e-12)
+    colours = colormaps[COLORS](np.clip(signal / brightest, 0, 1))[:, :3]
+    count = write_gaussians(command.out, seen.gaussians, colours, attenuation)
+    return f"Gaussians: {command.out} ({count}, coloured by their mean signal at {command.ghz:g} GHz)"
+
+
+def _write_paths(
+    command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
+) -> str:
+    from wbgs_jax.inference.evaluate_quantities import arrivals_of
+    from wbgs_jax.interchange.deepmimo import as_deepmimo, write_deepmimo
+    from wbgs_jax.interchange.ray_paths import from_arrivals, save_paths
+
+    found = arrivals_of(trained, receiver, positions, frequency_hz)
+    paths = from_arrivals(found, positions, np.asarray(receiver.position), frequency_hz)
+    if command.out.suffix == ".npz":
+        save_paths(command.out, paths)
+        return f"paths: {command.out} ({paths.valid.sum()} of {len(positions)} transmitters)"
+    write_deepmimo(command.out, as_deepmimo(paths.reversed()), frequency_hz)
+    return f"DeepMIMO scenario: {command.out} (the receiver as base station, {len(positions)} transmitters as users)"
+
+
+def take_in(command: Command) -> str:
+    """Writes a scene file of other programs' paths, and returns a line about it."""
+    from wbgs_jax.data.load import check_kind
+    from wbgs_jax.data.scene_file import save_scene
+    from wbgs_jax.interchange.deepmimo import is_deepmimo, load_deepmimo
+    from wbgs_jax.interchange.ray_paths import check_paths, read_paths
+    from wbgs_jax.interchange.rooms import open_room
+    from wbgs_jax.interchange.scenes import scene_of_paths
+    from wbgs_jax.interchange.sionna_arrays import DEFAULT, scene_of_sionna
+    from wbgs_jax.radio.array import planar_array
+
+    assert command.paths is not None, "checked"
+    hertz = None if command.ghz is None else 1e9 * command.ghz
+    if command.paths.is_file() and command.paths.suffix.lower() not in (".npz", ".mat"):
+        check_kind(command.paths)
+        raise UserError(f"{command.paths} is of no known kind; give an .npz with Sionna's arrays, or a DeepMIMO scenario")
+    room = None if command.mesh is None else open_room(command.mesh)
+    shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
+    if is_deepmimo(command.paths):
+        paths = load_deepmimo(command.paths, hertz, command.tx_set, command.tx_index, command.rx_set)
+        check_paths(paths, str(command.paths))
+        paths = paths if command.swap else paths.reversed()
+        scene = scene_of_paths([paths], planar_array(*(shape or DEFAULT)), name, room=room)
+    else:
+        choice = shape, command.port, command.tx_antenna, command.swap
+        scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, room, str(command.paths))
+    save_scene(command.out, scene)
+    heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
+    count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
+    return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {shlex.quote(str(command.out))}"
+
+
+def take_room(command: Command) -> str:
+    """Writes a room file of a model, lists its objects, and returns a line about it."""
+    from wbgs_jax.data.room_file import save_room
+    from wbgs_jax.interchange.rooms import describe_room, read_room, room_of
+
+    assert command.model is not None, "checked"
+    objects = read_room(command.model, command.materials, command.up, command.scale, named=False)
+    room = room_of(objects)
+    save_room(command.out, room)
+    say(describe_room(objects, ["closed" if one.mesh.is_watertight else "sheet" for one in objects]))
+    low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (room.vertices.min(0), room.vertices.max(0)))
+    beside = "it belongs into a folder of spectra, as room.npz, or beside snapshots (docs/own_scene.md)"
+    return f"room: {command.out} ({len(objects)} objects from ({low}) to ({high}) m); {beside}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax convert")
+    check(command)
+    check_writable(command.out if command.out.suffix else command.out / "scenario")
+    use_compilation_cache()
+    job = take_in if command.paths is not None else take_room if command.run is None else hand_on
+    say(job(command))
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,113 @@
+"""Evaluate a trained field: `wbgs-jax eval --run RUN [--data ...] [--json]`.
+
+Scores the held-out spectra (scikit-image SSIM, data range 1, default window; PSNR; MAE) beside the baselines, draws pictures
+into the run folder and writes the report to `eval.json` there; of other data (`--data`), to `eval-NAME.json`.
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+import json
+import shlex
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from wbgs_jax import plotting as pictures
+from wbgs_jax._util.cli import run_command
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable, write_json
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
+from wbgs_jax.evaluation.score import Part, evaluate, held_out
+from wbgs_jax.inference.predictor import BLOCK, at_receivers
+from wbgs_jax.training import curves
+from wbgs_jax.training.manifest import write_manifest
+from wbgs_jax.training.run_folder import MANIFEST, TrainedField, open_run
+
+
+@dataclass(frozen=True)
+class Command:
+    """Evaluate a trained field on held-out spectra."""
+
+    run: Path
+    """Run folder."""
+    data: str | None = None
+    """Other data than the run was trained on: a scene, a scene file or a folder."""
+    part: Part = "test"
+    """What to score: the test transmitters, or those held out for choices (`wbgs-jax train --validation 0.1`)."""
+    json: bool = False
+    """Print the report as one JSON object on stdout, and nothing else there."""
+    pictures: bool = True
+    """Draw pictures into the run folder."""
+    results: Path | None = None
+    """Also write quality_<dataset>_<field>_<preset>_<device>.json with provenance into this folder."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    use_compilation_cache()
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax eval")
+    trained = open_run(command.run)
+    check_writable(command.run / "eval.json")
+    dataset = trained.dataset() if command.data is None else trained.config.other_data(command.data)
+    if command.data is not None:
+        trained = for_receivers(trained, dataset)
+    console = Console(file=sys.stderr, markup=False, soft_wrap=True)
+    index = held_out(dataset, command.part)
+    console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
+    report, predicted = evaluate(trained, dataset, command.part)
+    beside = "" if command.data is None else f"-{dataset.name}"  # scores on other data never replace the run's own
+    write_json(command.run / f"{with_part('eval', command.part)}{beside}.json", report)
+    if command.data is None and (command.run / MANIFEST).exists():
+        write_manifest(command.run, trained, report)
+    if command.results:
+        path = result_path(command.results, report, trained.config.preset)
+        write_json(path, report | {"provenance": provenance(trained)})
+        console.print(f"results: {path}")
+    if command.pictures and dataset.kind != "power":
+        entries = curves.read(command.run / "metrics.jsonl")
+        folder = command.run / f"{with_part('pictures', command.part)}{beside}"
+        for path in pictures.draw_all(folder, dataset, index, predicted, report, entries):
+            console.print(f"picture: {path}")
+        if (displaced := trained.field.displaced_surfaces()) is not None:
+            console.print(f"picture: {pictures.draw_motion(folder, *displaced)}")
+    if command.json:
+        print(json.dumps(report, allow_nan=False))
+        return
+    Console(width=None if sys.stdout.isatty() else 140).print(table(report))
+    print("\n".join(closing_lines(report, BLOCK)))
+    for line in next_lines(trained, dataset, command.run):
+        console.print(line)
+
+
+def for_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
+    """Returns what answers at the receivers of other data; where nothing does, the field as it is, with a note."""
+    try:
+        return at_receivers(trained, dataset)
+    except UserError as error:
+        warnings.warn(f"scored as if {dataset.name} had the receivers of the training: {error}", stacklevel=2)
+        return trained
+
+
+def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
+    """Returns what to look at next."""
+    folder = shlex.quote(str(run))
+    place = ",".join(f"{x:.3g}" for x in dataset.tx_positions[dataset.test[0] if len(dataset.test) else 0])
+    ghz = f"{dataset.frequencies_hz.max() / 1e9:g}"
+    lines = []
+    if dataset.kind != "power":
+        lines.append(f"next: wbgs-jax predict --run {folder} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
+    if "power" in trained.field.known() and dataset.kind != "pas":
+        lines.append(f"      wbgs-jax map --run {folder} --ghz {ghz} --picture map.png")
+    return [*lines, f"      wbgs-jax view --run {folder}"]
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,144 @@
+"""Ask a trained field for maps over a floor: what reaches the receiver from a transmitter at every place of a level plane.
+
+wbgs-jax map --run RUN --ghz 28 [60 ...] --out map.npz --picture map.png
+wbgs-jax map --run RUN --ghz 28 --what best-beam|k-factor|delay-spread|angular-spread --height 1.2 --step 0.1 --out map.npz
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from wbgs_jax._util.cli import run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.progress_lines import CountProgress
+
+# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
+
+MOST_PLACES = 1_000_000
+SUFFIXES = {"out": ".npz", "picture": ".png"}
+What = Literal["power", "best-beam", "k-factor", "delay-spread", "angular-spread"]
+
+
+@dataclass(frozen=True)
+class Command:
+    """Ask a trained field for maps of transmitters over a level plane."""
+
+    run: Path
+    """Run folder."""
+    ghz: tuple[float, ...]
+    """Frequencies, 1 to 100, and from 0.3 for fields with paths: a map each."""
+    what: What = "power"
+    """What to map; all but best-beam only where the field knows it."""
+    height: float | None = None
+    """Of the transmitters, metres; by default the median of those of the data."""
+    step: float = 0.25
+    """Metres between places."""
+    area: str = ""
+    """Corners of the plane, x0,y0:x1,y1 in metres; by default all of the scene."""
+    rx: str = ""
+    """Another receiver than the first of the data: the number of one of them, x,y,z in metres, or x,y,z,w,i,j,k with the
+    quaternion that turns its array into the world frame."""
+    out: Path | None = None
+    """Write the maps to this .npz file: values (frequency, y, x)."""
+    picture: Path | None = None
+    """Draw the maps (the first 6) with the walls into this .png file."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that asks for nothing, or for what cannot be."""
+    if not (command.out or command.picture):
+        raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
+    for name, suffix in SUFFIXES.items():
+        path = getattr(command, name)
+        if path is not None and path.suffix != suffix:
+            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
+    if not (np.isfinite(command.step) and command.step > 0):
+        raise UserError(f"--step {command.step:g} is no distance; give metres, such as --step 0.25")
+    if command.height is not None and not np.isfinite(command.height):
+        raise UserError(f"--height {command.height:g} is no height; give metres, such as --height 1.5")
+
+
+def plane_of(command: Command, dataset: Any) -> Any:
+    """Returns the `floor.Plane` that is asked for; one that is empty or has too many places is a `UserError`."""
+    from wbgs_jax.data.scene import DatasetScene
+    from wbgs_jax.inference.radio_map import plane_over
+
+    low, high = DatasetScene(dataset).box[:, :2]
+    if command.area:
+        try:
+            corners = np.array([[float(part) for part in corner.split(",")] for corner in command.area.split(":")])
+        except ValueError:
+            corners = np.zeros(0)
+        if corners.shape != (2, 2) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
+            raise UserError(f"--area {command.area} is no rectangle; give x0,y0:x1,y1 in metres, the lower corner first")
+        low, high = corners
+    if np.prod((high - low) / command.step) > MOST_PLACES:
+        raise UserError(f"--step {command.step:g} makes more than {MOST_PLACES:,} places; give a larger one, or an --area")
+    height = float(np.median(dataset.tx_positions[:, 2])) if command.height is None else command.height
+    return plane_over(low, high, height, command.step)
+
+
+def make_maps(command: Command) -> None:
+    """Asks, and writes what is wanted."""
+    from wbgs_jax.inference.answers import (
+        CONFIDENCES,
+        bounds_of,
+        check_frequencies,
+        frequencies,
+        receiver_at,
+        source_of,
+        write_answer,
+    )
+    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.inference.radio_map import ask_plane, cut_at, pieces
+    from wbgs_jax.training.run_folder import open_run
+
+    frequencies_hz = frequencies(command.ghz)
+    trained = open_run(command.run)
+    dataset = trained.dataset()
+    plane, receiver = plane_of(command, dataset), receiver_at(command.rx, dataset)
+    trained = at_receiver(trained, receiver, dataset)
+    check_frequencies(trained, dataset, float(frequencies_hz.min()))
+    rx = np.asarray(receiver.position)
+    corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
+    bounds = bounds_of(dataset)
+    for line in bounds.doubts(rx, corners, frequencies_hz):
+        say(f"warning: {line}")
+    with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
+        answer = ask_plane(command.what, trained, dataset, receiver, plane, frequencies_hz, progress.advance)
+    nowhere = bounds.without_confidence(plane.positions()).reshape(len(plane.ys), len(plane.xs))
+    for name in answer.keys() & set(CONFIDENCES):
+        answer[name] = np.where(nowhere, np.nan, answer[name])
+    answer["no_confidence"] = nowhere
+    size = f"{len(plane.xs)} x {len(plane.ys)} places at {len(frequencies_hz)} frequencies"
+    if command.out:
+        write_answer(command.out, answer, source_of(trained, dataset, receiver) | {"what": command.what})
+        say(f"map: {command.out} ({size})")
+    if command.picture:
+        from wbgs_jax.plotting import draw_maps
+
+        with atomic_write(command.picture) as stream:
+            draw_maps(command.what, answer, cut_at(dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
+        say(f"picture: {command.picture}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax map")
+    check(command)
+    check_writable(command.out, command.picture)
+    use_compilation_cache()
+    make_maps(command)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,205 @@
+"""Learn a map of received power from readings, and say how well it holds:
+
+wbgs-jax measure --data FOLDER [--out scores.json] [--picture maps.png]
+wbgs-jax measure --data FOLDER --tx x,y,z [x,y,z ...] [--answers powers.csv]
+wbgs-jax measure --floor-plan walls.csv --ceiling 2.6 --mesh walls.ply
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+import dataclasses
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from trimesh.exchange.ply import export_ply
+
+from wbgs_jax._util.cli import parse_positions, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
+from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
+from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
+from wbgs_jax.data.tables import check_positions
+from wbgs_jax.evaluation.report import environment
+from wbgs_jax.inference.answers import Bounds
+from wbgs_jax.plotting import draw_power_maps
+from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_power
+from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
+
+BEYOND_M = 2.0
+"""How far from readings, receivers and walls an answer still has an interval: the next room, not the next building."""
+SUFFIXES = {"out": ".json", "picture": ".png", "answers": ".csv", "mesh": ".ply"}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Learn a map of received power from readings at many places, and say how well it holds where it was not told."""
+
+    data: Path | None = None
+    """Folder with readings.csv, receivers.csv and, if there is a floor plan, walls.csv (docs/measured.md)."""
+    floor_plan: Path | None = None
+    """Walls: a CSV file of segments x1,y1,x2,y2 or of the corners x,y of an outline; by default the one of the folder."""
+    height: float = 1.3
+    """Height of the transmitters above the floor (metres), where readings have no z."""
+    cell: float = 0.25
+    """Size of the cells (metres) over which readings are averaged."""
+    out: Path | None = None
+    """Write the scores to this .json file."""
+    picture: Path | None = None
+    """Draw the maps of all receivers into this .png file."""
+    tx: tuple[str, ...] = ()
+    """Transmitters, each as x,y,z in metres: what do the receivers hear?"""
+    answers: Path | None = None
+    """Write what they hear to this .csv file."""
+    ceiling: float = 2.6
+    """Height of the walls of a mesh, metres."""
+    mesh: Path | None = None
+    """Write the walls of the floor plan, with floor and ceiling, to this .ply file."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
+    for name, suffix in SUFFIXES.items():
+        path = getattr(command, name)
+        if path is not None and path.suffix != suffix:
+            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
+    if command.data is None and (command.floor_plan is None or command.mesh is None):
+        raise UserError("give --data FOLDER with readings, or --floor-plan walls.csv --mesh walls.ply")
+    if command.data is None and (command.tx or command.out or command.picture):
+        raise UserError("powers follow from readings: give --data FOLDER")
+    if command.answers and not command.tx:
+        raise UserError("--answers needs --tx x,y,z")
+    for name in ("height", "cell", "ceiling"):
+        value = getattr(command, name)
+        if not (np.isfinite(value) and (name == "height" or value > 0)):
+            raise UserError(f"--{name} is {value:g}; give metres")
+
+
+def walls_of(command: Command) -> Walls:
+    """Returns the walls of the file that is named, else of the folder; without any, none."""
+    named = [command.floor_plan] if command.floor_plan else [command.data / name for name in FILES if command.data]
+    path = next((path for path in named if path.exists()), None)
+    if path is None and command.floor_plan:
+        raise UserError(f"there is no floor plan {command.floor_plan}")
+    return NO_WALLS if path is None else load_walls(path)
+
+
+def means(readings: Readings, size: float) -> tuple[Readings, float]:
+    """Returns means over cells, and the size of the cells: doubled until there are no more than a map can hold."""
+    cells = cell_means(readings, size)
+    return (cells, size) if len(cells.places) <= MAX_PLACES else means(readings, 2 * size)
+
+
+def table(found: list[Score]) -> Table:
+    """Returns the scores for people."""
+    columns = ["held out", "means", "this map", "90 % hold", *COMPARED]
+    shown = Table(*columns, title="mean absolute error of the means of cells, dB")
+    for score in found:
+        errors = (f"{score.rivals_db[rival]:.2f}" for rival in COMPARED)
+        shown.add_row(escape(score.held_out), str(score.means), f"{score.error_db:.2f}", f"{100 * score.within:.0f} %", *errors)
+    return shown
+
+
+def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Bounds) -> list[list[str]]:
+    """Returns a header and a row a transmitter: its place, then mean and half of the 90 % interval at every receiver; NaN for
+    an interval outside of what was measured."""
+    mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(places, jnp.float32)))
+    std = np.where(where.without_confidence(places)[:, None], np.nan, std)
+    names = [f"{name}_{r + 1}" for r in range(mean.shape[1]) for name in ("dbm", "within_db")]
+    pairs = np.stack([mean, NINETY * std], -1).reshape(len(places), -1)
+    rows = [[*(f"{x:g}" for x in place), *(f"{x:.2f}" for x in row)] for place, row in zip(places, pairs, strict=True)]
+    return [["x", "y", "z", *names], *rows]
+
+
+def measured_bounds(cells: Readings, walls: Walls) -> Bounds:
+    """Returns the box around readings, receivers and walls."""
+    points = np.concatenate([cells.places, cells.receivers])
+    low, high = points.min(0), points.max(0)
+    ends = np.asarray(walls.ends).reshape(-1, 2)
+    if len(ends):
+        low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
+    return Bounds("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
+
+
+def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
+    """Returns what a results file holds."""
+    law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
+    assert command.data is not None, "checked"
+    return {
+        "data": command.data.resolve().name,
+        "attribution": attribution(command.data),
+        "cell_m": size,
+        "law": dict(zip(("dbm_at_one_metre", "exponent", "first_wall_db"), law, strict=True)),
+        "scales_db": dict(zip(("room", "wall", "place", "reading"), scales, strict=True)),
+        "scores": {_key(score.held_out): _as_json(score) for score in found},
+        "environment": environment(),
+    }
+
+
+def _as_json(score: Score) -> dict[str, Any]:
+    return dataclasses.asdict(score) | {"rivals_db": {_key(name): error for name, error in score.rivals_db.items()}}
+
+
+def _key(name: str) -> str:
+    return re.sub(r"\W+", "_", name)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    use_compilation_cache()
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax measure")
+    check(command)
+    check_writable(command.out, command.picture, command.answers, command.mesh)
+    places, walls = parse_positions(command.tx), walls_of(command)
+    check_positions("--tx", places)
+    if command.mesh and not len(walls.ends):
+        raise UserError("--mesh needs walls: give --floor-plan walls.csv")
+    if command.mesh:
+        with atomic_write(command.mesh) as stream:
+            stream.write(export_ply(extruded(walls, command.ceiling)))
+        say(f"mesh: {command.mesh} ({len(walls.ends)} walls, {command.ceiling:g} m high)")
+    if command.data is None:
+        return
+    cells, size = means(load_readings(command.data, command.height), command.cell)
+    say(f"{len(cells.places)} cells of {size:g} m, {len(cells.receivers)} receivers, {len(walls.ends)} walls or faces of walls")
+    for line in attribution(command.data):
+        say(f"about the data: {line}")
+    learned = learn_map(cells, walls)
+    if command.tx:
+        where = measured_bounds(cells, walls)
+        rows = answers(learned, places, where)
+        for row, outside in zip(rows[1:], where.without_confidence(places), strict=True):
+            what = "mean dBm" if outside else "mean dBm, 90 % within"
+            powers = [row[3 + 2 * r] + ("" if outside else f" ± {row[4 + 2 * r]}") for r in range(len(cells.receivers))]
+            listed = ", ".join(f"{r}: {power}" for r, power in enumerate(powers, 1))
+            rest = "; outside of the readings: no interval" if outside else ""
+            print(f"TX ({', '.join(row[:3])}) m, {what}: receiver {listed}{rest}")
+        if command.answers:
+            write_csv(command.answers, rows)
+            say(f"answers: {command.answers}")
+    if command.picture:
+        with atomic_write(command.picture) as stream:
+            draw_power_maps(learned, walls, cells).savefig(stream, format="png", dpi=110)
+        say(f"picture: {command.picture}")
+    if command.out or not (command.tx or command.picture):
+        found = scores(cells, walls)
+        Console(width=None if sys.stdout.isatty() else 140).print(table(found))
+        if command.out:
+            write_json(command.out, report(learned, found, command, size))
+            say(f"scores: {command.out}")
+
+
+if __name__ == "__main__":
+    run_command(main)

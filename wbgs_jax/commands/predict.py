@@ -1,0 +1,275 @@
+"""Ask a trained field for spectra or channels, or export it:
+
+wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
+wbgs-jax predict --run RUN --line 0,0,1.5:4,0,1.5:41 --ghz 28 --what power --out line.csv --picture line.png
+wbgs-jax predict --run RUN --tx x,y,z --sweep 1:100:50 --what delay-spread --out sweep.npz
+wbgs-jax predict --run RUN --queries queries.csv --out spectra.npz [--resume]
+wbgs-jax predict --run RUN --rx x,y,z --tx x,y,z --ghz 28 --what paths --out paths.csv
+wbgs-jax predict --run RUN --export field.zip
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from wbgs_jax._util.cli import parse_positions, parse_vector, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.progress_lines import CountProgress
+from wbgs_jax.inference import queries as asked
+from wbgs_jax.inference import results_file as writing
+from wbgs_jax.inference.queries import Queries, shown_rows
+from wbgs_jax.inference.results_file import Answers, open_parts
+
+# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
+
+SUFFIXES = {"out": (".npz",), "picture": (".png",), "export": (".zip",)}
+What = Literal[
+    "spectra",
+    "snapshot",
+    "power",
+    "beamforming-gain",
+    "k-factor",
+    "angular-spread",
+    "delay-spread",
+    "paths",
+    "frequency-response",
+    "mimo",
+]
+SCALARS = ("power", "beamforming-gain", "k-factor", "angular-spread", "delay-spread")
+"""Of `What`: a number a query, or two."""
+MOST_POINTS = 4096
+BLOCK = 256
+"""Queries that are asked, and kept, at a time."""
+SHOWN = 12
+"""Warnings."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Ask a trained field for the spectra of transmitters, or export it."""
+
+    run: Path
+    """Run folder."""
+    tx: tuple[str, ...] = ()
+    """Transmitters, each as x,y,z in metres (world frame)."""
+    line: str = ""
+    """Transmitters on a line: 0,0,1.5:4,0,1.5:41 (from:to:number)."""
+    grid: str = ""
+    """Transmitters on a grid: -2,-2,1.5:2,2,1.5:9x9x1."""
+    ghz: tuple[float, ...] = ()
+    """Frequencies, 1 to 100 (from 0.3 with paths), all for each."""
+    sweep: str = ""
+    """Frequencies at equal ratios: 1:100:50."""
+    queries: Path | None = None
+    """A CSV file instead, columns x,y,z,ghz."""
+    rx: str = ""
+    """Another receiver than the first of the data: the number of one; x,y,z in metres; or x,y,z,w,i,j,k with the quaternion
+    that turns its array into the world frame. Only fields with paths know places that the data do not have."""
+    what: What = "spectra"
+    """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
+    tx_velocity: str = "0,0,0"
+    """Of transmitters, metres a second: Doppler shifts of paths follow from it."""
+    rx_velocity: str = "0,0,0"
+    """Of the receiver."""
+    band_mhz: float = 100.0
+    """Width of the band of a frequency response ..."""
+    points: int = 64
+    """... and frequencies in it."""
+    tx_array: str = "1x1"
+    """Of a MIMO matrix: ROWSxCOLUMNS elements half a wavelength apart, in the y-z plane of the world."""
+    out: Path | None = None
+    """Write the answers to this .npz file, or to a .csv file: what is a number a query, and tables of paths."""
+    resume: bool = False
+    """Go on where the same command was interrupted."""
+    picture: Path | None = None
+    """Draw them into this .png file: 12 spectra, or curves."""
+    export: Path | None = None
+    """Write the field to this .zip file, which runs without its training code (docs/inference.md)."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
+    for name, suffixes in SUFFIXES.items():
+        path = getattr(command, name)
+        allowed = (*suffixes, *([".csv"] if name == "out" and command.what in (*SCALARS, "paths") else []))
+        if path is not None and path.suffix not in allowed:
+            raise UserError(f"--{name} {path} does not end in {' or '.join(allowed)}; rename it")
+    places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
+    bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
+    asks, writes = bool(places or bands), bool(command.out or command.picture)
+    if not (asks or writes or command.export):
+        raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
+    if (asks or writes) and not (places and bands and writes):
+        raise UserError("answers need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+    for several in (places, bands):
+        if len(several) > 1:
+            raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
+    for name, word in _velocities(command).items():
+        parse_vector(word, f"--{name}-velocity")
+    asked.parse_array(command.tx_array)
+    if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
+        raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
+    if command.what not in ("spectra", *SCALARS) and (command.picture or (asks and not command.out)):
+        raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
+
+
+def queries_of(command: Command) -> Queries:
+    """Returns what is asked; frequencies that no field answers are a `UserError`."""
+    from wbgs_jax.inference.answers import frequencies
+
+    if command.queries:
+        positions, ghz = asked.read_queries(command.queries)
+        return Queries(positions, frequencies(ghz, str(command.queries)), paired=True)
+    if command.line or command.grid:
+        positions = asked.parse_line(command.line) if command.line else asked.parse_grid(command.grid)
+    else:
+        positions = parse_positions(command.tx)
+    option = "--sweep" if command.sweep else "--ghz"
+    found = Queries(positions, frequencies(asked.parse_sweep(command.sweep) if command.sweep else command.ghz, option))
+    asked.check_count(len(found), "this command")
+    return found
+
+
+def lowest_asked(command: Command, queries: Queries) -> float:
+    """Returns the lowest frequency (hertz) that is asked for; a band that reaches beyond what fields know is a `UserError`."""
+    from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
+
+    half = 0.5e6 * command.band_mhz if command.what == "frequency-response" else 0.0
+    lowest, highest = float(queries.frequencies_hz.min() - half), float(queries.frequencies_hz.max() + half)
+    if lowest < LOWEST_OF_PATHS_HZ or highest > MAX_FREQUENCY_HZ:
+        edge = lowest if lowest < LOWEST_OF_PATHS_HZ else highest
+        span = f"{LOWEST_OF_PATHS_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
+        raise UserError(f"--band-mhz {2e-6 * half:g} reaches {edge / 1e9:g} GHz; the model knows {span}")
+    return lowest
+
+
+def _velocities(command: Command) -> dict[str, str]:
+    return {"tx": command.tx_velocity, "rx": command.rx_velocity}
+
+
+def _load(run: Path) -> tuple[Any, list[Path]]:
+    from wbgs_jax.training.run_folder import open_run, sources_of
+
+    trained = open_run(run)
+    return trained, sources_of(run, trained.config)
+
+
+def _export(command: Command) -> None:
+    from wbgs_jax.inference.export import export_field
+    from wbgs_jax.inference.quantities import check_known
+
+    assert command.export is not None
+    trained = _load(command.run)[0]
+    check_known("spectra", trained, trained.dataset())
+    export_field(trained, command.export)
+    say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
+
+
+def _warn(opened: Any, queries: Queries) -> None:
+    """Says what of the question is doubtful."""
+    positions, frequencies = queries.tx_positions, queries.frequencies_hz
+    if queries.paired:
+        positions, frequencies = np.unique(positions, axis=0), np.unique(frequencies)
+    lines = opened.bounds.doubts(np.asarray(opened.source["receiver"]["position"]), positions, frequencies)
+    for line in lines[:SHOWN]:
+        say(f"warning: {line}")
+    if len(lines) > SHOWN:
+        say(f"warning: and {len(lines) - SHOWN} more like these")
+
+
+def ask(command: Command, queries: Queries, opened: Any) -> Answers:
+    """Returns the answers to all queries, block by block; those of several blocks are kept in a folder until they are written.
+    Ctrl-C leaves them there."""
+    blocks = queries.blocks(BLOCK)
+    target = command.out or command.picture
+    assert target is not None, "checked"
+    if len(blocks) == 1:
+        return Answers([opened.answer(blocks[0])])
+    parts = open_parts(target, _question(command, queries, opened), command.resume)
+    if len(parts):
+        say(f"going on after {len(parts)} of {len(blocks)} blocks of {BLOCK} queries")
+    try:
+        with CountProgress(f"{command.what}, blocks of {BLOCK}", len(blocks), len(parts)) as progress:
+            for block in blocks[len(parts) :]:
+                parts.add(opened.answer(block))
+                progress.advance()
+    except KeyboardInterrupt:
+        say(f"{len(parts)} of {len(blocks)} blocks are kept in {parts.folder}; the same command with --resume goes on")
+        raise
+    return parts
+
+
+def _question(command: Command, queries: Queries, opened: Any) -> dict[str, Any]:
+    """Returns what a resumed command must ask as well."""
+    options = {
+        name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
+    }
+    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": opened.source}
+
+
+def answer(command: Command, queries: Queries) -> None:
+    """Asks, and writes what is wanted."""
+    from wbgs_jax.inference.answers import Options, open_field
+
+    tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
+    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, asked.parse_array(command.tx_array))
+    if command.what == "spectra" and command.out is None:
+        queries = queries.some(shown_rows(len(queries)))  # no others are drawn
+    lowest = lowest_asked(command, queries)
+    opened = open_field(command.run, command.rx, command.what, queries, lowest, options, lambda: _load(command.run))
+    _warn(opened, queries)
+    answers = ask(command, queries, opened)
+    for line in writing.lines(command.what, answers, queries, opened.source):
+        say(line)
+    count = f"{len(queries)} queries"
+    if not queries.paired:
+        count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
+    if command.out:
+        replaced = ", in the place of another file" if command.out.exists() else ""
+        writing.write(command.out, command.what, answers, queries, opened.source)
+        say(f"{command.what}: {command.out} ({count}){replaced}")
+    if command.picture:
+        write_picture(command.picture, command.what, answers, queries)
+        say(f"picture: {command.picture}")
+    answers.remove()
+
+
+def write_picture(path: Path, what: str, answers: Answers, queries: Queries) -> None:
+    """Draws spectra, or curves of the quantity."""
+    from wbgs_jax.plotting import draw_answers, draw_sweeps  # here: Matplotlib takes a while to load
+
+    name = answers.names()[0]
+    if what == "spectra":
+        shown = shown_rows(len(queries))
+        positions, frequencies = queries.flat()
+        figure = draw_answers(answers.rows(name, shown), positions[shown], frequencies[shown])
+    else:
+        figure = draw_sweeps(name, answers.whole(name), queries)
+    with atomic_write(path) as stream:
+        figure.savefig(stream, format="png", dpi=110)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax predict")
+    check(command)
+    queries = queries_of(command) if command.out or command.picture else None
+    check_writable(command.out, command.picture, command.export)
+    use_compilation_cache()
+    if command.export:
+        _export(command)
+    if queries is not None:
+        answer(command, queries)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,238 @@
+"""Train a field: `wbgs-jax train --scene 1`, `--data FOLDER`, `--preset smoke|cpu|gpu`, `--resume`, `--help`."""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+import contextlib
+import dataclasses
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import tyro
+
+from wbgs_jax._util.cli import option_value, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.devices import by_first, connect, is_first
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.config import Settings, check, from_sections, sections
+from wbgs_jax.data.conventions import ConventionName
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import released_scenes, source_names
+from wbgs_jax.data.splits import VALIDATION
+from wbgs_jax.fields import default_field, field_names, get_field
+from wbgs_jax.inference.intervals import write_confidence
+from wbgs_jax.inference.kriging import write_neighbours
+from wbgs_jax.training.batches import check_data, limited
+from wbgs_jax.training.checkpoint import checkpoint_steps
+from wbgs_jax.training.cross_validation import Training, is_few, learn_few
+from wbgs_jax.training.fit_intervals import learn_confidence
+from wbgs_jax.training.fit_kriging import Learned, learn_neighbours
+from wbgs_jax.training.loop import TrainResult, train
+from wbgs_jax.training.manifest import write_manifest
+from wbgs_jax.training.progress import Interrupted, duration_words, expected_seconds
+from wbgs_jax.training.run_folder import RunConfig, load_trained, locked, prepare_folder
+
+PROGRAM = "wbgs-jax train"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train a radiance field on the spectra of one scene, and leave it in a run folder."""
+
+    scene: str | None = None
+    """Released scene (1, 2, ...) or a scene file (.npz); several of one room, seen by different receivers, as A,B."""
+    data: str | None = None
+    """Folder of the published layout, instead of --scene."""
+    out: Path | None = None
+    """Run folder; the default names scene, field, preset and seed under runs/."""
+    field: str = dataclasses.field(default_factory=default_field)
+    """The model."""
+    preset: str = "cpu"
+    """smoke (about a minute), cpu (the default without a GPU), gpu, or paper (of the wideband field: the paper's form)."""
+    seed: int = 0
+    """Seed of everything that is drawn at random."""
+    resume: bool = False
+    """Go on from the run folder's newest checkpoint, if any."""
+    frequency_ghz: float | None = None
+    """Frequency of a folder that says none."""
+    convention: ConventionName | None = None
+    """Of a folder's rows, where it names none."""
+    train_ghz: tuple[float, ...] = ()
+    """Train at these frequencies, test at the others."""
+    train_tx: int = 0
+    """Train with this number of transmitters; 0: all that are not held out."""
+    validation: float = VALIDATION
+    """Share of the training transmitters by which choices are made; 0: none."""
+    test_box: tuple[float, ...] = ()
+    """Test at all transmitters in a box (lowest and highest corner, metres), train at the others."""
+    receiver: int | None = None
+    """Look at this receiver alone."""
+    neighbours: bool = True
+    """Use known spectra nearby, where that gains."""
+    devices: int = 0
+    """Devices that share every batch; 0: all (docs/scaling.md)."""
+    distributed: bool = False
+    """One of several processes (docs/scaling.md)."""
+
+
+def default_preset() -> str:
+    """Returns `gpu` where JAX finds one, else `cpu`."""
+    return "gpu" if jax.default_backend() == "gpu" else "cpu"
+
+
+def parse(arguments: list[str]) -> tuple[Command, Settings]:
+    """Returns the command and its settings. Field and preset are looked at first: they say which settings there are, and their
+    defaults. `--help` lists the command's options, `--help-settings` those of the field too."""
+    field = option_value(arguments, "--field", default_field())
+    preset = option_value(arguments, "--preset", default_preset())
+    kind = get_field(field)
+    if preset not in kind.presets:
+        others = [f"--field {name}" for name in field_names() if preset in get_field(name).presets]
+        raise UserError(f"{field} has no preset {preset!r}; choose one of: {', '.join([*kind.presets, *others])}")
+    parts = sections(kind.presets[preset], field)
+    everything = "--help-settings" in arguments
+    if everything:
+        arguments = [argument for argument in arguments if argument != "--help-settings"] + ["--help"]
+    command_type = Command if {"-h", "--help"} & set(arguments) and not everything else _with_settings(parts)
+    parsed = tyro.cli(
+        command_type,
+        default=command_type(field=field, preset=preset),
+        args=arguments,
+        prog=PROGRAM,
+        description=f"{Command.__doc__} Settings of the field: {PROGRAM} --field {field} --help-settings.",
+    )
+    values = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Command)}
+    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, kind.presets[preset], field)
+
+
+def _with_settings(parts: dict[str, Any]) -> type[Command]:
+    """Returns the command's type with the sections of settings as further options, --SECTION.NAME."""
+    fields = [
+        (name, Annotated[type(part), tyro.conf.arg(help="")], dataclasses.field(default=part)) for name, part in parts.items()
+    ]
+    made: Any = dataclasses.make_dataclass("CommandWithSettings", fields, bases=(Command,), frozen=True)
+    made.__doc__ = Command.__doc__
+    return made
+
+
+def run_config(command: Command, settings: Settings) -> RunConfig:
+    """Returns what determines the run, checked before any work is done."""
+    if (command.scene is None) == (command.data is None):
+        raise UserError("give either --scene (1, 2, ... or a .npz file) or --data (a folder of spectra)")
+    if not 0 <= command.validation < 1:
+        raise UserError(f"--validation is {command.validation}; it is a share of the training transmitters, 0 to 1")
+    if len(command.test_box) not in (0, 6):
+        raise UserError(
+            f"--test-box has {len(command.test_box)} numbers; give six: x y z of the lowest corner, then of the highest"
+        )
+    check(settings)
+    get_field(command.field).check(settings.field)
+    source = command.scene if command.data is None else command.data
+    words, released = source_names(str(source)), released_scenes() if command.data is None else {}
+    names = [str(Path(word).resolve()) if word not in released and Path(word).exists() else word for word in words]
+    if command.frequency_ghz is not None and not any(Path(name).is_dir() for name in names):
+        raise UserError(f"--frequency-ghz is for folders that do not say; {source} does, or does not exist")
+    if command.convention is not None and not any(Path(name).is_dir() for name in names):
+        raise UserError(f"--convention is for folders of spectra; {source} is none")
+    return RunConfig(
+        source=",".join(names),
+        field=command.field,
+        preset=command.preset,
+        seed=command.seed,
+        frequency_ghz=command.frequency_ghz,
+        settings=settings,
+        train_ghz=tuple(command.train_ghz),
+        train_tx=command.train_tx,
+        validation=command.validation,
+        test_box=tuple(command.test_box),
+        receiver=command.receiver,
+        neighbours=command.neighbours,
+        convention=command.convention,
+    )
+
+
+def default_folder(dataset: Dataset, config: RunConfig) -> Path:
+    """Returns runs/<scene>-<field>-<preset>-seed<seed>."""
+    return Path("runs") / f"{dataset.name}-{config.field}-{config.preset}-seed{config.seed}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    use_compilation_cache()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if "--distributed" in arguments:  # before JAX looks for devices, for which `parse` asks
+        connect()
+    command, settings = parse(arguments)
+    config = run_config(command, settings)
+    dataset = config.dataset()
+    config = dataclasses.replace(config, convention=dataset.convention)
+    check_data(dataset, get_field(config.field))
+    folder = command.out or default_folder(dataset, config)
+    by_first(lambda: prepare_folder(folder, config, command.resume))
+    counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
+    tell = say if is_first() else _nothing
+    tell(f"training {config.field} ({config.preset} preset) on {dataset.name}: {counts}")
+    with contextlib.ExitStack() as stack:
+        by_first(lambda: stack.enter_context(locked(folder)))
+        steps = checkpoint_steps(folder / "checkpoints")
+        if steps:
+            tell(f"going on from the checkpoint of step {steps[-1]}")
+        total = limited(config.settings, dataset, get_field(config.field)).optim.steps
+        for line in opening_lines(folder, config, total, steps[-1] if steps else 0):
+            tell(line)
+        try:
+            result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
+            by_first(lambda: learn_beside(result, dataset, config, folder, command.devices))
+        except KeyboardInterrupt:  # in the last epoch or behind it, or a second time
+            raise Interrupted("stopped; run the same command with --resume to go on") from None
+        by_first(lambda: write_manifest(folder, load_trained(folder)))
+    tell(summary(result, folder))
+    tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and pictures)")
+
+
+def _nothing(line: str) -> None:
+    """Keeps a line to itself."""
+
+
+def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> list[str]:
+    """Returns how long it will take if so many of the steps are done, and where the results go."""
+    field = get_field(config.field)
+    share = max(steps - done, 0) / field.presets[config.preset].optim.steps
+    seconds = expected_seconds(field, config.preset, share)
+    lasts = "how long it takes stands in the lines below" if seconds is None else f"{duration_words(seconds)} on this machine"
+    return [
+        f"{max(steps - done, 0)} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",
+        f"results: {folder} (checkpoints, curves in metrics.jsonl)",
+    ]
+
+
+def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path, devices: int) -> None:
+    """Leaves what goes with a trained field: known spectra beside it, and how sure it is."""
+    trained = result.field, result.params, dataset
+    if config.neighbours and is_few(dataset):
+        few = learn_few(*trained, Training(config.field, config.settings, result.steps, config.seed, folder, devices), say)
+        write_neighbours(folder, few.mixture)
+        say(few.line)
+        of_spectra, of_powers = learn_confidence(*trained, None)
+        write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
+        return
+    learned = learn_neighbours(*trained) if config.neighbours else Learned()
+    write_neighbours(folder, learned.neighbours)
+    if learned.line:
+        say(learned.line)
+    write_confidence(folder, *learn_confidence(*trained, learned.of_training))
+
+
+def summary(result: TrainResult, folder: Path) -> str:
+    """Returns one line for the end."""
+    sizes = ", ".join(f"{count} {name}" for name, count in result.sizes.items())
+    return f"trained {result.steps} steps in {result.seconds:.0f} s, {sizes}, {result.compilations} compilations: {folder}"
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,113 @@
+"""Look at a trained field in a browser:
+
+wbgs-jax view --run RUN [--port 8080]
+wbgs-jax view --run RUN --html scene.html --tx x,y,z --ghz 28      a page that opens without Python
+"""
+
+import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
+
+# isort: split
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from wbgs_jax._util.cli import parse_positions, run_command, say
+from wbgs_jax._util.compilation import use_compilation_cache
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import check_writable
+from wbgs_jax.inference.answers import check_frequencies, frequencies, receiver_at
+from wbgs_jax.inference.predictor import at_receiver
+from wbgs_jax.training.run_folder import open_run
+
+if TYPE_CHECKING:
+    from wbgs_jax.viewer.app import Viewer
+
+LOCAL = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Look at a trained field in a browser: the room, a transmitter to drag, what the receiver sees, paths, maps, materials."""
+
+    run: Path
+    """Run folder."""
+    host: str = "localhost"
+    """Address to listen on; localhost is this machine alone. Whoever reaches another one sees the field, without a password."""
+    port: int = 8080
+    """Port to listen on; another one is taken where it is in use."""
+    rx: str = ""
+    """Another receiver than the first of the data: the number of one of them, x,y,z in metres, or x,y,z,w,i,j,k with the
+    quaternion that turns its array into the world frame."""
+    tx: str = ""
+    """Where the transmitter stands at first, x,y,z in metres."""
+    ghz: float | None = None
+    """The frequency at first."""
+    up: Literal["x", "y", "z"] = "z"
+    """Which axis of the data points upwards; the published layout has y."""
+    html: Path | None = None
+    """Write what is seen to this .html file, which opens without Python, and end."""
+
+
+def check(command: Command) -> None:
+    """Raises a `UserError` for a command line that cannot work."""
+    if command.html is not None and command.html.suffix != ".html":
+        raise UserError(f"--html {command.html} does not end in .html; rename it")
+    if not 0 <= command.port <= 65535:
+        raise UserError(f"--port {command.port} is no port; give a number from 1 to 65535")
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise UserError("the viewer needs viser; install it with: pip install 'wbgs-jax[viewer]'") from error
+
+
+def start(command: Command) -> "Viewer":
+    """Returns the viewer that a command line asks for."""
+    from wbgs_jax.viewer.app import Viewer
+    from wbgs_jax.viewer.session import Asker
+
+    trained = open_run(command.run)
+    dataset = trained.dataset()
+    receiver = receiver_at(command.rx, dataset)
+    trained = at_receiver(trained, receiver, dataset)
+    if command.ghz is not None:
+        check_frequencies(trained, dataset, float(frequencies((command.ghz,))[0]))
+    page = command.html or Path(f"{dataset.name}.html")
+    viewer = Viewer(Asker(trained, dataset, receiver), command.host, command.port, page, command.up)
+    if command.ghz is not None:
+        viewer.set_ghz(command.ghz)
+    if command.tx:
+        viewer.move(parse_positions((command.tx,))[0])
+    return viewer
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point."""
+    use_compilation_cache()
+    command = tyro.cli(Command, args=arguments, prog="wbgs-jax view")
+    check(command)
+    check_writable(command.html)
+    if command.html:
+        say(f"drawing what {command.run} sees ...")
+    viewer = start(command)
+    if command.html:
+        viewer.wait()
+        say(f"page: {viewer.save()}")
+        viewer.stop()
+        return
+    where = "localhost" if command.host in LOCAL else command.host
+    say(f"viewer: http://{where}:{viewer.port} (Ctrl-C ends it)")
+    if command.host not in LOCAL:
+        say(f"note: whoever reaches {command.host} can look at this field; --host localhost keeps it on this machine")
+    try:
+        while True:
+            time.sleep(3600)
+    finally:
+        viewer.stop()
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,108 @@
+"""Walls of a floor plan: how many of them stand between two points, and what mesh they make.
+
+walls.csv (or layout.csv) holds segments x1,y1,x2,y2, each a wall, or the corners x,y of an outline around free space, in which
+a wall between rooms has two faces; of several outlines if a column room tells them apart. Metres.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.data.tables import check_positions, numbers, read_table
+
+FILES = ("walls.csv", "layout.csv")
+OUTLINES = "room"
+"""Column that tells outlines apart."""
+IGNORED = ("id", "name", "material", "thickness", "comment", "note")
+"""Columns that change nothing: the law takes all walls to be alike."""
+PARALLEL = 1e-9
+"""Square metres: what is smaller crosses nothing."""
+ON_WALL = 1e-2
+"""Metres: what is as near to a wall is on it, and the wall not in its way."""
+
+
+@pytree
+class Walls:
+    """W vertical walls."""
+
+    ends: Float[Array | np.ndarray, "w 2 2"]
+    """Of every wall on the floor, metres."""
+    share: Float[Array | np.ndarray, " w"]
+    """1, or 1/2 of each face of a wall that is drawn with two."""
+
+
+NO_WALLS = Walls(np.zeros((0, 2, 2)), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Format:
+    columns: tuple[str, ...]
+    share: float
+
+
+SEGMENTS, OUTLINE = _Format(("x1", "y1", "x2", "y2"), 1.0), _Format(("x", "y"), 0.5)
+
+
+def load_walls(path: Path) -> Walls:
+    """Reads the walls of a CSV file; anything else than the two forms is a `UserError`."""
+    header, rows = read_table(path)
+    form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
+    values = numbers(path, header, rows, list(form.columns))
+    check_positions(f"{path}: corners", values)
+    known = (*form.columns, *IGNORED, *([] if form is SEGMENTS else [OUTLINES]))
+    if other := [name for name in header if name not in known]:
+        raise UserError(
+            f"{path} has a column {other[0]!r}, of which a floor plan knows nothing; its columns are {', '.join(form.columns)}"
+            + (f" and, for several outlines, {OUTLINES}" if form is OUTLINE else "")
+        )
+    if form is SEGMENTS:
+        return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
+    room = np.array([row[header.index(OUTLINES)] if OUTLINES in header else "" for row in rows])
+    outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
+    ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
+    return Walls(ends, np.full(len(ends), form.share))
+
+
+def namespace(array: Any) -> Any:
+    """Returns the library that an array is of: geometry is found in NumPy, in double precision, and used in JAX."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def crossings(
+    walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
+) -> Float[Array | np.ndarray, "*#n"]:
+    """Returns how many walls stand between points of the plan; one that a point lies on does not count."""
+    xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
+    ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
+    ground = _cross(ray, along)
+    safe = xp.where(xp.abs(ground) < PARALLEL, 1.0, ground)
+    on_ray, on_wall = _cross(corner, along) / safe, _cross(corner, ray) / safe
+    long = xp.sqrt(xp.sum(along**2, -1))
+    apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # of the ends, across the wall
+    near = xp.minimum(on_ray, 1 - on_ray) * apart  # of the nearer one from it
+    hit = (xp.abs(ground) >= PARALLEL) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
+    return xp.sum(xp.where(hit, walls.share, 0.0), -1)
+
+
+def _cross(a: Any, b: Any) -> Any:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def extruded(walls: Walls, height: float) -> trimesh.Trimesh:
+    """Returns the walls as upright rectangles without thickness, between a floor at z = 0 and a ceiling that span all of them:
+    a mesh for the fields that want one."""
+    low, high = np.asarray(walls.ends).min((0, 1)), np.asarray(walls.ends).max((0, 1))
+    sheets = [[[*a, 0], [*b, 0], [*b, height], [*a, height]] for a, b in np.asarray(walls.ends) if not np.allclose(a, b)]
+    for z in (0.0, height):
+        sheets.append([[low[0], low[1], z], [high[0], low[1], z], [high[0], high[1], z], [low[0], high[1], z]])
+    vertices = np.array(sheets, float).reshape(-1, 3)
+    corner = 4 * np.arange(len(sheets))[:, None, None]
+    faces = (corner + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return trimesh.Trimesh(vertices, faces, process=False)

@@ -1,0 +1,380 @@
+"""The folder layout in which spectra are published (NeRF2, WRF-GS, Wideband3DGS): in, and out of any scene file.
+
+    spectrum/00001.png ...       8-bit grey PAS, 90 x 360, its pixels in one of two orders (`wbgs_jax.data.conventions`)
+    tx_pos.csv                   header x,y,z; row k belongs to image k, both counted from 1; metres
+    gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]; optional:
+                                 frequency (GHz), convention (of the spectra)
+    freq.txt                     optional: one frequency (GHz) a spectrum
+    train_, test_index.txt       optional: image names without .png, zero-padded or not; beside them validation_index.txt
+    point_cloud.ply              optional: the surface, or ...
+    room.npz                     ... optional: a room with its objects and materials (`wbgs-jax convert room.glb`)
+
+Frames: transmitters and receiver share the world frame, and room.npz is in it. The mesh is z-up while that frame is y-up: a
+mesh point (x, y, z) lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed, of
+unknown element pattern.
+
+    wbgs-jax layout SCENE.npz FOLDER      writes a scene file as such a folder
+"""
+
+import contextlib
+import itertools
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_text, read_yaml, safe_name
+from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.load import materials_of, scene_dataset
+from wbgs_jax.data.room_file import Room, load_room
+from wbgs_jax.data.scene_file import SceneFile
+from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
+from wbgs_jax.mesh.ply import read_ply, write_ply
+from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.types import (
+    HIGHEST_FREQUENCY_HZ,
+    LARGEST_COORDINATE_M,
+    LOWEST_FREQUENCY_HZ,
+    make_receiver,
+    stack_receivers,
+)
+
+SHORTEST, LONGEST = 1e-6, 1e6
+"""Of quaternions that have a direction."""
+
+
+class Gateway(NamedTuple):
+    """What gateway_info.yml holds; None where it does not."""
+
+    name: str | None
+    position: list[float]
+    orientation: tuple[float, float, float, float]
+    """w x y z."""
+    frequency_hz: float | None
+    convention: ConventionName | None
+
+
+def read_gateway(path: Path) -> Gateway:
+    """Returns what is known of the data set and of its first gateway."""
+    wanted = "write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]"
+    if not path.exists():
+        raise UserError(f"{path} is missing, which says where the receiver stands; {wanted}")
+    content = read_yaml(path)
+    entries = content if isinstance(content, dict) else {}
+    gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
+    if not gateways:
+        raise UserError(f"{path} names no gateway; {wanted}")
+    first, gateway = next(iter(gateways.items()))
+    if len(gateways) > 1:
+        warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)
+    position = vector(gateway.get("position"), 3, f"{path}: position")
+    x, y, z, w = vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
+    if not SHORTEST < np.linalg.norm(np.array([x, y, z, w]) / LONGEST) * LONGEST < LONGEST:
+        raise UserError(
+            f"{path}: orientation is all zeros, or beyond all measure; write the quaternion [0, 0, 0, 1] for no rotation"
+        )
+    frequency = entries.get("frequency", gateway.get("frequency"))
+    name, convention = entries.get("dataset_name"), entries.get("convention", gateway.get("convention"))
+    if convention not in (None, *CONVENTIONS):
+        raise UserError(f"{path}: convention is {str(convention)[:40]!r}; it must be {' or '.join(CONVENTIONS)}")
+    return Gateway(
+        name=None if name is None else safe_name(str(name)),
+        position=position,
+        orientation=(w, x, y, z),
+        frequency_hz=None if frequency is None else ghz_to_hz(str(frequency), path),
+        convention=convention,
+    )
+
+
+def vector(value: Any, length: int, what: str) -> list[float]:
+    """Returns so many numbers, or raises a `UserError` that names what they are."""
+    try:
+        vector = [float(v) for v in value] if isinstance(value, list) else []  # YAML gives 1e-3 as text
+    except (TypeError, ValueError, OverflowError):
+        vector = []
+    if len(vector) != length or not (np.abs(vector) <= LARGEST_COORDINATE_M).all():
+        unit = " metres from a place on the site" if length == 3 else ""
+        raise UserError(f"{what} is {repr(value)[:80]}; it must be {length} numbers of at most {LARGEST_COORDINATE_M:g}{unit}")
+    return vector
+
+
+def ghz_to_hz(word: str, where: Path) -> float:
+    """Returns hertz, through decimals, not by a factor of 1e9: rounding must not part a frequency from itself elsewhere."""
+    try:
+        hertz = float(Decimal(word).scaleb(9))
+    except (ArithmeticError, ValueError):
+        hertz = np.nan
+    if not LOWEST_FREQUENCY_HZ <= hertz <= HIGHEST_FREQUENCY_HZ:
+        raise UserError(f"{where}: the frequency {word[:40]!r} is no number of GHz from 0.3 to 100; write 0.92 for 920 MHz")
+    return hertz
+
+
+DIGITS = 9
+"""Of the number of an image, at most."""
+NOMINAL_FREQUENCY_HZ = 1e9
+"""Stands for the frequency of a folder that names none: without a mesh, a model of one frequency only needs some constant."""
+
+SPECTRA, POSITIONS, GATEWAY, FREQUENCIES = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt"
+MESH, ROOM = "point_cloud.ply", "room.npz"
+INDEX = {part: f"{part}_index.txt" for part in ("train", "validation", "test")}
+
+
+def load_layout(
+    folder: Path | str,
+    frequency_hz: float | None = None,
+    seed: int = 0,
+    test_fraction: float = 0.2,
+    convention: ConventionName | None = None,
+) -> Dataset:
+    """Loads a folder of the published layout; spectrum i is image i + 1.
+
+    Without freq.txt all spectra have one frequency: `frequency_hz`, else `frequency` (GHz) in gateway_info.yml, else
+    `NOMINAL_FREQUENCY_HZ`. Without index files `test_fraction` of the transmitters, drawn by `seed`, are the test.
+    The pixels are in the order of `convention`, else of `convention` in gateway_info.yml, else of that which the training
+    spectra reveal; a note names what was found.
+
+    Raises:
+        UserError: a file is missing, damaged, or at odds with the others, or the convention cannot be found.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder; give one that holds {SPECTRA}/, {POSITIONS} and {GATEWAY}")
+    images = _read_images(folder / SPECTRA)
+    positions = _read_positions(folder / POSITIONS, len(images))
+    gateway = read_gateway(folder / GATEWAY)
+    tx_index = group_transmitters(positions)
+    room = _read_room(folder)
+    if any((folder / name).exists() for name in INDEX.values()):
+        split = _read_split(folder, tx_index)
+    else:
+        train, test = tx_disjoint_split(tx_index, test_fraction, seed)
+        split = {"train": train, "validation": train[:0], "test": test}
+    named = _agreed(convention, gateway.convention, folder) or _revealed(folder, images, gateway, positions, tx_index, split)
+    receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
+    return Dataset(
+        name=gateway.name or safe_name(folder.resolve().name),
+        receivers=stack_receivers([receiver]),
+        tx_positions=positions,
+        frequencies_hz=_read_frequencies(
+            folder / FREQUENCIES, len(images), frequency_hz, gateway.frequency_hz, len(room.faces) > 0
+        ),
+        receiver_index=np.zeros(len(images), int),
+        tx_index=tx_index,
+        train=split["train"],
+        validation=split["validation"],
+        test=split["test"],
+        images=to_pas(images, named),
+        vertices=room.vertices,
+        faces=room.faces,
+        face_part=room.face_part if room.parts else None,
+        materials=materials_of(room, str(folder / ROOM)),
+        convention=named,
+    )
+
+
+def export_layout(scene: SceneFile, folder: Path | str) -> None:
+    """Writes a scene as a folder of the published layout; the folder appears whole or not at all.
+
+    Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and array are not kept.
+
+    Raises:
+        UserError: `folder` exists and is not empty, or cannot be written; or the scene has several receivers, powers alone, or
+            no training or no test spectra, for which the layout has no form.
+    """
+    dataset = scene_dataset(scene)
+    if dataset.n_receivers > 1 or dataset.kind == "power":
+        what = "received powers alone" if dataset.kind == "power" else f"{dataset.n_receivers} receivers"
+        raise UserError(f"scene {scene.name} has {what}, which the layout has no form for; keep the scene file")
+    if len(dataset.train) == 0 or len(dataset.test) == 0:
+        raise UserError(f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; give its split both")
+    with _new_folder(Path(folder)) as target:
+        (target / SPECTRA).mkdir()
+        for start in range(0, len(dataset), 256):  # in blocks: a scene in float32 is a gigabyte
+            index = np.arange(start, min(start + 256, len(dataset)))
+            for number, pas in zip(index + 1, np.asarray(dataset.pas(index)), strict=True):
+                Image.fromarray(np.round(pas * 255).astype(np.uint8)).save(target / SPECTRA / f"{number:05d}.png")
+        rows = (",".join(map(repr, row)) for row in dataset.tx_positions.tolist())
+        (target / POSITIONS).write_text("\n".join(["x,y,z", *rows]) + "\n")
+        (target / FREQUENCIES).write_text("".join(f"{_hz_to_ghz(f)}\n" for f in dataset.frequencies_hz))
+        for part, name in INDEX.items():
+            if len(index := getattr(dataset, part)):
+                (target / name).write_text("".join(f"{number:05d}\n" for number in index + 1))
+        w, x, y, z = scene.rx_orientation[0].tolist()
+        gateway = {"position": scene.rx_position[0].tolist(), "orientation": [x, y, z, w]}
+        content = {"dataset_name": scene.name, "convention": CONVENTIONS[0], "gateway1": gateway}
+        (target / GATEWAY).write_text(yaml.safe_dump(content, sort_keys=False))
+        if len(scene.vertices):
+            write_ply(target / MESH, world_to_mesh(scene.vertices), scene.faces)
+
+
+def mesh_to_world(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns points of the layout's z-up mesh in the y-up world of its transmitters: (x, y, z) -> (x, z, -y)."""
+    x, y, z = points.T
+    return np.stack([x, z, -y], -1)
+
+
+def world_to_mesh(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns the inverse of `mesh_to_world`: (x, y, z) -> (x, -z, y)."""
+    x, y, z = points.T
+    return np.stack([x, -z, y], -1)
+
+
+def _read_room(folder: Path) -> Room:
+    """Returns the surfaces of a folder, in the frame of its transmitters; without a triangle where it has points or nothing."""
+    mesh, room = folder / MESH, folder / ROOM
+    if room.exists():
+        if mesh.exists():
+            raise UserError(f"{folder} has both {MESH} and {ROOM}; keep the one that shows the room as it was")
+        return load_room(room)
+    vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    return Room(mesh_to_world(vertices), faces, np.zeros(len(faces), np.int32))
+
+
+def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
+    numbered = sorted((_image_number(path.stem, folder), path) for path in folder.glob("*.png"))
+    if not numbered:
+        raise UserError(f"{folder} holds no .png spectra; put 00001.png, 00002.png, ... there")
+    for expected, (number, path) in enumerate(numbered, 1):
+        if number != expected:
+            raise UserError(f"{path} stands where image {expected:05d} is due; number images from 1, without gaps or doubles")
+    return np.stack([_read_image(path) for _, path in numbered])
+
+
+def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            if image.size != (PAS_WIDTH, PAS_HEIGHT) or image.mode != "L":
+                found = f"{image.height} x {image.width} pixels of mode {image.mode}"
+                raise UserError(f"{path} has {found}; a spectrum is {PAS_HEIGHT} x {PAS_WIDTH}, 8-bit grey (mode L)")
+            return np.asarray(image)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # all of these, says Pillow
+        raise UserError(f"{path} is truncated or not a PNG image ({error}); copy or make it again") from error
+
+
+def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
+    header, *rows = [line for line in read_text(path).splitlines() if line.strip()] or [""]
+    if header.lower().replace(" ", "") != "x,y,z":
+        raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
+    if len(rows) != n:
+        raise UserError(f"{path} has {len(rows)} rows for {n} images in {SPECTRA}/; give one for each, row k for image k")
+    return np.array([vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
+
+
+def _read_frequencies(
+    path: Path, n: int, wanted_hz: float | None, gateway_hz: float | None, walls: bool
+) -> Float[np.ndarray, " n"]:
+    if not path.exists():
+        single = wanted_hz if wanted_hz is not None else gateway_hz
+        if single is None and walls:
+            warnings.warn(
+                f"{path.parent} names no frequency: its spectra are taken to be of {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz; if they "
+                f"are not, give --frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
+                stacklevel=3,
+            )
+        single = NOMINAL_FREQUENCY_HZ if single is None else single
+        if not LOWEST_FREQUENCY_HZ <= single <= HIGHEST_FREQUENCY_HZ:
+            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; the model knows 0.3 to 100 GHz")
+        return np.full(n, single, np.float64)
+    if wanted_hz is not None:
+        raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
+    words = read_text(path).split()
+    if len(words) != n:
+        raise UserError(f"{path} has {len(words)} frequencies for {n} images in {SPECTRA}/; give one (GHz) for each")
+    return np.array([ghz_to_hz(word, path) for word in words])
+
+
+def _agreed(wanted: ConventionName | None, named: ConventionName | None, folder: Path) -> ConventionName | None:
+    """Returns the convention that somebody has named, if anybody has."""
+    if wanted is not None and named is not None and wanted != named:
+        raise UserError(f"{folder / GATEWAY} names the convention {named}; leave out {wanted}, or correct that file")
+    return named if wanted is None else wanted
+
+
+def _revealed(
+    folder: Path,
+    images: UInt8[np.ndarray, "n 90 360"],
+    gateway: Gateway,
+    positions: Float[np.ndarray, "n 3"],
+    tx_index: np.ndarray,
+    split: dict[str, np.ndarray],
+) -> ConventionName:
+    """Returns the convention that the spectra reveal that are not for the test."""
+    known = np.sort(np.concatenate([split["train"], split["validation"]]))
+    receiver = make_receiver(gateway.position, gateway.orientation)
+    found = find_convention(images[known], receiver, positions[known], tx_index[known])
+    choices = " or ".join(CONVENTIONS)
+    if found.convention is None:
+        raise UserError(
+            f"{folder} does not name the order of its pixels, and its spectra do not show it ({found.reason}): give "
+            f"--convention {choices}, or write `convention: ...` in {GATEWAY} (docs/formats.md)"
+        )
+    warnings.warn(
+        f"{folder} does not name the order of its pixels: {found.convention} is used, because {found.reason}; "
+        f"`convention: {choices}` in {GATEWAY} settles it",
+        stacklevel=3,
+    )
+    return found.convention
+
+
+def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the indices of every part of the split; one of them alone, the validation, may be missing."""
+    optional = [] if (folder / INDEX["validation"]).exists() else ["validation"]
+    split = {p: np.zeros(0, int) if p in optional else _read_index(folder / INDEX[p], len(tx_index)) for p in INDEX}
+    for first, second in itertools.combinations(INDEX, 2):
+        both = np.intersect1d(split[first], split[second])
+        if len(both):
+            raise UserError(f"image {both[0] + 1:05d} is in both {folder / INDEX[first]} and {INDEX[second]}; keep it in one")
+    note_shared_transmitters(str(folder), tx_index, split)
+    return split
+
+
+def _read_index(path: Path, n: int) -> np.ndarray:
+    """Returns the indices of the spectra that an index file names; at least one, none twice."""
+    numbers = [_image_number(word.removesuffix(".png"), path) for word in read_text(path).split()]
+    absent = [number for number in numbers if not 1 <= number <= n]
+    if absent:
+        raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ holds images 1 to {n}; mend the index")
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; mend it, or delete all index files")
+    return np.array(numbers) - 1
+
+
+def _image_number(word: str, where: Path) -> int:
+    if not (word.isascii() and word.isdigit() and len(word) <= DIGITS):
+        raise UserError(f"{where}: {word[:40]!r} is not an image number; images are named by numbers, 00001 for example")
+    return int(word)
+
+
+def _hz_to_ghz(hertz: float) -> str:
+    return f"{Decimal(repr(float(hertz))).scaleb(-9).normalize():f}"
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Gives a temporary folder beside `folder` that becomes it when the block ends well and vanishes when it does not."""
+    temporary = None
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UserError(f"{folder} exists and is not an empty folder; choose another one")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+        yield temporary
+        os.umask(umask := os.umask(0))
+        temporary.chmod(0o777 & ~umask)  # mkdtemp makes folders that only their owner can enter
+        temporary.rename(folder)
+    except OSError as error:
+        raise UserError(f"cannot write {folder}: {error.strerror}; choose another folder or mend its permissions") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)

@@ -1,0 +1,208 @@
+"""What fields may ask about a data set's scene: its box, points spread over its surfaces, the surfaces themselves."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset, Materials
+from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.radio.geometry import to_local
+from wbgs_jax.types import Mesh, Receiver, Surface, SurfaceSampling
+
+MESH_SIZED = (20_000, 70_000)
+"""Bounds of the number of points when it is left to the mesh."""
+OVERSAMPLING = 30
+"""Candidates a point that are drawn by area before "solid_angle" chooses among them."""
+MIN_DISTANCE = 0.3
+"""Metres; nearer surfaces are not sampled more densely than at this distance."""
+BELOW_HORIZON = -0.1
+"""Cosine of the largest zenith angle at which points start: a little below the horizon, for footprints that reach above it."""
+BOX_MARGIN = 1.0
+"""Metres around transmitters and receivers in which points are drawn where no surface is known."""
+
+
+@dataclass(frozen=True)
+class DatasetScene:
+    """A data set's place, as fields see it (`wbgs_jax.types.Scene`)."""
+
+    dataset: Dataset
+
+    @property
+    def receivers(self) -> Receiver:
+        """All receivers, with a leading axis."""
+        return self.dataset.receivers
+
+    @property
+    def spectra(self) -> int:
+        """Number of links that are trained."""
+        return len(self.dataset.train)
+
+    @property
+    def box(self) -> Float[np.ndarray, "2 3"]:
+        """Smallest and largest coordinates (metres) of surfaces, where they are known, and of all transmitters and receivers.
+
+        What a field says about transmitters outside is made up.
+        """
+        places = np.concatenate([np.asarray(self.dataset.vertices, np.float64), _antennas(self.dataset)])
+        return np.stack([places.min(0), places.max(0)])
+
+    def surface(self, count: int, seed: int, sampling: SurfaceSampling = "solid_angle") -> Surface:
+        """Returns `make_surface` of the data set."""
+        return make_surface(self.dataset, count, seed, sampling)
+
+    def mesh(self) -> Mesh:
+        """Returns `make_mesh` of the data set."""
+        return make_mesh(self.dataset)
+
+
+def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampling = "solid_angle") -> Surface:
+    """Returns `count` points on the mesh; 0 means as many as the mesh has vertices, within `MESH_SIZED`.
+
+    "solid_angle" spreads them evenly over the directions of the receivers' hemispheres, hidden surfaces included: the image
+    has the same resolution everywhere and no Gaussian is spent where the image cannot show it. "area" spreads them evenly
+    over the surface. Without faces the points of the cloud are used; without any points, random ones in the box of
+    transmitters and receivers.
+    """
+    rng = np.random.default_rng(seed)
+    if count == 0:
+        count = int(np.clip(len(dataset.vertices), *MESH_SIZED))
+    if len(dataset.faces):
+        points = _sample_mesh(dataset, count, rng, sampling)
+    elif len(dataset.vertices):
+        points = dataset.vertices[rng.choice(len(dataset.vertices), min(count, len(dataset.vertices)), replace=False)]
+    else:
+        places = _antennas(dataset)
+        points = rng.uniform(places.min(0) - BOX_MARGIN, places.max(0) + BOX_MARGIN, (count, 3))
+    return surface_from_points(points)
+
+
+def make_mesh(dataset: Dataset) -> Mesh:
+    """Returns the surfaces themselves, for fields that know where they are; where parts or materials are not known, all
+    triangles are of one.
+
+    Raises:
+        UserError: only points are known, or nothing.
+    """
+    if not len(dataset.faces):
+        advice = "give a scene with a mesh or choose a field that does without"
+        raise UserError(f"{dataset.name} has no mesh, only points; this field needs surfaces: {advice}")
+    one = np.zeros(len(dataset.faces), np.int32)
+    materials = dataset.materials or Materials(one, ("",), np.zeros(1))
+    return Mesh(
+        vertices=jnp.asarray(dataset.vertices, jnp.float32),
+        faces=jnp.asarray(dataset.faces, jnp.int32),
+        part=jnp.asarray(one if dataset.face_part is None else dataset.face_part, jnp.int32),
+        material=jnp.asarray(materials.material, jnp.int32),
+        thickness=jnp.asarray(materials.thickness, jnp.float32),
+    )
+
+
+def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
+    """Returns a surface (float32) with the spacing of its points; needs at least 4 points."""
+    neighbours, _ = cKDTree(points).query(points, 4)
+    return Surface(jnp.asarray(points, jnp.float32), jnp.asarray(neighbours[:, 1:].mean(1), jnp.float32))
+
+
+def _antennas(dataset: Dataset) -> Float[np.ndarray, "n 3"]:
+    """Returns the positions (metres, float64) of all transmitters and receivers."""
+    return np.concatenate([dataset.tx_positions, np.asarray(dataset.receivers.position)])
+
+
+def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, sampling: SurfaceSampling) -> Float[np.ndarray, "n 3"]:
+    mesh = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
+    if sampling == "area":
+        return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=rng)[0])
+    candidates, face = map(np.asarray, trimesh.sample.sample_surface(mesh, OVERSAMPLING * count, seed=rng))
+    receivers = map(dataset.receiver, range(dataset.n_receivers))
+    weight = sum((_solid_angle(candidates, mesh.face_normals[face], rx) for rx in receivers), np.zeros(len(candidates)))
+    if np.count_nonzero(weight) < count:
+        weight = weight + 1e-12
+    return candidates[rng.choice(len(candidates), count, replace=False, p=weight / weight.sum())]
+
+
+def _solid_angle(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], receiver: Receiver
+) -> Float[np.ndarray, " n"]:
+    """Returns the solid angle at a receiver of unit pieces of surface, 0 below its horizon."""
+    offset = points - np.asarray(receiver.position)
+    distance = np.maximum(np.linalg.norm(offset, axis=1), MIN_DISTANCE)
+    facing = np.abs(np.sum(offset * normals, -1)) / distance
+    zenith = to_local(jnp.asarray(offset, jnp.float32), receiver.orientation)[:, 2] / distance
+    return np.where(np.asarray(zenith) > BELOW_HORIZON, facing / distance**2 + 1e-12, 0)
+
+
+CLEARANCE = 1e-3
+"""Metres at both ends of a line in which a surface does not count: antennas may be mounted on it."""
+
+
+def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
+    """Returns whether the receivers of some links see their transmitters; None where no mesh says so."""
+    if not len(dataset.faces):
+        return None
+    receivers = dataset.rx_positions(index)
+    lines, which = np.unique(np.stack([receivers, dataset.tx_positions[index]], 1), axis=0, return_inverse=True)
+    triangles = dataset.vertices[dataset.faces].astype(np.float64)
+    normals = trimesh.unitize(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+    lowest, highest = triangles.min(1), triangles.max(1)
+    free = np.ones(len(lines), bool)
+    for i, line in enumerate(lines):
+        near = np.flatnonzero(((lowest <= line.max(0)) & (highest >= line.min(0))).all(1))  # of all, a few in a hundred
+        free[i] = not len(near) or not _obstructed(line, triangles[near], normals[near])
+    return free[which.reshape(-1)]
+
+
+def _obstructed(
+    line: Float[np.ndarray, "2 3"], triangles: Float[np.ndarray, "faces 3 3"], normals: Float[np.ndarray, "faces 3"]
+) -> bool:
+    """Returns whether any triangle lies between the two ends of a line."""
+    start, way = line[0], line[1] - line[0]
+    starts, ways = (np.broadcast_to(vector, normals.shape) for vector in (start, way))
+    points, cut, along = trimesh.intersections.planes_lines(triangles[:, 0], normals, starts, ways, return_distance=True)
+    inside = (trimesh.triangles.points_to_barycentric(triangles[cut], points) >= 0).all(1)
+    margin = CLEARANCE / max(float(np.linalg.norm(way)), CLEARANCE)
+    return bool((inside & (along > margin) & (along < 1 - margin)).any())
+
+
+ALIKE_M = 1e-4
+"""Vertices nearer than this are one."""
+MOST_TRIANGLES = 20_000
+"""Of all bodies together, the largest bodies left out."""
+
+
+def closed_bodies(dataset: Dataset) -> tuple[ClosedBody, ...]:
+    """Returns the closed parts of a scene's surfaces that no receiver is in, nor most transmitters: those are rooms."""
+    faces = dataset.faces
+    if not len(faces):
+        return ()
+    part = np.zeros(len(faces), int) if dataset.face_part is None else np.asarray(dataset.face_part)
+    found: list[ClosedBody] = []
+    inhabitants = np.asarray(dataset.receivers.position, np.float64)
+    known = np.unique(dataset.tx_positions[np.concatenate([dataset.train, dataset.validation])], axis=0)
+    for number in np.unique(part):
+        own = faces[part == number]
+        if not _is_closed(dataset.vertices, own):
+            continue
+        body = ClosedBody(f"part {number}", np.asarray(dataset.vertices, np.float64)[own])
+        if not inside(body, inhabitants).any() and (not len(known) or inside(body, known).mean() < 0.5):
+            found.append(body)
+    found.sort(key=lambda body: len(body.triangles))
+    total = np.cumsum([len(body.triangles) for body in found])
+    return tuple(body for body, triangles in zip(found, total, strict=True) if triangles <= MOST_TRIANGLES)
+
+
+def _is_closed(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "t 3"]) -> bool:
+    """Returns whether every edge belongs to two triangles, once in each direction."""
+    used, index = np.unique(faces, return_inverse=True)
+    _, same = np.unique(
+        np.round(np.asarray(vertices, np.float64)[used] / ALIKE_M).astype(np.int64), axis=0, return_inverse=True
+    )
+    corners = same.reshape(-1)[index.reshape(-1, 3)]
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    there, back = (np.unique(one, axis=0, return_counts=True) for one in (edges, edges[:, ::-1]))
+    return np.array_equal(there[0], back[0]) and np.array_equal(there[1], back[1])

@@ -1,0 +1,220 @@
+"""Which column of a table belongs to which receiver: by its name, in any usual spelling."""
+
+import csv
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax._util.errors import UserError
+
+Tokens = tuple[str, ...]
+
+
+def match_columns(where: Path, columns: Sequence[str], ids: Sequence[str] | int) -> list[str]:
+    """Returns the columns in the order of the receivers that they name; of so many receivers without names those that are
+    numbered from 1, or from 0.
+
+    Names are compared without case, separators and leading zeros, then without what all of them share (`rssi_`, `ap`), then as
+    parts of each other.
+
+    Raises:
+        UserError: a column names no receiver, or one names several, or several name one.
+    """
+    own = [tokens(name) for name in columns]
+    if isinstance(ids, int):
+        first = 0 if ("0",) in distinguishing(own) else 1
+        ids = [str(number) for number in range(first, first + ids)]
+    wanted = [tokens(name) for name in ids]
+    for rule in (_equal(own, wanted), _equal(distinguishing(own), distinguishing(wanted)), _within(own, wanted)):
+        found = [[k for k, _ in enumerate(columns) if rule(k, r)] for r, _ in enumerate(ids)]
+        if all(len(one) == 1 for one in found) and len({one[0] for one in found}) == len(columns) == len(ids):
+            return [columns[k] for (k,) in found]
+    raise UserError(
+        f"{where}: its columns of powers ({_listed(columns)}) do not each name one of the receivers ({_listed(ids)}); name "
+        f"them {_listed(['rssi_' + name for name in ids])}"
+    )
+
+
+def tokens(name: str) -> Tokens:
+    """Returns the words and numbers of a name, in small letters, numbers without leading zeros."""
+    return tuple(word.lstrip("0") or "0" if word.isdigit() else word for word in re.findall(r"[^\W\d_]+|\d+", name.lower()))
+
+
+def distinguishing(names: list[Tokens]) -> list[Tokens]:
+    """Returns names without what they all begin or all end with."""
+    if len(names) < 2:
+        return names
+    while all(names) and len({one[0] for one in names}) == 1:
+        names = [one[1:] for one in names]
+    while all(names) and len({one[-1] for one in names}) == 1:
+        names = [one[:-1] for one in names]
+    return names
+
+
+def _equal(own: list[Tokens], wanted: list[Tokens]) -> Callable[[int, int], bool]:
+    return lambda k, r: own[k] == wanted[r]
+
+
+def _within(own: list[Tokens], wanted: list[Tokens]) -> Callable[[int, int], bool]:
+    """Returns whether the longest of the receivers' names that a column begins or ends with is that of a receiver."""
+
+    def holds(column: Tokens, name: Tokens) -> bool:
+        return bool(name) and (column[: len(name)] == name or column[-len(name) :] == name)
+
+    longest = [max((len(name) for name in wanted if holds(column, name)), default=0) for column in own]
+    return lambda k, r: holds(own[k], wanted[r]) and len(wanted[r]) == longest[k]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def found(folder: Path, names: tuple[str, ...]) -> Path:
+    """Returns the first of these files that exists; none is a `UserError`."""
+    for name in names:
+        if (folder / name).exists():
+            return folder / name
+    raise UserError(f"{folder} has no {' or '.join(names)}; write it as docs/measured.md shows")
+
+
+def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Returns the header of a CSV file in small letters, and its rows, all of one length."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text in UTF-8; save it as CSV in UTF-8") from None
+    except (OSError, csv.Error) as error:
+        raise UserError(f"{path} cannot be read: {error}; check the path, or save it again as CSV") from None
+    if len(lines) < 2:
+        raise UserError(f"{path} has no rows below its header")
+    header = [name.lower() for name in lines[0][1]]
+    for sign, name in ((";", "';'"), ("\t", "tabs")):
+        if len(header) == 1 and sign in header[0]:
+            raise UserError(f"{path} has {name} between its cells; separate them by commas")
+    if len(set(header)) < len(header):
+        raise UserError(f"{path} names two columns alike: {', '.join(header)}")
+    for number, row in lines[1:]:
+        if len(row) != len(header):
+            raise UserError(f"{path}, line {number} has {len(row)} cells, the header {len(header)}")
+    return header, [row for _, row in lines[1:]]
+
+
+def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[str]) -> Float[np.ndarray, "n k"]:
+    """Returns some columns as numbers; empty cells are NaN."""
+    if missing := [name for name in columns if name not in header]:
+        raise UserError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(header)}")
+    where, values = [header.index(name) for name in columns], np.full((len(rows), len(columns)), np.nan)
+    for i, row in enumerate(rows):
+        for k, column in enumerate(where):
+            try:
+                values[i, k] = float(row[column]) if row[column] else np.nan
+            except ValueError:
+                hint = "leave cells empty where nothing was received"
+                raise UserError(f"{path}, row {i + 1}: {row[column]!r} is no number; {hint}") from None
+    return values
+
+
+POWERS_DBM = (-200.0, 50.0)
+"""Beyond it numbers are no powers."""
+SENTINELS = (
+    0.0,
+    1.0,
+    100.0,
+    127.0,
+    255.0,
+    -100.0,
+    -110.0,
+    -120.0,
+    -127.0,
+    -128.0,
+    -140.0,
+    -150.0,
+    -174.0,
+    -199.0,
+    -200.0,
+    -999.0,
+)
+"""Numbers that devices write where they received nothing ..."""
+APART_DB = 8.0
+"""... if all others lie so far to one side of them ..."""
+OFTEN = 0.2
+"""... or so many readings are exactly the lowest."""
+FURTHEST = 1e4
+"""Metres."""
+DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
+"""Largest longitude and latitude; extent of a site in degrees; and how many times as far it lies from the origin."""
+FEWEST, ELSEWHERE = 5, 50.0
+"""Places that may be degrees, powers of a receiver that may lack their sign; and how many times the extent of such places lies
+between them and the nearest receiver, if that is in metres."""
+
+
+def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
+    """Returns powers with NaN where a number stands for nothing; a note names the number."""
+    powers = np.where(np.isneginf(powers), np.nan, powers)
+    for number in SENTINELS:
+        is_it = powers == number
+        others = powers[~np.isnan(powers) & ~is_it]
+        if not is_it.any() or not len(others):
+            continue
+        apart = number > others.max() + APART_DB or number < others.min() - APART_DB
+        floor = number < others.min() and is_it.sum() >= OFTEN * len(others)
+        if apart or floor:
+            share = is_it.sum() / powers.size
+            warnings.warn(f"{where}: {number:g} stands for nothing received ({100 * share:.0f} % of its powers)", stacklevel=2)
+            powers = np.where(is_it, np.nan, powers)
+    return powers
+
+
+def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
+    """Raises a `UserError` for numbers that are no powers in dBm."""
+    heard = powers[~np.isnan(powers)]
+    if not len(heard):
+        raise UserError(f"{where}: nothing was received anywhere")
+    if heard.min() >= 0:
+        raise UserError(
+            f"{where}: powers are {heard.min():g} to {heard.max():g}, which no receiver has in dBm; convert milliwatts "
+            "(10 log10), give magnitudes their sign, leave cells empty where nothing was received"
+        )
+    for number, column in enumerate(powers.T, 1):
+        own = column[~np.isnan(column)]
+        if len(own) >= FEWEST and own.min() >= 0:
+            raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
+    if not ((heard >= POWERS_DBM[0]) & (heard <= POWERS_DBM[1])).all():
+        span = " to ".join(f"{power:g}" for power in POWERS_DBM)
+        raise UserError(f"{where}: powers must be dBm, {span}; leave cells empty where nothing was received")
+
+
+def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
+    """Raises a `UserError` for positions that are none."""
+    if not (np.abs(positions) < FURTHEST).all():
+        raise UserError(f"{what} must be numbers of metres, each nearer than {FURTHEST:g} m to the origin")
+
+
+def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
+    """Raises a `UserError` for positions whose first two coordinates are longitudes and latitudes."""
+    plane = positions[:, :2]
+    extent, offset = np.ptp(plane, axis=0).max(), np.abs(plane.mean(0)).max()
+    ranged = (np.abs(plane) <= DEGREES).all() or (np.abs(plane) <= DEGREES[::-1]).all()
+    if len(plane) > 1 and ranged and extent < TINY and offset > FAR * max(extent, 1e-12):
+        raise UserError(
+            f"{what} all lie within {extent:.2g}, {offset:.3g} from the origin: degrees of longitude and latitude; project "
+            "them to metres (UTM, say), from an origin on the site"
+        )
+
+
+def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np.ndarray, "r 3"]) -> None:
+    """Raises a `UserError` for places in degrees around receivers in metres."""
+    plane = np.unique(places[:, :2], axis=0)
+    extent = np.ptp(plane, axis=0).max()
+    nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
+    if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
+        raise UserError(
+            f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
+            "latitude; project them to metres (UTM, say), from the origin of the receivers"
+        )

@@ -1,0 +1,351 @@
+"""The coherent field: the snapshot as a sum of waves, its phases from geometry, its materials learned.
+
+    y = sum over paths  a(direction) g(direction) E(f) exp(-j k d) / d        PAS = |a^H y| / max
+
+The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (propagation/).
+What arrives over a path follows from the slabs it is reflected by and passes through, and those are learned: permittivity,
+conductivity and (where it is not known) thickness of every material, a small correction of every facet, how far every surface
+may stand from where the mesh has it, and the antennas where nobody has said what they are. Phase-blind models cannot follow
+interference; this one does, as far as lengths are known, and it yields the channel itself.
+"""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int, Key
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
+from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, heard_alone, register
+from wbgs_jax.fields.coherent_model import (
+    Materials,
+    PreparedPaths,
+    WaveParams,
+    WavePlan,
+    arrivals_at,
+    densities,
+    first_params,
+    no_clutter,
+    observe,
+    path_arrivals,
+    path_covariances,
+    path_snapshots,
+    phase_blind_pas,
+    prepare_paths,
+    slabs_at,
+    trace,
+)
+from wbgs_jax.fields.coherent_settings import MAX_FACETS, PRESETS, WaveConfig
+from wbgs_jax.fields.losses import snapshot_losses
+from wbgs_jax.mesh.edges import Edges, edges_of_facets, padded_edges
+from wbgs_jax.mesh.facets import Facets, remaining
+from wbgs_jax.mesh.facets import moved as move_facets
+from wbgs_jax.mesh.simplification import facets_that_fit
+from wbgs_jax.propagation.absorption import Grid, grid_around
+from wbgs_jax.propagation.displacement import Motion, still
+from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.radio.array import Beams, beams_of
+from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.geometry import turned
+from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
+
+__all__ = [
+    "Materials",
+    "PreparedPaths",
+    "WaveConfig",
+    "WaveField",
+    "WaveParams",
+    "WavePlan",
+    "arrivals_at",
+    "channels",
+    "make_field",
+    "observe",
+    "path_covariances",
+    "path_snapshots",
+    "phase_blind_pas",
+    "render",
+    "slabs_at",
+    "snapshots",
+    "trace",
+]
+
+SAME_PLACE_M = 1e-3
+"""Distance of two receivers that are the same."""
+
+
+@register
+@pytree
+class WaveField(Field):
+    """Facets and edges of the scene, and the thicknesses that are known."""
+
+    facets: Facets
+    edges: Edges
+    known_thickness: Float[Array, " m"]
+    """Thickness of every material, metres; 0 where it is not known, and learned."""
+    first_placement: Float[Array, " places"]
+    """`WaveParams.placement` before training."""
+    receivers: Float[Array, "r 3"]
+    """Where the receivers of the data are said to stand, world frame, metres."""
+    motion: Motion
+    """How far things and those receivers stand from where the data say, as far as that has been found out; the facets are
+    there already."""
+    tuning: Float[Array, "r elements 2"] | None
+    """Logarithm of amplitude, and phase (radians), by which elements of those receivers differ from what their positions say,
+    as far as that has been found out; None: they are in tune."""
+    grid: Grid | None
+    """Of clutter; None: there is none."""
+    first_clutter: Float[Array, "x y z 2"] | None
+    """`WaveParams.clutter` before training."""
+    config: WaveConfig = static()
+
+    name: ClassVar[str] = "wave"
+    presets: ClassVar = PRESETS
+    gives: ClassVar = ("pas", "snapshots", "power", "paths")
+    controls: ClassVar = ("search",)
+    seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
+
+    @classmethod
+    def check(cls, config: WaveConfig) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        if config.max_facets > MAX_FACETS:
+            raise UserError(f"--{cls.name}.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
+        if config.clutter_cells < 1 or config.clutter_cell <= 0:
+            raise UserError(f"--{cls.name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 does without")
+
+    @classmethod
+    def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
+        """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
+        cls.check(config)
+        return make_field(scene.mesh(), config, scene.receivers.position)
+
+    def init(self, key: Key[Array, ""]) -> WaveParams:
+        """Returns parameters in which all materials are alike; nothing is random."""
+        facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
+        return first_params(self.config, facets, materials, self.first_placement, self.first_clutter)
+
+    def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
+        """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
+        check_receiver(receiver)
+        receiver, tuning = self._as_found(receiver)
+        surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
+        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, self.config)
+
+    def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
+        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
+        shift and the turn of the plan's receiver alone."""
+        orientation = turned(plan.receiver.orientation, jnp.asarray(motion.receiver_turn))
+        return dataclasses.replace(plan, motion=motion, receiver=dataclasses.replace(plan.receiver, orientation=orientation))
+
+    def _search(self, receiver: Receiver) -> Search:
+        config = self.config
+        if _traced(self.facets, self.edges, receiver.position):
+            raise TypeError(
+                "the wave field finds a receiver's mirror images on the host: neither the field nor receiver.position can be "
+                "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
+            )
+        areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
+        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
+
+    def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
+        """Returns a receiver of the data where it has been found to stand, and its tuning; any other one as it is, in tune."""
+        if not len(self.receivers):
+            return receiver, None
+        known = self.receivers, receiver.position, self.motion.receiver
+        xp = jnp if _traced(*known) else np  # the mirror images of a position are found on the host, within `jit` too
+        places, position, shifts = map(xp.asarray, known)
+        away = xp.linalg.norm(places - position, axis=-1)
+        own = xp.argmin(away)
+
+        def found(of_all: Any, xp: Any = jnp) -> Any:
+            return xp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
+
+        position = position + found(shifts, xp)
+        if xp is np:
+            with jax.ensure_compile_time_eval():
+                position = jnp.asarray(position)
+        orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
+        tuning = None if self.tuning is None else found(self.tuning)
+        return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
+
+    def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
+        """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
+        return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
+
+    def cache_of(self, cache: PreparedPaths, links: Links) -> PreparedPaths:
+        """Returns the paths of some links."""
+        return cache.only(links)
+
+    def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
+        """Returns spectra, snapshots and received power of B queries."""
+        check_query(query)
+        return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+
+    def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
+        """Returns the same of links of one receiver whose paths are prepared."""
+        return observe(params, plan, cache.of(links), links.query.frequency_hz)
+
+    def loss(
+        self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
+        """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
+        facet corrections and clutter. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum
+        of 1."""
+        plan = self.plan(params, batch.receiver, cache=cache)
+        return self.compared(params, self.render_links(params, plan, cache, batch.links), batch)
+
+    def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
+        """Returns the loss of what it says of a batch."""
+        config = self.config
+        loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight)
+        if seen.snapshots is not None and batch.snapshots is not None:
+            correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
+            loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
+        return loss + self.penalty(params), aux
+
+    def penalty(self, params: WaveParams) -> Float[Array, ""]:
+        """Returns what corrections of facets and clutter cost."""
+        corrections = self.config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0))
+        if params.clutter is None:
+            return corrections
+        return corrections + self.config.clutter_weight * jnp.mean(densities(params.clutter))
+
+    def moved(self, motion: Motion) -> "WaveField":
+        """Returns the field of a scene in which things stand elsewhere (host)."""
+        facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
+        return self._of(facets, jax.tree.map(lambda a, b: a + b, self.motion, motion))
+
+    def without(self, movers: Int[np.ndarray, " k"]) -> "WaveField":
+        """Returns the field of a scene in which some movers are not there (host)."""
+        stays = np.setdiff1d(np.arange(len(self.motion.shift)), movers)
+        motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
+        placement = self.first_placement[np.append(stays, -1)]
+        return dataclasses.replace(self._of(remaining(self.facets, stays), motion), first_placement=placement)
+
+    def _of(self, facets: Facets, motion: Motion) -> "WaveField":
+        parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
+        return dataclasses.replace(self, **{name: to_device(part) for name, part in parts.items()})
+
+    def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
+        """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
+        further = jnp.asarray(np.stack([np.log(np.abs(gains)), np.angle(gains)], -1), jnp.float32)
+        return dataclasses.replace(self, tuning=further if self.tuning is None else self.tuning + further)
+
+    def cluttered(self) -> "WaveField":
+        """Returns the field that knows of clutter: none of it yet, anywhere around its surfaces and receivers (host)."""
+        around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
+        grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
+        return dataclasses.replace(self, grid=to_device(grid), first_clutter=no_clutter(shape))
+
+    def electrical(self, params: WaveParams) -> Electrical:
+        """Returns the properties of the materials, as far as they were learned."""
+        m, known = jax.tree.map(np.asarray, (params.materials, self.known_thickness))
+        thickness = np.where(known > 0, known, np.exp(m.log_thickness))
+        return Electrical(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
+
+    def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
+        """Returns parameters in which one material has another permittivity (above 1) and conductivity."""
+        m = params.materials
+        polarised = m.log_susceptibility.at[material].set(np.log(permittivity - 1))
+        conducting = m.log_conductivity.at[material].set(np.log(conductivity))
+        changed = dataclasses.replace(m, log_susceptibility=polarised, log_conductivity=conducting)
+        return dataclasses.replace(params, materials=changed)
+
+    def with_thickness(self, plan: WavePlan, material: int, metres: float) -> tuple["WaveField", WavePlan]:
+        """Returns the field and the plan in which one material has a thickness that is known."""
+        known = self.known_thickness.at[material].set(metres)
+        return tuple(dataclasses.replace(one, known_thickness=known) for one in (self, plan))  # type: ignore[return-value]
+
+    def blurred(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
+        """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
+        variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2
+        return dataclasses.replace(params, placement=params.placement.at[-1].set(0.5 * jnp.log(variance)))
+
+    def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
+        """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""
+        return self, params
+
+    def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns the corners of the facets where they stand now, and how far their movers were shifted."""
+        if not np.any(self.motion.shift):
+            return None
+        return np.asarray(self.facets.corners), np.asarray(self.motion.shift)[np.asarray(self.facets.mover)]
+
+    def arrivals(self, params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
+        """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
+        return channels(params, plan, query)
+
+    def sizes(self, params: WaveParams) -> dict[str, int]:
+        """Returns the numbers of materials, facets and edges."""
+        edges = int(np.count_nonzero(np.asarray(self.edges.length)))
+        return {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
+
+    @classmethod
+    def groups(cls, config: WaveConfig) -> dict[str, Group]:
+        """Returns the groups of parameters; idealisations are searched, and not trained."""
+        return {
+            "materials": Group(config.materials_lr),
+            "thickness": Group(config.thickness_lr),
+            "corrections": Group(config.corrections_lr),
+            "antennas": Group(config.antennas_lr),
+            "placement": Group(config.placement_lr),
+            "ideal": Group(0.0),
+            "clutter": Group(config.clutter_lr),
+        }
+
+    @classmethod
+    def labels(cls, params: WaveParams) -> Any:
+        """Returns the group of every parameter."""
+        clutter = [] if params.clutter is None else ["clutter"]
+        found = *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
+        return with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
+
+
+def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
+    """Returns the field of a mesh: its facets and edges are found on the host.
+
+    Args:
+        mesh: of the scene.
+        config: settings.
+        receivers: (r, 3), positions (world frame, metres) of those whose own place may be learned; none by default.
+    """
+    config = config or WaveConfig()
+    facets = facets_that_fit(mesh, config.max_facets)
+    edges = padded_edges(edges_of_facets(facets))
+    movers = int(facets.mover.max()) + 1
+    placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
+    thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
+    motion = to_device(still(movers, len(known)))
+    return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, None, None, config)
+
+
+def _beams(receiver: Receiver) -> Beams | None:
+    """Returns the beams of an array that is the same at all frequencies and known on the host."""
+    positions = receiver.element_positions
+    if receiver.unit != "wavelengths" or _traced(positions):
+        return None
+    return beams_of(np.asarray(positions))
+
+
+def _traced(*trees: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
+    """Returns the power angular spectra of B queries."""
+    check_query(query)
+    return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz).pas
+
+
+def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array, "b elements"]:
+    """Returns the complex array snapshots (channel state) of B queries."""
+    check_query(query)
+    return path_snapshots(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+
+
+def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
+    """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
+    check_query(query)
+    return path_arrivals(params, plan, trace(plan, query.tx_position), query.frequency_hz)

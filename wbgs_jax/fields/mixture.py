@@ -1,0 +1,322 @@
+"""How far three opinions are to be trusted, query by query, learned from links that nothing was trained on: the coherent
+field's, the splatting field's own, and the splatting field's that has seen the first.
+
+    first = a coherent + (1 - a) own        all = b first + (1 - b) informed
+
+The coherent and the own opinion err in different places; the informed one knows what the mesh lacks, but errs where the
+coherent one does. Each share is
+
+    share = sigmoid(bias + weights . z)
+
+with z what is known beforehand and tells where phases fail: the frequency, how much the two fields disagree, how far below free
+space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
+is. The weights are those by which validation links are explained best; they are zero unless, on transmitters left out a fifth
+at a time, they do better than one common share by more than a standard error.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.statistics import standard_error
+from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.losses import ssim
+from wbgs_jax.radio.array import EXACT
+from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
+from wbgs_jax.types import Query
+
+SHARES = np.linspace(0, 1, 21)
+"""Shares of the first of two opinions that links are scored at."""
+FEATURES = 7
+FOLDS = 5
+RIDGE = 5e-3
+"""Penalty on the squared weights, in the unit of the scores' spread over shares."""
+STEPS, RATE = 400, 0.03
+"""Of Adam, which finds the weights."""
+BLOCK = 48
+"""Spectra that are compared at once."""
+FAINTEST_DB = 60.0
+"""Received powers are told apart down to so many decibels below free space."""
+
+
+@pytree
+class Share:
+    """The logit of a share: linear in the features."""
+
+    bias: Float[Array, ""]
+    weights: Float[Array, " features"]
+    mean: Float[Array, " features"]
+    """Of the features over the links that it was learned from ..."""
+    scale: Float[Array, " features"]
+    """... and their standard deviation."""
+
+
+@pytree
+class Shares:
+    """Of three opinions."""
+
+    coherent: Share
+    """Of the coherent field, the rest is the splatting field's own opinion ..."""
+    uninformed: Share
+    """... and of these two together, the rest is its informed one."""
+
+
+class Opinions(NamedTuple):
+    """What B links are said to be: spectra, or powers in decibels."""
+
+    coherent: Any
+    own: Any
+    informed: Any
+
+
+class Scored(NamedTuple):
+    """What some links say."""
+
+    features: Float[np.ndarray, "n features"]
+    scores: Float[np.ndarray, "n shares"]
+    """What every share of `SHARES` is worth on each link: the larger, the better."""
+    tx_index: Int[np.ndarray, " n"]
+
+
+def constant(share: float) -> Share:
+    """Returns the same share for all queries."""
+    share = min(max(share, 1e-3), 1 - 1e-3)
+    weights, mean = jnp.zeros(FEATURES), jnp.zeros(FEATURES)  # two arrays: training gives every one away once
+    return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
+
+
+def at_first() -> Shares:
+    """Returns the shares by which the coherent field counts half, and each opinion of the splatting one a quarter."""
+    return Shares(constant(2 / 3), constant(3 / 4))
+
+
+def coherent_alone() -> Shares:
+    """Returns the shares by which the coherent field alone counts, within a few thousandths."""
+    return Shares(constant(1.0), constant(1.0))
+
+
+def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[str, Any]:
+    """Returns, for reports, how much each opinion counts on average over N links, and whether that differs from query to
+    query."""
+    first, both = (np.asarray(share_of(share, jnp.asarray(features))) for share in (shares.coherent, shares.uninformed))
+    means = {"coherent": first * both, "own": (1 - first) * both, "informed": 1 - both}
+    by_query = bool(np.any(shares.coherent.weights) or np.any(shares.uninformed.weights))
+    return {name: round(float(share.mean()), 3) for name, share in means.items()} | {"by_query": by_query}
+
+
+def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
+    """Returns the share, 0 to 1, that the first of two opinions has in B queries."""
+    scaled = (features - share.mean) / share.scale
+    return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
+
+
+def mixed(shares: Shares, features: Float[Array, "b features"], said: Opinions) -> Any:
+    """Returns what three opinions come to for B queries."""
+    first = _mix(share_of(shares.coherent, features), said.coherent, said.own)
+    return _mix(share_of(shares.uninformed, features), first, said.informed)
+
+
+def _mix(share: Float[Array, " b"], one: Any, other: Any) -> Any:
+    share = share.reshape(share.shape + (1,) * (one.ndim - 1))
+    return share * one + (1 - share) * other
+
+
+def features(
+    query: Query, rx_position: Float[Array, "3"], coherent: Observation, own: Observation
+) -> Float[Array, "b features"]:
+    """Returns what tells how far the coherent field is right for B queries, beside the splatting field's own opinion."""
+    octave = jnp.log2(query.frequency_hz / 1e10)
+    link = query.tx_position, rx_position, query.frequency_hz
+    beyond = [
+        jnp.zeros_like(octave)
+        if seen.power_db is None
+        else jnp.clip(beyond_free_space_db(seen.power_db, *link), -FAINTEST_DB, 0.0)
+        for seen in (coherent, own)
+    ]
+    brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, own)]
+    disagreement = jnp.log(jnp.mean(jnp.abs(coherent.pas - own.pas), (-2, -1)) + 1e-3)
+    return jnp.stack([octave, octave**2, disagreement, *beyond, *brightness], -1)
+
+
+def learn_shares(
+    told: Float[np.ndarray, "n features"], tx_index: Int[np.ndarray, " n"], said: Opinions, worth: Callable[[Any, Any], Any]
+) -> Shares:
+    """Returns the shares that explain N links best (host), one after the other; `worth(one, other)` returns the score on each
+    link of every mixture of two opinions, by the share (`SHARES`) of the first: (n, shares)."""
+    coherent = learn_share(Scored(told, worth(said.coherent, said.own), tx_index))
+    first = np.asarray(_mix(share_of(coherent, jnp.asarray(told)), jnp.asarray(said.coherent), jnp.asarray(said.own)))
+    return Shares(coherent, learn_share(Scored(told, worth(first, said.informed), tx_index)))
+
+
+def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
+    """Returns the SSIM of every mixture of two spectra."""
+    return in_blocks(_ssim_of_mixtures, one, other, truth)
+
+
+def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
+    """Returns what a function says of N spectra, or of several beside each other; few are on the device at once."""
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(spectra[0]), BLOCK)]
+    return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
+
+
+@jax.jit
+def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> Float[Array, "b shares"]:
+    return jax.lax.map(lambda share: ssim(share * one + (1 - share) * other, truth), jnp.asarray(SHARES, jnp.float32)).T
+
+
+def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
+    """Returns the negative error (dB) of every mixture of two powers; 0 where nothing was heard."""
+    said = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
+    return np.where((heard_db > NOT_HEARD_DB)[:, None], -np.abs(said - heard_db[:, None]), 0)
+
+
+def learn_share(known: Scored) -> Share:
+    """Returns the share that explains links best (host): one for all, unless the features surely improve on it."""
+    common = constant(_best(known.scores))
+    folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
+    if len(np.unique(known.tx_index)) < 2 * FOLDS:
+        return common
+    gains = np.zeros(len(folds))
+    for fold in range(FOLDS):
+        own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
+        by_features, by_all = _fit(rest), constant(_best(rest.scores))
+        gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
+    gain, error = standard_error(gains, known.tx_index)
+    return _fit(known) if gain > error else common
+
+
+def _best(scores: Float[np.ndarray, "n shares"]) -> float:
+    return float(SHARES[np.argmax(scores.mean(0))])
+
+
+def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
+    return np.asarray(score_at(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
+
+
+def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Returns the score at a share between those that were tried."""
+    place = share * (len(SHARES) - 1)
+    low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
+    left, right = (jnp.take_along_axis(scores, (low + step)[:, None], 1)[:, 0] for step in (0, 1))
+    return left + (place - low) * (right - left)
+
+
+def _fit(known: Scored) -> Share:
+    """Returns the weights that make the mean score largest, standardised and shrunk towards none."""
+    start = constant(min(max(_best(known.scores), 0.05), 0.95))
+    mean, scale = known.features.mean(0), known.features.std(0)
+    used = scale > 1e-6
+    start = Share(start.bias, start.weights, jnp.asarray(mean), jnp.asarray(np.where(used, scale, 1)))
+    unit = max(float(np.ptp(known.scores, 1).mean()), 1e-6)
+    learned: Share = _ascend(start, jnp.asarray(known.features), jnp.asarray(known.scores / unit), jnp.asarray(used))
+    return learned
+
+
+@jax.jit
+def _ascend(
+    start: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"], used: Bool[Array, " features"]
+) -> Share:
+    """Maximises the mean score by Adam: a smooth function of eight numbers."""
+
+    def with_learned(learned: tuple[Array, Array]) -> Share:
+        return Share(learned[0], learned[1] * used, start.mean, start.scale)
+
+    def loss(learned: tuple[Array, Array]) -> Float[Array, ""]:
+        worth = score_at(scores, share_of(with_learned(learned), features))
+        return RIDGE * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
+
+    def step(i: Int[Array, ""], carry: Any) -> Any:
+        learned, first, second = carry
+        gradient = jax.grad(loss)(learned)
+        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, gradient)
+        second = jax.tree.map(lambda v, g: 0.99 * v + 0.01 * g**2, second, gradient)
+        size = RATE * jnp.sqrt(1 - 0.99 ** (i + 1.0)) / (1 - 0.9 ** (i + 1.0))
+        learned = jax.tree.map(lambda p, m, v: p - size * m / (jnp.sqrt(v) + 1e-8), learned, first, second)
+        return learned, first, second
+
+    learned = start.bias, start.weights
+    zeros = jax.tree.map(jnp.zeros_like, learned)
+    return with_learned(jax.lax.fori_loop(0, STEPS, step, (learned, zeros, zeros))[0])
+
+
+LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
+"""Floors that are tried, as shares of the largest square of a spectrum: of less, spectra show hardly anything."""
+SURE = 2.0
+"""Standard errors over transmitters that spectra have to be more alike with a floor ..."""
+HARMLESS = 1.0
+"""... and that they may be less so where learned ones are raised to it."""
+DARKEST = 0.05
+"""Share of the pixels of learned spectra that may be darker than the floor."""
+FEWEST_TX = 10
+"""Transmitters of which less is no evidence."""
+COMPARED = 240
+"""Spectra that are looked at."""
+
+
+def with_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
+    """Returns spectra as noise lets them appear; `floor` is N sigma^2 / max |a^H h|^2."""
+    return jnp.sqrt((pas**2 + floor) / (1 + floor))
+
+
+def without_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
+    """Returns spectra without what noise has added; of what is darker than the floor nothing remains."""
+    square = (1 + floor) * pas**2 - floor
+    dark = square <= 0  # the root has no gradient at 0
+    return jnp.where(dark, 0, jnp.sqrt(jnp.where(dark, 1, square)))
+
+
+def at_least_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
+    """Returns spectra that are nowhere darker than the floor: what taking it out and adding it again comes to."""
+    return jnp.maximum(pas, jnp.sqrt(floor / (1 + floor)))
+
+
+def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: Int[np.ndarray, " n"]) -> float:
+    """Returns the floor that noise puts under N observed spectra (host): the lowest of three accounts; 0 unless the coherent
+    field's spectra, which know no noise, are surely more like the observed ones with it.
+
+    Args:
+        said: of the links, with the floor in what has been learned.
+        observed: spectra.
+        tx_index: their transmitters, which are what was drawn.
+    """
+    looked = np.random.default_rng(0).permutation(np.flatnonzero(_met(said)))[:COMPARED]
+    unaware, learned, observed, tx_index = said.coherent[looked], said.informed[looked], observed[looked], tx_index[looked]
+    if len(np.unique(tx_index)) < FEWEST_TX:
+        return 0.0
+    added = in_blocks(_added, unaware, observed)
+    best = int(added.mean(0).argmax())
+    gain, error = standard_error(added[:, best] - added[:, 0], tx_index)
+    if gain <= SURE * error:
+        return 0.0
+    raised = in_blocks(_raised, learned, observed)
+    losses = [standard_error(raised[:, 0] - with_level, tx_index) for with_level in raised.T]
+    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= HARMLESS * error)
+    return float(min(LEVELS[best], harmless, np.quantile(learned**2, DARKEST)))
+
+
+def observed_opinions(said: Opinions, floor: float) -> Opinions:
+    """Returns opinions as they would be observed, had those that have learned the floor been without it (host)."""
+    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in said[1:])
+    coherent = jnp.where(_met(said)[:, None, None], with_floor(jnp.asarray(said.coherent), floor), own)
+    return Opinions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
+
+
+def _met(said: Opinions) -> Bool[np.ndarray, " n"]:
+    """Returns on which links the coherent field has an opinion of its own."""
+    return np.asarray((said.coherent != said.own).any((-2, -1)))
+
+
+def _alike(
+    change: Callable[..., Array], said: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
+) -> Float[Array, "b levels"]:
+    """Returns how like the observed spectra others are when every floor has changed them."""
+    return jax.lax.map(lambda floor: ssim(change(said, floor), observed), jnp.asarray(LEVELS, said.dtype)).T
+
+
+_added, _raised = (jax.jit(partial(_alike, change)) for change in (with_floor, at_least_floor))

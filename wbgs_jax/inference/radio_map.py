@@ -1,0 +1,111 @@
+"""Maps of a quantity of the channel over a level plane of transmitters, and the walls that the plane cuts."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.inference.predictor import Trained, observe_queries
+from wbgs_jax.inference.quantities import ask_channel, check_known
+from wbgs_jax.radio.array import best_beams, codebook, pas_directions
+from wbgs_jax.radio.geometry import direction_to_angles
+from wbgs_jax.types import Receiver, make_query
+
+BEST_BEAM = "best-beam"
+AT_ONCE = 512
+"""Links: between two steps of the progress, and in memory."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Transmitters on a level grid, world frame, metres."""
+
+    xs: Float[np.ndarray, " nx"]
+    ys: Float[np.ndarray, " ny"]
+    height: float
+
+    def positions(self) -> Float[np.ndarray, "places 3"]:
+        """Returns all places, x fastest."""
+        y, x = np.meshgrid(self.ys, self.xs, indexing="ij")
+        return np.stack([x, y, np.full(x.shape, self.height)], -1).reshape(-1, 3)
+
+
+def plane_over(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], height: float, step: float) -> Plane:
+    """Returns a grid of squares of about `step` metres that fill a rectangle; places are their centres."""
+    counts = np.maximum(np.round((high - low) / step), 1).astype(int)
+    xs, ys = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True))
+    return Plane(xs, ys, height)
+
+
+def ask_plane(
+    what: str,
+    trained: Trained,
+    dataset: Dataset,
+    receiver: Receiver,
+    plane: Plane,
+    frequencies_hz: Float[np.ndarray, " freq"],
+    advance: Callable[[], None] = lambda: None,
+) -> dict[str, np.ndarray]:
+    """Returns {name with unit: values (freq, ny, nx)} of transmitters all over a plane, and `xs`, `ys`, `frequencies_hz`.
+
+    Args:
+        what: `BEST_BEAM`, the number of the beam of `radio.codebook` that hears most, or what `quantities.ask_channel` answers.
+        trained: the field, and the data it was trained on: `dataset`.
+        receiver: at which it is asked.
+        plane: of the transmitters.
+        frequencies_hz: of the carrier.
+        advance: called `pieces(plane, frequencies)` times, as the work goes on.
+
+    Raises:
+        UserError: the field knows nothing of it.
+    """
+    if what == BEST_BEAM:
+        check_known("spectra", trained, dataset)
+    places, parts = plane.positions(), []
+    for some in np.array_split(places, pieces(plane, frequencies_hz)):
+        if what == BEST_BEAM:
+            parts.append(_best_beams(trained, receiver, some, frequencies_hz))
+        else:
+            found = ask_channel(what, trained, dataset, receiver, some, frequencies_hz)
+            parts.append({name: values for name, values in found.items() if name not in ("tx_positions", "frequencies_hz")})
+        advance()
+    shape = len(plane.ys), len(plane.xs)
+    maps = {}
+    for name in parts[0]:
+        values = np.moveaxis(np.concatenate([part[name] for part in parts]), 1, 0)
+        maps[name] = values.reshape(len(frequencies_hz), *shape, *values.shape[2:])
+    more = beam_angles() if what == BEST_BEAM else {}
+    return maps | more | {"xs": plane.xs, "ys": plane.ys, "height": np.array(plane.height), "frequencies_hz": frequencies_hz}
+
+
+def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:
+    """Returns how many pieces the work is done in."""
+    places = len(plane.xs) * len(plane.ys)
+    return -(-places // max(AT_ONCE // len(frequencies_hz), 1))
+
+
+def _best_beams(
+    trained: Trained, receiver: Receiver, places: Float[np.ndarray, "places 3"], frequencies_hz: Float[np.ndarray, " freq"]
+) -> dict[str, np.ndarray]:
+    query = make_query(np.repeat(places, len(frequencies_hz), 0), np.tile(frequencies_hz, len(places)))
+    spectra = observe_queries(trained, receiver, query, "pas")
+    return {"best_beam": best_beams(spectra).reshape(len(places), len(frequencies_hz))}
+
+
+def beam_angles() -> dict[str, np.ndarray]:
+    """Returns where the codebook's beams point, degrees in the receiver's frame."""
+    azimuth, zenith = direction_to_angles(jnp.asarray(pas_directions().reshape(-1, 3)[codebook()], jnp.float32))
+    return {"beam_azimuth_deg": np.degrees(azimuth), "beam_zenith_deg": np.degrees(zenith)}
+
+
+def cut_at(dataset: Dataset, height: float) -> Float[np.ndarray, "n 2 2"]:
+    """Returns the lines (x and y of both ends, metres) in which surfaces meet a level plane; none where none are known."""
+    if not len(dataset.faces):
+        return np.zeros((0, 2, 2))
+    mesh = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
+    lines = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height])
+    return np.asarray(lines).reshape(-1, 2, 3)[..., :2]

@@ -1,0 +1,250 @@
+"""Answers to many queries, block by block: in a folder beside the file that they end in, so that nothing is lost and memory
+holds one block at a time."""
+
+import contextlib
+import json
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import atomic_write, opened_archive, read_json, told, write_csv, write_json
+from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
+
+QUESTION = "question.json"
+QUICK = 1
+"""Level of compression: spectra are hardly smaller at higher ones."""
+SHARED = ("offsets_hz", "delays_s", "tx_elements")
+"""Arrays that belong to all queries alike; all others have a row a query (or several: tables of paths)."""
+
+
+class Answers:
+    """Blocks of answers in memory: arrays by name."""
+
+    def __init__(self, blocks: list[Mapping[str, np.ndarray]] | None = None):
+        self._blocks = blocks or []
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def add(self, block: Mapping[str, np.ndarray]) -> None:
+        """Keeps one more block."""
+        self._blocks.append(block)
+
+    @contextlib.contextmanager
+    def opened(self, number: int) -> Iterator[Mapping[str, np.ndarray]]:
+        """Gives a block."""
+        yield self._blocks[number]
+
+    def names(self) -> list[str]:
+        """Returns the names of arrays with a row a query."""
+        with self.opened(0) as block:
+            return [name for name in block if name not in SHARED]
+
+    def shared(self) -> dict[str, np.ndarray]:
+        """Returns the arrays that belong to all queries alike."""
+        with self.opened(0) as block:
+            return {name: block[name] for name in block if name in SHARED}
+
+    def pieces(self, name: str) -> Iterator[np.ndarray]:
+        """Gives an array block by block."""
+        for number in range(len(self)):
+            with self.opened(number) as block:
+                yield block[name]
+
+    def whole(self, name: str, most: int | None = None) -> np.ndarray:
+        """Returns an array, or its first `most` rows."""
+        parts: list[np.ndarray] = []
+        for piece in self.pieces(name):
+            parts.append(piece)
+            if most is not None and sum(map(len, parts)) >= most:
+                break
+        return _joined(parts)[:most]
+
+    def rows(self, name: str, wanted: np.ndarray) -> np.ndarray:
+        """Returns some rows of an array, by their numbers in ascending order."""
+        found, start = [], 0
+        for piece in self.pieces(name):
+            inside = wanted[(wanted >= start) & (wanted < start + len(piece))]
+            found.append(piece[inside - start])
+            start += len(piece)
+        return _joined(found)
+
+    def remove(self) -> None:
+        """Forgets what is no longer needed."""
+
+
+class PartFiles(Answers):
+    """Blocks of answers in a folder."""
+
+    def __init__(self, folder: Path, done: int):
+        super().__init__()
+        self.folder, self.done = folder, done
+
+    def __len__(self) -> int:
+        return self.done
+
+    def add(self, block: Mapping[str, np.ndarray]) -> None:
+        """Writes one more block, whole or not at all."""
+        with atomic_write(_file(self.folder, self.done)) as stream:
+            arrays: dict[str, Any] = dict(block)
+            np.savez(stream, **arrays)
+        self.done += 1
+
+    @contextlib.contextmanager
+    def opened(self, number: int) -> Iterator[Mapping[str, np.ndarray]]:
+        """Gives a block; its arrays are read when they are asked for."""
+        path = _file(self.folder, number)
+        with opened_archive(path, "", "remove it and all after it, and go on with --resume") as block:
+            yield block
+
+    def remove(self) -> None:
+        """Removes the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def part_folder(target: Path) -> Path:
+    """Returns where the blocks of a file's answers are kept until all are there."""
+    return target.with_name(f"{target.name}.part")
+
+
+def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFiles:
+    """Returns the blocks beside a file: none, or with `resume` those that an interrupted command left.
+
+    Raises:
+        UserError: blocks are there and are not to be used, or answer another question.
+    """
+    folder = part_folder(target)
+    done = 0
+    while _file(folder, done).exists():
+        done += 1
+    if done and not resume:
+        raise UserError(
+            f"{folder} holds answers of an interrupted command; add --resume to go on with it, or remove the folder"
+        )
+    if done and (changed := _difference(read_json(folder / QUESTION), question)):
+        raise UserError(f"{folder} holds answers to another question ({changed}); remove the folder, or choose another --out")
+    if not done:
+        write_json(folder / QUESTION, question)
+    return PartFiles(folder, done)
+
+
+def write_archive(
+    path: Path, answers: Answers, shape: tuple[int, ...] | None, known: dict[str, Any], source: dict[str, Any]
+) -> None:
+    """Writes answers as a compressed .npz file, block by block.
+
+    Args:
+        path: of the file.
+        answers: all of them.
+        shape: leading axes in place of the queries' one; None for tables, whose rows are no queries.
+        known: further arrays.
+        source: where they come from, JSON text in `meta`.
+    """
+    single = {**answers.shared(), **known, "meta": np.array(json.dumps(source))}
+    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
+        for name in answers.names():
+            shapes, dtypes = zip(*((piece.shape, piece.dtype) for piece in answers.pieces(name)), strict=True)
+            count, dtype = sum(one[0] for one in shapes), np.result_type(*dtypes)
+            leading = (count,) if shape is None else shape
+            header = {"descr": dtype.str, "fortran_order": False, "shape": (*leading, *shapes[0][1:])}
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_2_0(member, header)
+                for piece in answers.pieces(name):
+                    member.write(np.ascontiguousarray(piece, dtype).tobytes())
+        for name, values in single.items():
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+
+
+def _joined(pieces: list[np.ndarray]) -> np.ndarray:
+    with told("a block of kept answers", "remove the folder of blocks, and ask again"):
+        return np.concatenate(pieces)
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / f"{number:06}.npz"
+
+
+def _difference(before: Any, now: dict[str, Any]) -> str:
+    before = before if isinstance(before, dict) else {}
+    return ", ".join(key for key in now if before.get(key) != json.loads(json.dumps(now[key])))
+
+
+PATHS = "paths"
+TWO = ("azimuth", "zenith")
+"""What pairs of numbers are of."""
+DIGITS = ".7g"
+
+
+def write(path: Path, what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> None:
+    """Writes all answers: to a .csv file a row a query, or a path; to an .npz file arrays (tx, freq, ...), or (queries, ...)
+    where queries are paired."""
+    if path.suffix == ".csv":
+        write_csv(path, table_rows(answers) if what == PATHS else query_rows(answers, queries))
+        return
+    known: dict[str, Any] = {}
+    if what != PATHS:
+        known = {"tx_positions": queries.tx_positions, "frequencies_hz": queries.frequencies_hz}
+    write_archive(path, answers, None if what == PATHS else queries.shape, known, source)
+
+
+def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
+    """Gives a header, and a row a query: its columns x, y, z, ghz, and the numbers that answer it."""
+    names = answers.names()
+    columns = []
+    for name in names:
+        values = answers.whole(name)
+        if values.ndim == 1:
+            columns.append((name, values))
+        else:
+            columns += [(f"{TWO[i]}_{name}", values[:, i]) for i in range(values.shape[1])]
+    yield [*COLUMNS, *(name for name, _ in columns)]
+    positions, frequencies = queries.flat()
+    for i, (position, frequency) in enumerate(zip(positions, frequencies, strict=True)):
+        numbers = [*position, frequency / 1e9, *(values[i] for _, values in columns)]
+        yield [format(float(number), DIGITS) for number in numbers]
+
+
+def table_rows(answers: Answers) -> Iterator[list[Any]]:
+    """Gives a header, and the rows of a table."""
+    names = answers.names()
+    yield names
+    for number in range(len(answers)):
+        with answers.opened(number) as block:
+            for row in zip(*(block[name] for name in names), strict=True):
+                yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
+
+
+NO_CONFIDENCE = "no confidence: it lies outside of what was trained, or where no antenna can stand"
+
+
+def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
+    """Returns how good some of the answers are expected to be, where that is known: one line each. `source` holds the level of
+    their intervals (`answers.source_of`)."""
+    from wbgs_jax.inference.answers import link_words
+
+    if what == PATHS or not {"expected", "within_db"} & set(answers.names()):
+        return []
+    shown = shown_rows(len(queries))
+    positions, frequencies = (part[shown] for part in queries.flat())
+    where = [link_words(position, float(frequency)) for position, frequency in zip(positions, frequencies, strict=True)]
+    sure = f"{100 * source['interval_level' if what == 'spectra' else 'power_interval_level']:.0f} %"
+    if what == "spectra":
+        expected = zip(where, answers.rows("expected", shown), strict=True)
+        return [
+            f"{link}: {NO_CONFIDENCE}"
+            if np.isnan(ssim)
+            else f"{link}: expected SSIM {ssim:.2f}, {sure} between {low:.2f} and {min(high, 1):.2f}"
+            for link, (ssim, low, high) in expected
+        ]
+    columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))
+    return [
+        f"{link}: {power:.1f} dB of the transmitted power; "
+        + (NO_CONFIDENCE if np.isnan(error) else f"expected {error:.1f} dB off, {sure} within {within:.1f} dB")
+        for link, power, error, within in zip(where, *columns, strict=True)
+    ]

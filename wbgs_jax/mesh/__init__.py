@@ -1,0 +1,1 @@
+"""Meshes: readers, cleaning, facets and edges."""

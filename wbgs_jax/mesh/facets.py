@@ -1,0 +1,251 @@
+"""A mesh as a few planar facets: convex polygons of three or four corners, merged from coplanar triangles of one body.
+
+Facets are what reflects, transmits and shades. They tile every planar piece of the mesh without gaps or overlaps. A body is
+what they are merged in, and what edges are searched in (`edges.py`): an object of the scene, or several open sheets of one
+material that meet, such as the walls of a room. Objects that are closed stay apart even where they touch. Runs on the host.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import pytree
+from wbgs_jax.mesh.cleaning import components, names, repaired, sides
+from wbgs_jax.types import Mesh
+
+AnyArray = Array | np.ndarray
+"""Geometry is found in NumPy, in double precision, and used in JAX."""
+CORNERS = 4
+WELD = 1e-5
+"""Metres: corners nearer than this are one."""
+SMALLEST_AREA = 1e-10
+"""Square metres: smaller triangles are no surface."""
+FLAT = 1e-4
+"""Sine of the largest angle between normals of one plane, and between edges of one straight line."""
+Polygon = list[int]
+
+
+@pytree
+class Facets:
+    """F planar convex polygons. A triangle repeats its last corner."""
+
+    corners: Float[AnyArray, "f 4 3"]
+    """World frame, metres, counter-clockwise around the normal."""
+    normal: Float[AnyArray, "f 3"]
+    """Unit vectors, world frame."""
+    offset: Float[AnyArray, " f"]
+    """Distance of the plane from the origin along the normal, metres."""
+    body: Int[AnyArray, " f"]
+    """What a facet may have edges with: the object that it belongs to, or the open sheets of its material that meet."""
+    material: Int[AnyArray, " f"]
+    """Index of the mesh's material."""
+    mover: Int[AnyArray, " f"]
+    """What a facet moves with, if it stands elsewhere than the mesh says: the corners of a body that hang together."""
+
+
+@pytree
+class Outline:
+    """The sides of all facets: a point of the plane lies inside where inward . point >= offset for all four."""
+
+    inward: Float[AnyArray, "f 4 3"]
+    """Unit vectors in the plane, world frame; zero for a side of no length."""
+    offset: Float[AnyArray, "f 4"]
+    """Metres."""
+
+
+def facets_from_mesh(mesh: Mesh) -> Facets:
+    """Returns the facets of a mesh, which is `repaired` first, as float64 and int32 NumPy arrays, the largest first; a mesh
+    without any surface is a `UserError`."""
+    points, index = _weld(np.asarray(mesh.vertices, np.float64))
+    part_and_material = np.column_stack([np.asarray(mesh.part), np.asarray(mesh.material)])
+    pieces, piece = np.unique(part_and_material, axis=0, return_inverse=True)
+    triangles, kept = repaired(points, index[np.asarray(mesh.faces)], piece.reshape(-1))
+    piece = piece.reshape(-1)[kept]
+    material = pieces[piece, 1]
+    body = _bodies(triangles, piece, pieces[:, 1])
+    mover = _movers(triangles, body)
+    normal, area = _normals(points, triangles)
+    keep = area > SMALLEST_AREA
+    if not keep.any():
+        raise UserError("the mesh has no triangle with an area; leave the mesh out, or give one with surfaces")
+    triangles, normal, body, material, mover = (a[keep] for a in (triangles, normal, body, material, mover))
+    polygons: list[Polygon] = []
+    first = []  # triangle of every polygon's plane
+    for group in _coplanar(triangles, normal, body):
+        merged = _merge(points, triangles[group].tolist(), normal[group[0]])
+        polygons += merged
+        first += [group[0]] * len(merged)
+    rows = [polygon + polygon[-1:] * (CORNERS - len(polygon)) for polygon in polygons]
+    corners = points[np.array(rows, int).reshape(-1, CORNERS)]
+    normals, sizes = _polygon_normals(corners)
+    order = np.argsort(-sizes, kind="stable")
+    owner = np.array(first, int)[order]
+    offset = np.sum(normals[order] * corners[order].mean(1), -1)
+    _, hangs_with = np.unique(mover[owner], return_inverse=True)
+    numbers = (values.astype(np.int32) for values in (body[owner], material[owner], hangs_with.reshape(-1)))
+    return Facets(corners[order], normals[order], offset, *numbers)
+
+
+def centres(facets: Facets, movers: int) -> Float[Array, "m 3"]:
+    """Returns the centres that the movers of the facets turn about: the means of their facets' corners."""
+    start = jnp.zeros((movers, 3)), jnp.zeros((movers, 1))
+    total = start[0].at[facets.mover].add(jnp.mean(jnp.asarray(facets.corners, jnp.float32), 1))
+    return total / jnp.maximum(start[1].at[facets.mover].add(1), 1)
+
+
+def moved(facets: Facets, shift: Float[np.ndarray, "m 3"], turn: Float[np.ndarray, "m 3"]) -> Facets:
+    """Returns the facets with their movers turned about their centres (rotation vectors, radians) and shifted (metres)."""
+    mover, corners = np.asarray(facets.mover), np.asarray(facets.corners, np.float64)
+    centre, rotation = np.asarray(centres(facets, len(shift)), np.float64)[mover], Rotation.from_rotvec(turn[mover])
+    arms = corners - centre[:, None]
+    turned = np.stack([rotation.apply(arms[:, k]) for k in range(CORNERS)], 1)
+    corners = centre[:, None] + turned + np.asarray(shift, np.float64)[mover][:, None]
+    normal = rotation.apply(np.asarray(facets.normal, np.float64))
+    return dataclasses.replace(facets, corners=corners, normal=normal, offset=np.sum(normal * corners.mean(1), -1))
+
+
+def remaining(facets: Facets, movers: Int[np.ndarray, " k"]) -> Facets:
+    """Returns the facets of some movers (ascending), which are numbered anew in their order."""
+    own = np.isin(np.asarray(facets.mover), movers)
+    left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], facets)
+    return dataclasses.replace(left, mover=np.searchsorted(movers, left.mover).astype(np.int32))
+
+
+def outline_of(facets: Facets) -> Outline:
+    """Returns the sides of all facets (float64). Where two facets meet, one of them ends `WELD` before the other begins: what
+    hits the seam, as in rooms of round numbers, hits one of them."""
+    corners = np.asarray(facets.corners, np.float64)
+    along = np.roll(corners, -1, 1) - corners
+    inward = np.cross(np.asarray(facets.normal)[:, None], along)
+    length = np.linalg.norm(inward, axis=-1, keepdims=True)
+    inward = np.where(length > WELD, inward / np.maximum(length, WELD), 0)
+    first = np.take_along_axis(inward, np.argmax(np.abs(inward) > FLAT, -1)[..., None], -1)[..., 0]
+    return Outline(inward, np.sum(inward * corners, -1) + WELD * (first < 0))
+
+
+def areas(facets: Facets) -> Float[np.ndarray, " f"]:
+    """Returns the areas of all facets in square metres."""
+    return _polygon_normals(np.asarray(facets.corners))[1]
+
+
+def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, " v"]]:
+    """Returns the corners without duplicates, and the new index of every vertex."""
+    different, which = np.unique(vertices, axis=0, return_inverse=True)  # at once: pairs of equal ones may be many
+    pairs = cKDTree(different).query_pairs(WELD, output_type="ndarray")
+    index = components(len(different), pairs[:, 0], pairs[:, 1])[which.reshape(-1)]
+    _, first = np.unique(index, return_index=True)
+    return vertices[first], index
+
+
+def _bodies(
+    triangles: Int[np.ndarray, "t 3"], piece: Int[np.ndarray, " t"], material: Int[np.ndarray, " pieces"]
+) -> Int[np.ndarray, " t"]:
+    """Returns the body of every triangle: its piece, which is what one part has of one material, or all open pieces of its
+    material that meet in corners of their borders.
+
+    A piece is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
+    blocks of one object that touch along an edge share it four times, and are closed.)
+    """
+    owner, side = np.repeat(piece, 3), sides(triangles)
+    _, first, count = np.unique(names(owner, side), return_index=True, return_counts=True)
+    border = first[(count % 2 == 1) & (side[first, 0] != side[first, 1])]
+    owner, corner = np.repeat(owner[border], 2), side[border].reshape(-1)
+    _, shared = np.unique(np.column_stack([material[owner], corner]), axis=0, return_inverse=True)
+    # A graph whose nodes are the pieces, and behind them the corners of borders, one for each material that meets there.
+    label = components(len(material) + len(owner), owner, len(material) + shared.reshape(-1))
+    return label[piece]
+
+
+def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
+    """Returns the mover of every triangle: those of one body that are joined by common corners share it."""
+    _, node = np.unique(np.column_stack([np.repeat(body, 3), triangles.reshape(-1)]), axis=0, return_inverse=True)
+    node = node.reshape(-1, 3)
+    label = components(int(node.max(initial=-1)) + 1, node[:, [0, 1]].reshape(-1), node[:, [1, 2]].reshape(-1))
+    return label[node[:, 0]]
+
+
+def _normals(
+    points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[Float[np.ndarray, "t 3"], Float[np.ndarray, " t"]]:
+    """Returns unit normals and areas (square metres) of triangles."""
+    a, b, c = points[triangles].swapaxes(0, 1)
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=-1)
+    return cross / np.maximum(length, 1e-30)[:, None], length / 2
+
+
+def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
+    """Returns unit normals and areas (square metres) of polygons."""
+    cross = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    cross = np.where(
+        np.linalg.norm(corners[:, 3] - corners[:, 2], axis=-1, keepdims=True) < WELD,
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+        cross,
+    )
+    length = np.linalg.norm(cross, axis=-1)
+    return cross / np.maximum(length, 1e-30)[:, None], length / 2
+
+
+def _coplanar(
+    triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]
+) -> list[Int[np.ndarray, " k"]]:
+    """Returns the triangles of one body that share sides and a plane, as groups of indices."""
+    _, first, which = np.unique(names(np.repeat(body, 3), sides(triangles)), return_index=True, return_inverse=True)
+    owner = np.repeat(np.arange(len(triangles)), 3)
+    other = owner[first[which]]
+    flat = _parallel(normal[owner], normal[other])
+    label = components(len(triangles), owner[flat], other[flat])
+    by_group = np.argsort(label, kind="stable")
+    return np.split(by_group, np.flatnonzero(np.diff(label[by_group])) + 1)
+
+
+def _parallel(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Returns whether unit normals agree."""
+    return (np.linalg.norm(np.cross(a, b), axis=-1) < FLAT) & (np.sum(a * b, -1) > 0)
+
+
+def _merge(points: Float[np.ndarray, "w 3"], polygons: list[Polygon], normal: Float[np.ndarray, "3"]) -> list[Polygon]:
+    """Returns polygons with neighbours joined while the union is convex with at most four corners."""
+    merged = True
+    while merged:
+        merged = False
+        owner: dict[tuple[int, int], int] = {}
+        for i, polygon in enumerate(polygons):
+            for side in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+                owner[side] = i
+        used: set[int] = set()
+        joined: list[Polygon] = []
+        for (u, v), i in owner.items():
+            j = owner.get((v, u))
+            if j is None or i == j or i in used or j in used:
+                continue
+            union = _join(points, polygons[i], polygons[j], u, v, normal)
+            if union is not None:
+                joined.append(union)
+                used |= {i, j}
+                merged = True
+        polygons = [polygon for i, polygon in enumerate(polygons) if i not in used] + joined
+    return polygons
+
+
+def _join(
+    points: Float[np.ndarray, "w 3"], first: Polygon, second: Polygon, u: int, v: int, normal: Float[np.ndarray, "3"]
+) -> Polygon | None:
+    """Returns the union over the side u-v, without corners on straight lines; None unless convex with at most four corners."""
+    i, j = first.index(v), second.index(u)
+    ring = first[i:] + first[:i] + (second[j:] + second[:j])[1:-1]
+    corners = []
+    for before, here, after in zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1], strict=True):
+        a, b = points[here] - points[before], points[after] - points[here]
+        turn = np.cross(a, b) @ normal / (np.linalg.norm(a) * np.linalg.norm(b))
+        if turn < -FLAT:
+            return None
+        if turn > FLAT:
+            corners.append(here)
+    return corners if 3 <= len(corners) <= CORNERS else None

@@ -1,0 +1,88 @@
+"""Objects of OBJ files (Wavefront, appendix B of the Advanced Visualizer's manual): polygons alone.
+
+Corners count from 1, or backwards from the newest one if they are negative. Objects begin with `o`; where there is none, groups
+(`g`) are objects. Text in any encoding: names of one file only have to differ.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.mesh.bodies import Body
+from wbgs_jax.mesh.polygons import triangulate
+
+CURVED = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp"}
+"""Statements of curves and curved surfaces."""
+NAMED = re.compile(r"\s*((o|g|usemtl|mtllib)\s|#)")
+"""Statements of names, and comments: they are not continued in the next line."""
+COMMENT, REMARK = re.compile("#"), re.compile(r"(?:^|\s)#(?=\s|$)|^\s*#")
+"""What begins a comment; behind a name, which may hold the sign, it stands alone."""
+LINES = re.compile(r"\r\n|\r|\n")
+WIDE = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+
+def read_obj(file: Path) -> list[Body]:
+    """Returns the objects of a file; a curved surface, or a face of corners that are none, is a `UserError`."""
+    statements = list(_statements(_text(file.read_bytes())))
+    begins = "o" if any(words[0] == "o" for words in statements) else "g"
+    vertices: list[list[float]] = []
+    faces: dict[str, tuple[list[int], list[int]]] = {}
+    name = latest = file.stem
+    for number, words in enumerate(statements, 1):
+        match words[0]:
+            case "v":
+                vertices.append([float(word) for word in words[1:4]])
+            case "f" | "fo":  # as it was called before
+                corners = [_corner(word, len(vertices), file) for word in words[1:]]
+                own, sizes = faces.setdefault(name, ([], []))
+                own += corners
+                sizes.append(len(corners))
+            case "o" | "g" as kind:
+                latest = " ".join(words[1:]) or f"object_{number}"
+                name = latest if kind == begins else name
+            case "call":
+                raise UserError(f"{file} calls another file ({' '.join(words[1:])}); export it in one")
+            case kind if kind in CURVED:
+                raise UserError(f"object {latest!r} of {file} has a curved surface ({kind}); export it as polygons")
+    points = np.array(vertices, np.float64).reshape(-1, 3)
+    return [
+        Body(name, points, triangulate(points, np.array(own, int), np.array(sizes, int)))
+        for name, (own, sizes) in faces.items()
+    ]
+
+
+def _corner(word: str, count: int, file: Path) -> int:
+    """Returns the place of a vertex, "7", "7/1/2" or "-1"."""
+    number = int(word.split("/", 1)[0])
+    place = number - 1 if number > 0 else count + number
+    if number == 0 or place < 0:
+        raise UserError(f"{file} has a face with the corner {word!r}, which does not exist; export it again")
+    return place
+
+
+def _statements(text: str) -> Iterator[list[str]]:
+    """Gives the words of every statement, continued lines in one. Names may hold a `#`, and end with a backslash, as characters
+    of Shift-JIS and GBK do whose encoding is not known."""
+    begun = ""
+    for line in LINES.split(text):
+        whole = begun + line
+        kind = NAMED.match(whole)
+        if whole.endswith("\\") and not kind:
+            begun = whole[:-1] + " "
+            continue
+        begun = ""
+        if words := (REMARK if kind else COMMENT).split(whole, maxsplit=1)[0].split():
+            yield words
+
+
+def _text(content: bytes) -> str:
+    """Returns the text; bytes of no known encoding are kept apart from each other."""
+    coding = WIDE.get(content[:2], "utf-8-sig")
+    try:
+        text = content.decode(coding)
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.removeprefix("\ufeff")

@@ -1,0 +1,164 @@
+"""How good predicted spectra are, over all of them, by frequency and by sight: SSIM (scikit-image's), PSNR, MAE, beams."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from skimage.metrics import structural_similarity
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.radio.array import codebook, pas_directions
+
+FLAT = 1e-4
+"""Of an array's size: how far the elements of a planar one may stand out."""
+FAINTEST_DB = -60.0
+"""A beam that hears less than this, relative to the best one, hears nothing."""
+
+
+def angle_error_deg(
+    predicted: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    array_normal: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, " n"]:
+    """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
+
+    A planar array cannot tell its front from its back: with its normal, either will do.
+    """
+    directions = pas_directions().reshape(-1, 3)
+    a, b = (directions[spectra.reshape(len(spectra), -1).argmax(1)] for spectra in (predicted, truth))
+    twins = [a] if array_normal is None else [a, a - 2 * (a @ array_normal)[:, None] * array_normal]
+    angles = [np.arctan2(np.linalg.norm(np.cross(twin, b), axis=-1), (twin * b).sum(-1)) for twin in twins]
+    return np.degrees(np.min(angles, 0))
+
+
+def plane_normal(element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "3"] | None:
+    """Returns the unit normal of the plane that the elements of an array lie in; None if they lie in none, or in several."""
+    centred = element_positions - element_positions.mean(0)
+    if len(centred) < 3:
+        return None
+    _, sizes, axes = np.linalg.svd(centred.astype(np.float64), full_matrices=False)
+    flat = sizes < FLAT * max(sizes[0], 1e-12)
+    return axes[-1] if flat.tolist() == [False, False, True] else None
+
+
+def beam_loss_db(
+    predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], tried: int = 1
+) -> Float[np.ndarray, " n"]:
+    """Returns the power (dB, at least 0) that is lost against the codebook's best beam.
+
+    The `tried` beams that a predicted spectrum ranks highest are measured, and the best of them is used. A beam is a pixel of
+    the spectrum, which is an amplitude: power is its square.
+    """
+    expected, heard = (spectra.reshape(len(spectra), -1)[:, codebook()] for spectra in (predicted, truth))
+    ranked = np.argsort(-expected, axis=1, kind="stable")[:, :tried]
+    used = np.take_along_axis(heard, ranked, 1).max(1).astype(np.float64)
+    best = heard.max(1).astype(np.float64)
+    ratio = np.where(best > 0, used / np.where(best > 0, best, 1), 1)
+    return -20 * np.log10(np.maximum(ratio, 10 ** (FAINTEST_DB / 20)))
+
+
+PSNR_LIMIT_DB = 100.0
+"""PSNR of a perfect prediction, which would be infinite and fit no report."""
+
+
+def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
+    """Returns the structural similarity of every spectrum, float64: scikit-image, data_range 1, its default 7 x 7 window."""
+    pairs = zip(predicted, truth, strict=True)
+    return np.array([structural_similarity(p.astype(np.float64), t.astype(np.float64), data_range=1.0) for p, t in pairs])
+
+
+def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
+    """Returns the mean absolute error of every spectrum, float64."""
+    pairs = zip(predicted, truth, strict=True)  # one by one: float64 copies of a whole scene are gigabytes
+    return np.array([np.mean(np.abs(p.astype(np.float64) - t)) for p, t in pairs])
+
+
+def psnr_db(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
+    """Returns the peak signal-to-noise ratio (dB, peak 1) of every spectrum, float64, at most `PSNR_LIMIT_DB`."""
+    pairs = zip(predicted, truth, strict=True)
+    error = np.array([np.mean((p.astype(np.float64) - t) ** 2) for p, t in pairs])
+    return -10 * np.log10(np.maximum(error, 10 ** (-PSNR_LIMIT_DB / 10)))
+
+
+def score(
+    predicted: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    frequencies_hz: Float[np.ndarray, " n"],
+    sight: Bool[np.ndarray, " n"] | None = None,
+    array_normal: Float[np.ndarray, "3"] | None = None,
+) -> dict[str, Any]:
+    """Returns a report of predicted spectra, ready for JSON.
+
+    Args:
+        predicted: spectra in 0..1.
+        truth: what was observed.
+        frequencies_hz: of every spectrum.
+        sight: whether the receiver sees the transmitter, where that is known.
+        array_normal: of a planar array, which cannot tell its front from its back.
+
+    Returns:
+        n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
+        strongest direction (median); beam_loss_db and beam_loss_top3_db, the power lost by using the best of one or three
+        predicted beams (means, `beams.py`). The same figures in per_frequency, a list by ascending frequency_ghz, and in
+        in_sight and out_of_sight, where `sight` is given and there are such spectra.
+
+    Raises:
+        UserError: there is no spectrum, or a prediction contains NaN or infinity.
+    """
+    return summarise(figures(predicted, truth, array_normal), frequencies_hz, sight)
+
+
+def figures(
+    predicted: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    array_normal: Float[np.ndarray, "3"] | None = None,
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """Returns what `score` reports of every spectrum by itself; raises what it raises."""
+    if len(predicted) == 0:
+        raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
+    if broken := sum(not np.isfinite(p).all() for p in predicted):
+        raise UserError(f"{broken} of {len(predicted)} predicted spectra contain NaN or infinity; the model diverged")
+    return {
+        "ssim": ssim(predicted, truth),
+        "psnr_db": psnr_db(predicted, truth),
+        "mae": mae(predicted, truth),
+        "angle_error_deg": angle_error_deg(predicted, truth, array_normal),
+        "beam_loss_db": beam_loss_db(predicted, truth),
+        "beam_loss_top3_db": beam_loss_db(predicted, truth, 3),
+    }
+
+
+def summarise(
+    values: dict[str, Float[np.ndarray, " n"]],
+    frequencies_hz: Float[np.ndarray, " n"],
+    sight: Bool[np.ndarray, " n"] | None = None,
+    receiver: Int[np.ndarray, " n"] | None = None,
+) -> dict[str, Any]:
+    """Returns the report of `score` from the figures of all spectra; of several receivers, where their numbers are given, with
+    the same figures in per_receiver."""
+
+    def part(chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]:
+        return _summary({name: value[chosen] for name, value in values.items()})
+
+    report = _summary(values)
+    if sight is not None:
+        report |= {name: part(where) for name, where in (("in_sight", sight), ("out_of_sight", ~sight)) if where.any()}
+    if receiver is not None and len(numbers := np.unique(receiver)) > 1:
+        report["per_receiver"] = [{"receiver": int(number)} | part(receiver == number) for number in numbers]
+    by_frequency = ((f, part(frequencies_hz == f)) for f in np.unique(frequencies_hz))
+    return report | {"per_frequency": [{"frequency_ghz": float(f / 1e9)} | summary for f, summary in by_frequency]}
+
+
+def _summary(values: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {
+        "n": len(values["ssim"]),
+        "median_ssim": float(np.median(values["ssim"])),
+        "mean_ssim": float(np.mean(values["ssim"])),
+        "p5_ssim": float(np.percentile(values["ssim"], 5)),
+        "p10_ssim": float(np.percentile(values["ssim"], 10)),
+        "psnr_db": float(np.median(values["psnr_db"])),
+        "mae": float(np.mean(values["mae"])),
+        "angle_error_deg": float(np.median(values["angle_error_deg"])),
+        "beam_loss_db": float(np.mean(values["beam_loss_db"])),
+        "beam_loss_top3_db": float(np.mean(values["beam_loss_top3_db"])),
+    }

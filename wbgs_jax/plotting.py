@@ -1,0 +1,363 @@
+"""Pictures of a run: spectra (rectangular and polar), curves, SSIM by frequency. Written as PNG files, atomically."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from wbgs_jax import metrics
+from wbgs_jax._util.files import atomic_write
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.floor_plan import Walls
+from wbgs_jax.data.rssi_folder import Readings
+from wbgs_jax.inference.answers import point_words
+from wbgs_jax.inference.queries import Queries, shown_rows
+from wbgs_jax.power_map.model import PowerMap, received_power
+from wbgs_jax.radio.channel import NOT_HEARD_DB
+
+SHOWN = 6
+"""Spectra in a picture."""
+LONGEST_ARROW = 0.1
+"""Of the scene's size."""
+SIZES = ("gaussians",)
+"""Sizes of a field that change during training."""
+
+
+def draw_all(
+    folder: Path,
+    dataset: Dataset,
+    index: Int[np.ndarray, " n"],
+    predicted: Float[np.ndarray, "n 90 360"],
+    report: dict[str, Any],
+    curves: list[dict[str, Any]],
+) -> list[Path]:
+    """Draws predicted spectra of some links, the report and the curves of a training into a folder; returns the files."""
+    chosen = spread(dataset, index)
+    truth, shown = np.asarray(dataset.pas(index[chosen])), predicted[chosen]
+    titles = [_title(dataset, i) for i in index[chosen].tolist()]
+    figures = {
+        "spectra.png": draw_spectra(truth, shown, titles),
+        "spectra_polar.png": draw_polar(truth, shown, titles),
+        "ssim_by_frequency.png": draw_frequencies(report),
+    }
+    if curves:
+        figures["curves.png"] = draw_curves(curves)
+    return [_save(figure, folder / name) for name, figure in figures.items()]
+
+
+def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
+    """Returns places in `index` of a spread of frequencies, at different transmitters where there are enough."""
+    frequencies = np.unique(dataset.frequencies_hz[index])
+    rng = np.random.default_rng(0)
+    chosen: list[int] = []
+    for frequency in frequencies[np.linspace(0, len(frequencies) - 1, min(count, len(index))).round().astype(int)]:
+        candidates = np.flatnonzero(dataset.frequencies_hz[index] == frequency)
+        used = dataset.tx_index[index[np.array(chosen, int)]]
+        fresh = candidates[~np.isin(dataset.tx_index[index[candidates]], used)]
+        chosen.append(int(rng.choice(fresh if len(fresh) else candidates)))
+    return np.array(chosen)
+
+
+def _title(dataset: Dataset, index: int) -> str:
+    x, y, z = dataset.tx_positions[index]
+    return f"{dataset.frequencies_hz[index] / 1e9:g} GHz, TX ({x:.1f}, {y:.1f}, {z:.1f}) m"
+
+
+def draw_spectra(truth: Float[np.ndarray, "k 90 360"], predicted: Float[np.ndarray, "k 90 360"], titles: list[str]) -> Figure:
+    """Returns truth, prediction and absolute error over azimuth and zenith, one row a spectrum."""
+    figure = Figure(figsize=(13, 1.75 * len(truth) + 0.6), layout="constrained")
+    axes = figure.subplots(len(truth), 3, squeeze=False)
+    ssim = metrics.ssim(predicted, truth)
+    for row, (a, b, title, score) in enumerate(zip(truth, predicted, titles, ssim, strict=True)):
+        images = (a, b, np.abs(a - b))
+        labels = (f"truth: {title}", f"prediction: SSIM {score:.3f}", f"|error|: mean {images[2].mean():.3f}")
+        for axis, image, label in zip(axes[row], images, labels, strict=True):
+            shown = axis.imshow(image, vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
+            axis.set_title(label, fontsize=9)
+            axis.set_xticks(range(-180, 181, 90))
+            axis.set_yticks((0, 45, 90))
+        axes[row, 0].set_ylabel("zenith [deg]")
+    for axis in axes[-1]:
+        axis.set_xlabel("azimuth [deg]")
+    figure.colorbar(shown, ax=axes, shrink=0.5, label="normalised amplitude")
+    return figure
+
+
+def draw_polar(truth: Float[np.ndarray, "k 90 360"], predicted: Float[np.ndarray, "k 90 360"], titles: list[str]) -> Figure:
+    """Returns the receiver's hemisphere seen from above: the zenith in the middle, the horizon at the rim."""
+    figure = Figure(figsize=(2.6 * len(truth), 5.8), layout="constrained")
+    axes = figure.subplots(2, len(truth), squeeze=False, subplot_kw={"projection": "polar"})
+    azimuth, zenith = np.linspace(-np.pi, np.pi, 360), np.linspace(0, 90, 90)
+    for row, (label, images) in enumerate((("truth", truth), ("prediction", predicted))):
+        for axis, image, title in zip(axes[row], images, titles, strict=True):
+            axis.grid(False)
+            shown = axis.pcolormesh(azimuth, zenith, image, vmin=0, vmax=1, cmap="viridis", shading="nearest", rasterized=True)
+            axis.set_title(f"{label}\n{title.replace(', TX', chr(10) + 'TX')}" if row == 0 else label, fontsize=8)
+            axis.set_yticks([])
+            axis.set_xticks(np.deg2rad((0, 90, 180, 270)))
+            axis.tick_params(labelsize=7)
+    figure.colorbar(shown, ax=axes, shrink=0.6, label="normalised amplitude")
+    return figure
+
+
+def draw_curves(entries: list[dict[str, Any]]) -> Figure:
+    """Returns loss, metrics of the batches and of held-out links, and the sizes that change, over the steps."""
+    steps = [e for e in entries if "loss" in e]
+    held_out = sorted({name for e in steps for name in e if name.startswith("held_out")})
+    sizes = [name for name in SIZES if any(name in e for e in steps)]
+    figure = Figure(figsize=(13 if sizes else 9, 3.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, 3 if sizes else 2))
+    axes[0].plot([e["step"] for e in steps], [e["loss"] for e in steps], color="C0")
+    axes[0].set(title="training loss", xlabel="step")
+    batch = [(e["step"], e["batch_ssim"]) for e in steps if e.get("batch_ssim") is not None]
+    if batch:
+        axes[1].plot(*zip(*batch, strict=True), color="C0", alpha=0.6, label="training batches: mean SSIM (11x11)")
+    for name in held_out:
+        points = [(e["step"], e[name]) for e in steps if name in e]
+        label = "held-out sample: median SSIM (7x7)" if name == "held_out_ssim" else name.replace("_", " ")
+        axes[1].plot(*zip(*points, strict=True), "o-", color="C3", label=label)
+    axes[1].set(title="how good it is", xlabel="step")
+    if batch or held_out:
+        axes[1].legend(fontsize=8)
+    for name in sizes:
+        axes[2].plot([e["step"] for e in steps], [e.get(name) for e in steps], color="C2")
+        axes[2].set(title=name, xlabel="step", ylim=(0, None))
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[np.ndarray, "f 3"]) -> Path:
+    """Draws how far a training has moved the surfaces of a mesh, seen from above and from the side; returns the file."""
+    figure = Figure(figsize=(10, 7), layout="constrained")
+    axes, size = figure.subplots(2, 1), 1e3 * np.linalg.norm(shift, axis=-1)
+    colours = colormaps["viridis"](size / max(size.max(), 1e-9))
+    different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # what moves alike is one thing
+    centre = np.array([corners[body.reshape(-1) == k].mean((0, 1)) for k in range(len(different))])
+    longest = LONGEST_ARROW * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
+    for axis, (i, j), name in zip(axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
+        outlines = np.concatenate([corners, corners[:, :1]], 1)[..., [i, j]]
+        axis.add_collection(LineCollection(list(outlines), colors=colours, linewidths=0.8))
+        arrows = *centre[:, [i, j]].T, *(longest * different[:, [i, j]].T)
+        axis.quiver(*arrows, color=colours[first], angles="xy", scale_units="xy", scale=1)
+        axis.set(
+            title=f"{name} (arrows {longest:.0f} times too long)", xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal"
+        )
+        axis.autoscale_view()
+    shown = ScalarMappable(Normalize(0, size.max()), "viridis")
+    figure.colorbar(shown, ax=axes, label="moved by [mm]", shrink=0.8)
+    return _save(figure, folder / "surfaces_moved.png")
+
+
+def draw_frequencies(report: dict[str, Any]) -> Figure:
+    """Returns the median SSIM by frequency of the field and of every baseline."""
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    axis = figure.subplots()
+    series = {report["field"]: report} | {name.replace("_", " "): r for name, r in report["baselines"].items()}
+    for i, (name, result) in enumerate(series.items()):
+        rows = result["per_frequency"]
+        style: dict[str, Any] = {"lw": 2.5, "marker": "o"} if i == 0 else {"lw": 1.2, "marker": ".", "ls": "--"}
+        label = f"{name}: {result['median_ssim']:.3f}"
+        axis.plot([r["frequency_ghz"] for r in rows], [r["median_ssim"] for r in rows], label=label, **style)
+    ticks = [r["frequency_ghz"] for r in report["per_frequency"]]
+    axis.set(
+        xscale="log", xlabel="frequency [GHz]", ylabel="median SSIM", title=f"{report['scene']}: held-out spectra", ylim=(0, 1)
+    )
+    axis.set_xticks(ticks, [f"{t:g}" for t in ticks], fontsize=8, rotation=45)
+    axis.minorticks_off()
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, title="overall median", title_fontsize=8)
+    return figure
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    with atomic_write(path) as stream:
+        figure.savefig(stream, format="png", dpi=110)
+    return path
+
+
+COLORS = "viridis"
+LABELS = {
+    "power_db": "received power [dB of the transmitted]",
+    "beamforming_gain_db": "beamforming gain [dB]",
+    "k_factor_db": "K-factor [dB]",
+    "angular_spread_deg": "spread of the azimuth of arrival [deg]",
+    "delay_spread_s": "r.m.s. delay spread [ns]",
+}
+NANO = 1e9
+
+
+def draw_answers(
+    pas: Float[np.ndarray, "n 90 360"], tx_positions: Float[np.ndarray, "n 3"], frequencies_hz: Float[np.ndarray, " n"]
+) -> Figure:
+    """Returns a figure of spectra over azimuth and zenith, two in a row."""
+    columns = min(2, len(pas))
+    rows = -(-len(pas) // columns)
+    figure = Figure(figsize=(5.5 * columns, 1.9 * rows + 0.5), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for i, axis in enumerate(axes.flat):
+        if i >= len(pas):
+            axis.axis("off")
+            continue
+        shown = axis.imshow(pas[i], vmin=0, vmax=1, cmap=COLORS, extent=(-180, 180, 90, 0), aspect="auto")
+        axis.set_title(f"{frequencies_hz[i] / 1e9:.4g} GHz, TX {point_words(tx_positions[i])}", fontsize=9)
+        axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
+    figure.supxlabel("azimuth [deg]", fontsize=9)
+    figure.supylabel("zenith [deg]", fontsize=9)
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="normalised amplitude")
+    return figure
+
+
+def draw_sweeps(name: str, values: Float[np.ndarray, " *shape"], queries: Queries) -> Figure:
+    """Returns a figure of a quantity: over the frequency where there are more of these than transmitters, a curve each; else
+    over the distance from the first transmitter along the way to the last; of single queries over their numbers."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    values = values * NANO if name == "delay_spread_s" else values
+    values = values.reshape(*queries.shape, -1)[..., 0]
+    if queries.paired:
+        curves, places, legend = values[None], np.arange(1, len(queries) + 1.0), [""]
+        axis.set_xlabel("query")
+    elif len(queries.frequencies_hz) > len(queries.tx_positions):
+        curves, places = values, queries.frequencies_hz / 1e9
+        legend = [f"TX {point_words(tx)}" for tx in queries.tx_positions]
+        axis.set(xlabel="frequency [GHz]", xscale="log")
+    else:
+        steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
+        curves, places = values.T, np.concatenate([[0.0], np.cumsum(steps)])
+        legend = [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
+        axis.set_xlabel("distance along the transmitters [m]")
+    chosen = shown_rows(len(curves))
+    for share, number in zip(np.linspace(0, 0.9, len(chosen)), chosen, strict=True):
+        axis.plot(places, curves[number], ".-", ms=3, lw=1, label=legend[number], color=colormaps[COLORS](share))
+    if legend != [""]:
+        axis.legend(fontsize=8)
+    axis.set_ylabel(LABELS.get(name, name))
+    axis.grid(alpha=0.3)
+    return figure
+
+
+SHOWN_MAPS = 6
+"""Frequencies in a picture."""
+
+
+class Look(NamedTuple):
+    """How a quantity is drawn."""
+
+    name: str
+    """In the answer."""
+    label: str
+    scale: float = 1.0
+    """Drawn units in one of the answer's."""
+    colors: str = "viridis"
+
+
+LOOKS: dict[str, Look] = {
+    "power": Look("power_db", "received power [dB of the transmitted]"),
+    "best-beam": Look("best_beam", "azimuth of the best beam [deg]", colors="twilight"),
+    "k-factor": Look("k_factor_db", "K-factor [dB]"),
+    "delay-spread": Look("delay_spread_s", "r.m.s. delay spread [ns]", 1e9),
+    "angular-spread": Look("angular_spread_deg", "spread of the azimuth of arrival [deg]"),
+}
+
+
+def draw_maps(
+    what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
+) -> Figure:
+    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star."""
+    look, xs, ys = LOOKS[what], answer["xs"], answer["ys"]
+    values = _drawn(look, answer)[:SHOWN_MAPS]
+    half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
+    extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
+    wide = extent[1] - extent[0] > extent[3] - extent[2]
+    rows, columns = (len(values), 1) if wide and len(values) < 4 else (-(-len(values) // 2), min(2, len(values)))
+    ratio = (extent[3] - extent[2]) / (extent[1] - extent[0])
+    figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
+    for i, axis in enumerate(axes.flat):
+        if i >= len(values):
+            axis.axis("off")
+            continue
+        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=look.colors, aspect="equal", **span)
+        axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
+        axis.plot(*rx[:2], "*", color="white", markeredgecolor="black", markersize=14)
+        axis.set(xlim=extent[:2], ylim=extent[2:])
+        axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
+    figure.supxlabel("x [m]", fontsize=9)
+    figure.supylabel("y [m]", fontsize=9)
+    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{look.label}, transmitters {answer['height']:.3g} m high")
+    return figure
+
+
+def _drawn(look: Look, answer: dict[str, np.ndarray]) -> Float[np.ndarray, "freq ny nx"]:
+    values = answer[look.name]
+    if look.name == "best_beam":
+        return answer["beam_azimuth_deg"][values]
+    heard = values > NOT_HEARD_DB if look.name == "power_db" else np.ones(values.shape, bool)
+    drawn = look.scale * np.where(heard, values, np.nan)
+    return drawn[..., 0] if drawn.ndim > 3 else drawn
+
+
+def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
+    """Returns limits of the colours that leave out the extreme hundredths."""
+    low, high = np.nanquantile(values, [0.01, 0.99])
+    return {"vmin": float(low), "vmax": float(high)}
+
+
+SPACING, MARGIN = 0.1, 0.3
+"""Metres: of the pixels, and around all that is drawn."""
+PIXELS = 40_000
+"""At most; spacings grow with larger plans."""
+AT_ONCE = 2048
+SHOWN_RECEIVERS = 12
+"""Receivers in a picture."""
+COLUMNS = 3
+
+
+def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
+    """Returns a figure with the map of every receiver at the median height of what was measured, walls, and the cells."""
+    height = float(np.median(cells.places[:, 2]))
+    outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
+    low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
+    spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / PIXELS)))
+    x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
+    powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
+    shown = min(SHOWN_RECEIVERS, len(cells.receivers))
+    columns, rows = min(COLUMNS, shown), -(-shown // COLUMNS)
+    size = (high - low) / max(high - low)
+    figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    span = {"vmin": float(powers[:, :shown].min()), "vmax": float(powers[:, :shown].max())}
+    for r, axis in enumerate(axes.flat):
+        if r >= shown:
+            axis.axis("off")
+            continue
+        extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
+        image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap="viridis", **span)
+        _plan(axis, walls, cells.places)
+        axis.plot(*cells.receivers[r, :2], "*", color="white", markeredgecolor="black", markersize=14)
+        axis.set_title(f"receiver {r + 1}", fontsize=10)
+    figure.supxlabel("x [m]", fontsize=9)
+    figure.supylabel("y [m]", fontsize=9)
+    figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
+    return figure
+
+
+def _plan(axis: Axes, walls: Walls, places: Float[np.ndarray, "n 3"]) -> None:
+    for wall in np.asarray(walls.ends):
+        axis.plot(wall[:, 0], wall[:, 1], color="black", linewidth=1.2)
+    axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
+
+
+def _powers(learned: PowerMap, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n r"]:
+    blocks = np.array_split(places, -(-len(places) // AT_ONCE))
+    return np.concatenate([np.asarray(received_power(learned, jnp.asarray(block, jnp.float32))[0]) for block in blocks])

@@ -1,0 +1,1 @@
+"""Maps of received power, learned from readings."""

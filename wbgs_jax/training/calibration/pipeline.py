@@ -1,0 +1,182 @@
+"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, bodies that are not
+there, idealisations, tuning, places, clutter.
+
+The first two are a choice among known ones by how well they explain some training spectra; bodies without which spectra are
+explained better are left out of the mesh; surfaces are moved where it is doubtful, and how far they may still be off is
+guessed. Training goes on from there.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from wbgs_jax._util.pytree import same
+from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields import Field
+from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
+from wbgs_jax.training.calibration.alignment import Place, learn_geometry
+from wbgs_jax.training.calibration.antennas import search_antennas
+from wbgs_jax.training.calibration.array_gains import search_tuning
+from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
+from wbgs_jax.training.calibration.objective import Scores, Told
+from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
+from wbgs_jax.training.calibration.propagation_options import search_idealisations
+from wbgs_jax.training.calibration.thickness import search_slabs
+from wbgs_jax.training.calibration.uncertainty import search_placement
+from wbgs_jax.training.hooks import Context, Edit, Say
+
+GAINS_DB = (100.0, 5.0), (5.0, 0.5)
+"""How far a gain may be from the one before, and the steps in which it is tried."""
+ROOMS_DB = -40.0, 10.0
+"""What rooms do to received powers beyond free space, in the median. Snapshots whose powers are not among these are in a unit
+of their own, as measured voltages are; what is less far off, gradients find."""
+SWEEPS = 2
+"""Times that antennas are searched anew after materials are named, at most."""
+
+
+def search_gain(params: Any, score: Scores, gain: float = 0.0) -> tuple[Any, float]:
+    """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB), near one
+    that is given: nobody may have said what was transmitted."""
+    for reach, step in GAINS_DB:
+        tried = gain + np.arange(-reach, reach + step, step)
+        candidates = [dataclasses.replace(params, log_gain=jnp.asarray(db * np.log(10) / 20, jnp.float32)) for db in tried]
+        best = int(np.argmin(score(candidates).mean(1)))
+        params, gain = candidates[best], float(tried[best])
+    return params, gain
+
+
+def unusual_level(told: Told) -> float:
+    """Returns the median of received powers beyond free space (dB), if no room explains it; else zero."""
+    assert told.data.snapshots is not None, "asked of snapshots"
+    snapshots, links = jax.tree.map(lambda leaf: leaf[told.spectra], (told.data.snapshots, told.data.links))
+    rx = told.data.receivers.position[links.receiver_index]
+    power, query = received_power_db(snapshots), links.query
+    beyond = np.asarray(beyond_free_space_db(power, query.tx_position, rx, query.frequency_hz))
+    heard = np.asarray(snapshots).any(-1)
+    level = float(np.median(beyond[heard])) if heard.any() else 0.0
+    return 0.0 if ROOMS_DB[0] <= level <= ROOMS_DB[1] else level
+
+
+@dataclass(frozen=True)
+class Search:
+    """The host control of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
+
+    config: SearchConfig
+    stream: int = 6
+
+    def statistics(self, params: Any) -> tuple[()]:
+        """Returns nothing: it watches no step."""
+        return ()
+
+    def accumulate(self, statistics: tuple[()], gradients: Any, probe: Any) -> tuple[()]:
+        """Returns nothing."""
+        return ()
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether it is before the first step."""
+        return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
+
+    def next_size(self, params: Any, step: int, steps: int) -> None:
+        """Returns None: the search is over before an epoch is compiled."""
+
+    def apply(
+        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
+        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
+        bodies that are not there and with its surfaces moved if the mesh is doubtful."""
+        config, data, cache, say = self.config, context.data, context.cache, context.say
+        spectra = rng.permutation(context.train)
+        report: dict[str, Any] = {}
+        told = Told(field, cache, data, spectra)
+        if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
+            say("search: gain and materials")
+            params, gain = search_gain(params, told.scores(config.spectra))
+            if config.rounds:
+                params, named = search_materials(params, told, config.spectra, config, usual=True)
+                params, gain = search_gain(params, told.scores(config.spectra))
+                report["search"] = dataclasses.asdict(named)
+            return Edit(params, (), None, report | {"gain_db": gain}, field, cache)
+        if config.antenna_rounds:
+            say("search: antennas")
+            params, _ = self._antennas(params, told, report)
+        if config.rounds:
+            say("search: materials")
+            params, named, _ = search_slabs(params, told, config, config.spectra)
+            report["search"] = dataclasses.asdict(named)
+            if config.absent_spectra and data.snapshots is not None:
+                params, told, absent = search_absent(params, told, config, say)
+                report["absent"] = dataclasses.asdict(absent)
+                if absent.centres:
+                    field, cache = told.field, told.cache
+                    params, named, _ = search_slabs(params, told, config, config.spectra)
+                    report["search"] = dataclasses.asdict(named)
+            say("search: idealisations")
+            for _ in range(SWEEPS):
+                params = self._idealisations(params, told, report)
+                params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
+                if not changed:
+                    break
+                params, _ = search_materials(params, told, config.ideal_spectra, config)
+            say("search: how far surfaces may be off")
+            _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
+            report["doubt"] = dataclasses.asdict(guessed)
+            field = self._tuning(params, told, report)
+            told = dataclasses.replace(told, field=field)
+            if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
+                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
+                report["geometry"] = dataclasses.asdict(moved)
+                if "antennas" in report:  # what is in it may have been dropped since
+                    found = report["antennas"]["taken"].items()
+                    kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
+                    report["antennas"]["taken"] = kept
+                params, field, cache = place.params, place.field, place.cache
+                told = Told(field, cache, data, spectra)
+                field = self._tuning(params, told, report)
+                told = dataclasses.replace(told, field=field)
+            params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
+            report["placement"] = dataclasses.asdict(guessed)
+            params, field = self._clutter(params, told, report, rng, say)
+            thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
+            report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # named again since then
+        if data.snapshots is not None and (level := unusual_level(told)):
+            told = dataclasses.replace(told, field=field)  # which may know of clutter since
+            params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
+        return Edit(params, (), None, report, field, cache)
+
+    def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
+        """Returns parameters with the antennas that are found, and whether there are any."""
+        count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
+        params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
+        before = report.get("antennas", dataclasses.asdict(found))
+        report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
+        return params, bool(found.taken)
+
+    def _tuning(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+        """Returns the field with arrays that are out of tune as spectra say, which takes two transmitters."""
+        count = self.config.tuning_spectra
+        if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
+            return told.field
+        field, found = search_tuning(params, told, count)
+        report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
+        return field
+
+    def _clutter(self, params: Any, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say) -> tuple[Any, Any]:
+        """Returns parameters and field with what stands in the way and is not in the mesh."""
+        if not self.config.clutter_spectra:
+            return params, told.field
+        say("search: what the mesh lacks")
+        params, told, found = search_clutter(params, told, self.config, rng)
+        if found:
+            report["clutter"] = dataclasses.asdict(found)
+        return params, told.field
+
+    def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+        """Returns parameters without the idealisations that spectra contradict."""
+        params, found = search_idealisations(params, told, self.config)
+        named = {name: dataclasses.asdict(one) for name, one in found.items()}
+        report["idealisations"] = report.get("idealisations", {}) | named
+        return params

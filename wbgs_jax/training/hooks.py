@@ -1,0 +1,153 @@
+"""Host controls: what is done to a field between jitted epochs. All are alike to the loop.
+
+A field asks for controls by name (`Field.controls`); the settings section of that name switches one on. A control may watch
+every step (`statistics` and `accumulate` are pure and run inside the epoch) and change parameters between epochs (`apply` runs
+on the host). It says how whatever is stored beside the parameters, such as optimiser moments, follows.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import numpy as np
+import optax
+
+from wbgs_jax._util.pytree import replaced
+from wbgs_jax.fields import Field
+from wbgs_jax.training.batches import TrainingData
+
+Say = Callable[[str], None]
+"""Told what long work turns to next; raises where it is to stop."""
+
+
+def silent(stage: str) -> None:
+    """Tells nobody."""
+
+
+class Edit(NamedTuple):
+    """What a control did."""
+
+    params: Any
+    statistics: Any
+    """What the control has watched, from here on."""
+    moments: Callable[[Any], Any] | None
+    """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
+    report: dict[str, Any]
+    """For metrics.jsonl; nothing is written if it is empty."""
+    field: Field | None = None
+    """The field where it is another one now, ..."""
+    cache: Any = None
+    """... and what it knows of the links."""
+    growth: float = 1.0
+    """How much more room the field needs than before."""
+
+
+class Context(NamedTuple):
+    """What a control may look at."""
+
+    data: TrainingData
+    cache: Any
+    """Of the field's `prepare`."""
+    train: np.ndarray
+    """Indices of the training links."""
+    say: Say = silent
+
+
+@runtime_checkable
+class Control(Protocol):
+    """A host control: a frozen, hashable object."""
+
+    @property
+    def stream(self) -> int:
+        """Number of its stream of random numbers."""
+        ...
+
+    def statistics(self, params: Any) -> Any:
+        """Returns zeros, to be accumulated over steps; () if it watches nothing."""
+        ...
+
+    def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
+        """Returns the statistics after a step, from the gradients of the parameters and of the field's probe (pure)."""
+        ...
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether something is to be done after this step of so many."""
+        ...
+
+    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+        """Returns the changed parameters."""
+        ...
+
+    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+        """Returns parameters of the shapes that the control may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
+        None where nothing is near after this step of so many."""
+        ...
+
+
+@dataclass(frozen=True)
+class OfPart:
+    """A control of one part of a field that is made of parts: of its field and parameters of that name."""
+
+    part: str
+    inner: Control
+
+    @property
+    def stream(self) -> int:
+        """Number of its stream of random numbers."""
+        return self.inner.stream
+
+    def statistics(self, params: Any) -> Any:
+        """Returns zeros, to be accumulated over steps; () where there is no such part."""
+        own = getattr(params, self.part)
+        return () if own is None else self.inner.statistics(own)
+
+    def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
+        """Returns the statistics after a step."""
+        own = getattr(gradients, self.part)
+        return () if own is None else self.inner.accumulate(statistics, own, probe)
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether something is to be done after this step of so many."""
+        return self.inner.due(step, steps)
+
+    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+        """Returns all parameters, those of the part changed."""
+        own = getattr(params, self.part)
+        if own is None:
+            return Edit(params, statistics, lambda tree: tree, {})
+        edit = self.inner.apply(getattr(field, self.part), own, statistics, context, step, rng)
+
+        def put(tree: Any, value: Any) -> Any:
+            return replaced(tree, **{self.part: value})
+
+        follow = edit.moments
+        moments = None if follow is None else lambda tree: put(tree, follow(getattr(tree, self.part)))
+        whole = None if edit.field is None else put(field, edit.field)
+        return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
+
+    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+        """Returns the shapes of all parameters that the control may soon change to, and that growth."""
+        own = getattr(params, self.part)
+        found = None if own is None else self.inner.next_size(own, step, steps)
+        if found is None:
+            return None
+        return replaced(jax.eval_shape(lambda tree: tree, params), **{self.part: found[0]}), found[1]
+
+
+def map_moments(moments: Any, params: Any, function: Callable[[Any], Any]) -> Any:
+    """Returns the optimiser's state with every tree in it that is like the parameters transformed. In the tree of a group the
+    leaves of all others are masked."""
+    leaves, structure = jax.tree.flatten(params)
+    known: Any = structure
+
+    def alike(value: Any) -> bool:
+        own, found = jax.tree.flatten(value, is_leaf=_is_masked)
+        same = (_is_masked(a) or (a.shape, a.dtype) == (b.shape, b.dtype) for a, b in zip(own, leaves, strict=False))
+        return bool(found == known) and not _is_masked(value) and all(same)
+
+    return jax.tree.map(lambda leaf: function(leaf) if alike(leaf) else leaf, moments, is_leaf=alike)
+
+
+def _is_masked(node: Any) -> bool:
+    return isinstance(node, optax.MaskedNode)

@@ -1,0 +1,234 @@
+"""What the viewer asks of a trained field: everything about one transmitter at one frequency, compiled once."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Electrical, Splatted
+from wbgs_jax.inference.answers import bounds_of
+from wbgs_jax.inference.evaluate_quantities import describe_interactions, names_of
+from wbgs_jax.inference.intervals import Expected, expected_ssim
+from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
+from wbgs_jax.inference.predictor import Trained, as_observed, check_power
+from wbgs_jax.inference.radio_map import Plane, ask_plane, pieces
+from wbgs_jax.metrics import ssim
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
+from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
+from wbgs_jax.types import Query, Receiver, make_query
+
+
+@dataclass(frozen=True)
+class PathList:
+    """The paths of one link, the strongest first."""
+
+    points: Float[np.ndarray, "k 5 3"]
+    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    amplitude: Complex[np.ndarray, " k"]
+    power_db: Float[np.ndarray, " k"]
+    length: Float[np.ndarray, " k"]
+    """Metres."""
+    direction: Float[np.ndarray, "k 3"]
+    """Of arrival, unit vectors in the receiver's frame."""
+    interaction: Int[np.ndarray, "k 5"]
+    """Types, as `propagation.paths` has them."""
+    words: tuple[str, ...]
+    """What each path meets: "off concrete, through glass"."""
+    k_factor_db: float
+    delay_spread_s: float
+
+    @property
+    def delay_ns(self) -> Float[np.ndarray, " k"]:
+        """Delays, nanoseconds."""
+        return self.length / SPEED_OF_LIGHT * 1e9
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a field says of one transmitter at one frequency."""
+
+    pas: Float[np.ndarray, "90 360"]
+    power_db: float | None
+    """Relative to the transmitted power; None where the field knows of none."""
+    expected: tuple[float, float, float] | None
+    """Expected SSIM, and the ends of its interval ..."""
+    level: float | None
+    """... in which the true one lies with this chance."""
+    paths: PathList | None
+    doubts: tuple[str, ...]
+    """Why the answer should not be trusted, a line each."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The observed spectrum of the nearest transmitter of the data, at the nearest frequency."""
+
+    pas: Float[np.ndarray, "90 360"]
+    position: Float[np.ndarray, "3"]
+    frequency_hz: float
+    distance_m: float
+    part: str
+    """"training", "validation" or "test"."""
+    ssim: float
+    """Of what the field says there."""
+
+
+class Asker:
+    """A trained field, asked about single transmitters.
+
+    Materials and thicknesses may be changed; everything else is as it was trained.
+    """
+
+    def __init__(self, trained: Trained, dataset: Dataset, receiver: Receiver):
+        self.trained, self.dataset, self.receiver = trained, dataset, receiver
+        self.plan = self._planned = trained.field.plan(trained.params, receiver)
+        self._neighbours, self._confidence = (
+            for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence)
+        )
+        self._bounds = bounds_of(self.dataset)
+        self._spectra = self._links_with_spectra()
+        self._samples: dict[int, Sample] = {}
+
+    @property
+    def knows_paths(self) -> bool:
+        """Whether the field knows paths."""
+        return "paths" in self.trained.field.known()
+
+    @property
+    def knows_power(self) -> bool:
+        """Whether the field knows received power."""
+        try:
+            check_power(self.trained.field, self.dataset)
+        except UserError:
+            return False
+        return True
+
+    def ask(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Answer:
+        """Returns what the field says of a transmitter (world frame, metres)."""
+        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
+        learned = self._neighbours, self._confidence
+        found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
+        pas, power, expected, paths = jax.tree.map(np.asarray, found)
+        place = np.asarray(position, np.float64)[None]
+        unsure = self._bounds.doubts(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
+        expected = None if self._bounds.without_confidence(place)[0] else expected
+        return Answer(
+            pas,
+            float(power) if power is not None and self.knows_power else None,
+            None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
+            None if self._confidence is None or expected is None else float(self._confidence.level),
+            None if paths is None else self._listed(*paths),
+            tuple(unsure),
+        )
+
+    def nearest_sample(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Sample | None:
+        """Returns the observed spectrum nearest to a transmitter and frequency; None where the data have no spectra."""
+        if not len(self._spectra):
+            return None
+        data, index = self.dataset, self._spectra
+        away = np.linalg.norm(data.tx_positions[index] - position, axis=1)
+        octaves = np.abs(np.log2(data.frequencies_hz[index] / frequency_hz))
+        nearest = away <= away.min() + 1e-6
+        link = int(index[nearest][np.argmin(octaves[nearest])])
+        if link not in self._samples:
+            self._samples[link] = self._sample(link)
+        return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
+
+    def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Splatted | None:
+        """Returns the Gaussians with attenuation and signal (NumPy) of a field that splats."""
+        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
+        found: Splatted | None = self.trained.field.splatted(self.trained.params, self.plan, query)
+        return jax.tree.map(np.asarray, found)
+
+    def power_plane(
+        self, plane: Plane, frequency_hz: float, progress: Callable[[float], None] = lambda share: None
+    ) -> Float[np.ndarray, "ny nx"]:
+        """Returns the received power (dB) from transmitters all over a plane; `progress` hears the share that is done."""
+        frequencies, done = np.array([frequency_hz]), 0
+        total = pieces(plane, frequencies)
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            progress(done / total)
+
+        return ask_plane("power", self.trained, self.dataset, self.receiver, plane, frequencies, advance)["power_db"][0]
+
+    def materials(self) -> tuple[tuple[str, ...], Electrical] | None:
+        """Returns names and properties of the materials; None of a field that knows of none."""
+        found = self.trained.field.electrical(self.trained.params)
+        if found is None:
+            return None
+        names = names_of(self.dataset) or ("everything",)
+        return tuple(name or f"material {number}" for number, name in enumerate(names[: len(found.permittivity)])), found
+
+    def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
+        """Gives a material another permittivity and conductivity at 1 GHz (S/m) from now on."""
+        params = self.trained.field.with_material(self.trained.params, number, permittivity, conductivity)
+        self.trained = dataclasses.replace(self.trained, params=params)  # type: ignore[type-var]
+        self._samples.clear()
+
+    def change_thickness(self, number: int, metres: float) -> None:
+        """Makes all walls of a material this thick from now on."""
+        field, self.plan = self.trained.field.with_thickness(self.plan, number, metres)
+        self.trained = dataclasses.replace(self.trained, field=field)  # type: ignore[type-var]
+        self._samples.clear()
+
+    def restore(self, trained: Trained) -> None:
+        """Asks a field as it was trained from now on."""
+        self.trained, self.plan = trained, self._planned
+        self._samples.clear()
+
+    def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
+        """Returns the links of this receiver whose spectra are known."""
+        if self.dataset.kind == "power":
+            return np.zeros(0, int)
+        places = np.asarray(self.dataset.receivers.position)
+        away = np.linalg.norm(places - np.asarray(self.receiver.position), axis=1)
+        return np.flatnonzero((self.dataset.receiver_index == np.argmin(away)) & (away.min() < SAME_PLACE_M))
+
+    def _sample(self, link: int) -> Sample:
+        data, index = self.dataset, np.array([link])
+        position, frequency = data.tx_positions[link], float(data.frequencies_hz[link])
+        truth = np.asarray(data.pas(index))
+        said = as_observed(self.trained.field, self.trained.params, self.ask(position, frequency).pas[None])
+        parts = {"training": data.train, "validation": data.validation, "test": data.test}
+        part = next((name for name, links in parts.items() if link in links), "other")
+        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said, truth)[0]))
+
+    def _listed(self, arrived: Arrivals, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
+        power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
+        order = np.argsort(-power, kind="stable")
+        order = order[np.abs(arrived.amplitude[order]) > 0]
+        kinds, materials = np.asarray(arrived.interaction)[order], np.asarray(arrived.material)[order]
+        names = names_of(self.dataset)
+        words = tuple(describe_interactions(*met, names) for met in zip(kinds, materials, strict=True))
+        points = np.asarray(arrived.points)[order]
+        amplitude, length, direction = (np.asarray(a)[order] for a in (arrived.amplitude, arrived.length, arrived.direction))
+        return PathList(points, amplitude, power[order], length, direction, kinds, words, float(k_factor), float(spread))
+
+
+def _answer(
+    field: Field, params: Any, plan: Any, query: Query, neighbours: Any, confidence: Any, with_paths: bool
+) -> tuple[Any, Any, Any, Any]:
+    """Returns spectrum, power, expected SSIM, and arrivals with K-factor and delay spread, of a batch of one query, without its
+    axis."""
+    seen = field.render(params, plan, query)
+    pas = correct(neighbours, seen.pas, query)
+    expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
+    paths = None
+    if with_paths:
+        arrived = field.arrivals(params, plan, query)
+        paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
+    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, paths))
+
+
+_ask = jax.jit(_answer, static_argnames="with_paths")

@@ -1,0 +1,192 @@
+"""The three-dimensional part of the viewer: the room, the receiver and what it sees, paths, Gaussians, maps."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import viser
+from jaxtyping import Float, UInt8
+
+from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.fields.base import Splatted
+from wbgs_jax.inference.radio_map import Plane
+from wbgs_jax.radio.geometry import covariance_factor, rotation_matrix
+from wbgs_jax.types import Receiver
+from wbgs_jax.viewer import drawing
+from wbgs_jax.viewer.session import PathList
+
+CEILING_CUT = 0.02
+"""Share of the room's height below its top that is cut away at the start, so that one can look in."""
+AXES_AWAY_M = 0.5
+"""Metres between the room and the axes."""
+DOME_RADIUS = 0.4
+"""Of what the receiver hears, as a share of the room's shortest side."""
+HANDLE_RADIUS = 0.04
+"""Metres: of the balls on paths that are clicked at."""
+CHOSEN = np.array([[214, 39, 40]], np.uint8)
+"""Colour of the path that was clicked at."""
+MOST_GAUSSIANS = 20_000
+SPHERE = 8
+"""Corners around the ball."""
+
+
+class SceneView:
+    """Everything with a place in the room."""
+
+    def __init__(self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver, up: str = "z"):
+        self.scene, self.dataset, self.up = server.scene, dataset, "xyz".index(up)
+        self.box = DatasetScene(dataset).box
+        self.size = float(np.ptp(self.box, axis=0).max())
+        self.rx = np.asarray(receiver.position, float)
+        self._rotation = np.asarray(rotation_matrix(receiver.orientation), float)
+        self.scene.set_up_direction(np.eye(3)[self.up])
+        self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
+        self._draw_fixed(receiver)
+        self.clip(*self.heights())
+
+    def heights(self) -> tuple[float, float]:
+        """Returns from and up to which height the room is drawn at first: without its ceiling."""
+        low, high = self.box[:, self.up]
+        return float(low), float(high - CEILING_CUT * (high - low))
+
+    def _draw_fixed(self, receiver: Receiver) -> None:
+        low, high = self.box
+        corner = low + np.array([high[0] - low[0] + AXES_AWAY_M, 0.0, 0.0])
+        self.scene.add_frame("/axes", axes_length=1.0, axes_radius=0.02, position=corner)
+        for axis, name in enumerate("xyz"):
+            self.scene.add_label(f"/axes/{name}", f"{name}, 1 m", position=np.eye(3)[axis] * 1.1)
+        flat = [axis for axis in range(3) if axis != self.up]
+        width, height = (high - low)[flat]
+        under = (low + high) / 2
+        under[self.up] = low[self.up] - 0.01
+        plane: Literal["xy", "xz", "yz"] = ("yz", "xz", "xy")[self.up]
+        self.scene.add_grid("/grid", float(width), float(height), plane=plane, cell_size=1.0, position=under, fade_strength=0)
+        orientation = np.asarray(receiver.orientation, float)
+        self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012, position=self.rx, wxyz=orientation)
+        self.scene.add_label("/receiver/name", "receiver", position=(0, 0, 0.12))
+        places = np.unique(self.dataset.tx_positions, axis=0)
+        self.samples = self.scene.add_point_cloud(
+            "/samples", places.astype(np.float32), (90, 90, 90), point_size=0.035, point_shape="circle", visible=False
+        )
+
+    def clip(self, low: float, high: float) -> None:
+        """Draws the surfaces whose middle lies between two heights (metres), a colour a material."""
+        shown = (self._centroids[:, self.up] >= low) & (self._centroids[:, self.up] <= high)
+        materials = self.dataset.materials
+        number = np.zeros(len(shown), int) if materials is None else materials.material
+        for material in np.unique(number):
+            faces = self.dataset.faces[shown & (number == material)]
+            name = f"/room/{material}"
+            if not len(faces):
+                self.scene.remove_by_name(name)
+                continue
+            self.scene.add_mesh_simple(
+                name,
+                self.dataset.vertices.astype(np.float32),
+                faces.astype(np.uint32),
+                color=drawing.material_color(int(material)),
+                opacity=0.4,
+                side="double",
+                flat_shading=True,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+
+    def draw_dome(self, pas: Float[np.ndarray, "90 360"]) -> None:
+        """Draws what the receiver hears around it."""
+        radius = DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
+        points, colors = drawing.dome(pas, self._rotation, radius)
+        self.scene.add_point_cloud(
+            "/dome",
+            (points + self.rx).astype(np.float32),
+            colors,
+            point_size=0.04 * radius,
+            point_shape="circle",
+        )
+
+    def draw_paths(
+        self, paths: PathList | None, count: int, by_power: bool, chosen: int | None, on_click: Callable[[int], None]
+    ) -> None:
+        """Draws the strongest paths, with a ball on each to click at; a chosen one in red."""
+        if paths is None or not count or not len(paths.power_db):
+            for name in ("/paths", "/path_handles", "/chosen_path"):
+                self.scene.remove_by_name(name)
+            return
+        points = paths.points[:count]
+        colors = drawing.path_colors(paths.power_db[:count], drawing.bounces(paths.interaction[:count]), by_power)
+        self._draw_lines("/paths", points, colors, 2.0)
+        self._draw_handles(drawing.path_handles(points), colors, on_click)
+        if chosen is not None and chosen < len(points):
+            self._draw_lines("/chosen_path", points[chosen : chosen + 1], CHOSEN, 5.0)
+        else:
+            self.scene.remove_by_name("/chosen_path")
+
+    def _draw_lines(
+        self, name: str, points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, "k 3"], thickness: float
+    ) -> None:
+        segments, ends = drawing.path_segments(points, drawing.linear(colors))
+        self.scene.add_line_segments(name, segments.astype(np.float32), ends, thickness=thickness, thickness_units="screen")
+
+    def _draw_handles(
+        self, places: Float[np.ndarray, "k 3"], colors: UInt8[np.ndarray, "k 3"], on_click: Callable[[int], None]
+    ) -> None:
+        vertices, faces = _ball(HANDLE_RADIUS)
+        upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1))
+        handle = self.scene.add_batched_meshes_simple(
+            "/path_handles",
+            vertices,
+            faces,
+            upright.astype(np.float32),
+            places.astype(np.float32),
+            batched_colors=drawing.linear(colors),
+            lod="off",  # simplified, its poles have no normals
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+        @handle.on_click
+        def _(event: viser.SceneNodePointerEvent) -> None:
+            if event.instance_index is not None:
+                on_click(int(event.instance_index))
+
+    def draw_gaussians(self, splatted: Splatted | None, by: str) -> None:
+        """Draws the Gaussians, coloured by "signal" or "attenuation"; None removes them."""
+        if splatted is None:
+            self.scene.remove_by_name("/gaussians")
+            return
+        gaussians = splatted.gaussians
+        alive = np.flatnonzero(np.asarray(gaussians.alive))[:MOST_GAUSSIANS]
+        attenuation, signal = (np.asarray(values)[alive, 0] for values in (splatted.attenuation, splatted.signal))
+        shown = signal if by == "signal" else attenuation
+        top = max(float(np.quantile(shown, 0.99)), 1e-6)
+        factor = np.asarray(covariance_factor(gaussians.log_scales[alive], gaussians.quats[alive]))
+        self.scene.add_gaussian_splats(
+            "/gaussians",
+            np.asarray(gaussians.means)[alive].astype(np.float32),
+            (factor @ factor.swapaxes(-1, -2)).astype(np.float32),
+            (drawing.colored(shown, 0.0, top, "inferno") / 255).astype(np.float32),
+            np.clip(attenuation, 0.05, 1.0)[:, None].astype(np.float32),
+        )
+
+    def draw_map(self, values: Float[np.ndarray, "ny nx"] | None, plane: Plane | None) -> tuple[float, float]:
+        """Draws a map on its plane; None removes it. Returns the values of the first and the last colour."""
+        if values is None or plane is None:
+            self.scene.remove_by_name("/map")
+            return 0.0, 0.0
+        picture, low, high = drawing.map_picture(values)
+        middle = np.array([(plane.xs[0] + plane.xs[-1]) / 2, (plane.ys[0] + plane.ys[-1]) / 2, plane.height])
+        width, height = (float(np.ptp(a)) * len(a) / max(len(a) - 1, 1) for a in (plane.xs, plane.ys))
+        # The picture's upper edge is its first row: turned about x, so that rows run down y and it faces upwards.
+        self.scene.add_image("/map", picture, width, height, position=middle, wxyz=(0.0, 1.0, 0.0, 0.0), format="png")
+        return low, high
+
+
+def _ball(radius: float) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
+    """Returns a ball of few triangles."""
+    zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, SPHERE // 2 + 1), np.linspace(0, 2 * np.pi, SPHERE + 1), indexing="ij")
+    vertices = radius * np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
+    index = np.arange(zenith.size).reshape(zenith.shape)
+    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.uint32)
