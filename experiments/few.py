@@ -254,8 +254,9 @@ def main() -> None:
         row = make_row(case, seed, runs)
         write_json(path, row)
         best = max(row["simple"].values())
-        write_json(command.out.with_suffix(".json"), summary(rows_of(command.out)) | environment())
         print(f"{case.name} seed {seed}: {row['median_ssim']:.3f}, best simple {best:.3f}", file=sys.stderr, flush=True)
+    if not command.list and (rows := rows_of(command.out)):
+        write_json(command.out.with_suffix(".json"), summary(rows) | environment())
 
 
 if __name__ == "__main__":
