@@ -2,7 +2,7 @@
 
 A run's settings are those of its field, of the optimiser, of the host loop, and of the host controls that the field asks
 for. All can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. The paper's own
-values are the wideband field's preset `paper`; docs/decisions.md says what was measured.
+values are the wideband field's preset `paper`; docs/history.md says what was measured.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ class OptimConfig:
     low frequencies the phase behind a slab is no riddle."""
     virtual: float = setting(0.5, before=0.0)
     """Share of every batch that are links of transmitters nobody measured, with kriged spectra, where spectra are few and the
-    field knows no paths (training/virtual.py)."""
+    field knows no paths (training/batches.py)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Search for known materials and antennas before the first step (training/search.py)."""
+    """Search for known materials and antennas before the first step (training/calibration/pipeline.py)."""
 
     rounds: int = 3
     """Times all materials are gone through, at most; 0: no search for materials."""

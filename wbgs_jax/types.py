@@ -67,7 +67,7 @@ class Receiver:
     """Local frame, in `unit`."""
     pattern_exponents: Float[Array, "*r 2"]
     """Of the elements' gain: how much they are the element of 3GPP TR 38.901 and how much a short dipole; zeros are isotropic
-    (`radio/patterns.py`)."""
+    (`radio/antenna.py`)."""
     unit: ElementUnit = static(default="wavelengths")
 
     def element_wavelengths(self, frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b_elements 3"]:
@@ -145,7 +145,7 @@ class Mesh:
 
 @runtime_checkable
 class Scene(Protocol):
-    """What a field may ask about a place when it is made (`data.surface.DatasetScene`)."""
+    """What a field may ask about a place when it is made (`data.scene.DatasetScene`)."""
 
     @property
     def receivers(self) -> Receiver:
@@ -185,7 +185,7 @@ def make_receiver(
         orientation: quaternion (wxyz) of any non-zero length that turns local vectors into world ones.
         element_positions: (elements, 3) in the local frame; default: the 4x4 half-wavelength array in the local y-z plane.
         unit: of the element positions.
-        pattern: of the elements, a name that `radio.patterns.PATTERN_EXPONENTS` knows; empty stands for isotropic ones.
+        pattern: of the elements, a name that `radio.antenna.PATTERN_EXPONENTS` knows; empty stands for isotropic ones.
     """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)

@@ -99,7 +99,7 @@ class Field(ABC):
     gives: ClassVar[tuple[Quantity, ...]] = ("pas",)
     """What it knows of a link."""
     controls: ClassVar[tuple[str, ...]] = ()
-    """Host controls between epochs that it asks for: names in `training.run.CONTROLS`, "part.name" for one of a part alone."""
+    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`, "part.name" for one of a part alone."""
     seconds: ClassVar[Mapping[str, float]] = {}
     """How long trainings take on two cores of an AMD EPYC, by preset, search and compilation included (scenes 1 to 6)."""
     config: Any

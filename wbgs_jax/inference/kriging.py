@@ -6,7 +6,7 @@
 
 The first adds what the field left unexplained at its neighbours; the second moves towards their spectra themselves, which helps
 where the field has learned them by heart and their residuals are zero. Which, how far (L) and how much (w) is found on the
-validation part (training/neighbours.py), nothing at all included. Only the nearest are asked: the others are behind them, and
+validation part (training/fit_kriging.py), nothing at all included. Only the nearest are asked: the others are behind them, and
 a data set may hold thousands.
 """
 

@@ -6,7 +6,7 @@
 u is the logarithm of d, the distance to the nearest known transmitter, within what has been observed. The simple methods: the
 mean spectrum, the nearest one, inverse distances, ordinary kriging (Cressie 1993, section 3.2) with the kernel
 exp(-|x - x_j| / L), and line of sight. All but the mean and the last look at the same frequency alone. Weights and share are
-found by cross-validation (training/mixture.py).
+found by cross-validation (training/fit_mixture.py).
 """
 
 from typing import Any

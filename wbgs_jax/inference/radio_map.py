@@ -53,7 +53,7 @@ def ask_plane(
     """Returns {name with unit: values (freq, ny, nx)} of transmitters all over a plane, and `xs`, `ys`, `frequencies_hz`.
 
     Args:
-        what: `BEST_BEAM`, the number of the beam of `radio.codebook` that hears most, or what `quantities.ask_channel` answers.
+        what: `BEST_BEAM`, the number of the beam of `radio.array` that hears most, or what `quantities.ask_channel` answers.
         trained: the field, and the data it was trained on: `dataset`.
         receiver: at which it is asked.
         plane: of the transmitters.

@@ -1,7 +1,7 @@
 """The wave on every path: the field vector through reflections, transmissions and a diffraction, and the array's snapshot.
 
 The electric field is a complex vector across the ray, split at every slab into its components across (TE) and in (TM) the
-plane of incidence. Antennas are those of radio/patterns.py. The time factor is exp(+j omega t).
+plane of incidence. Antennas are those of radio/antenna.py. The time factor is exp(+j omega t).
 """
 
 import dataclasses

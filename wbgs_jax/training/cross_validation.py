@@ -2,7 +2,7 @@
 from cross-validation (host).
 
 A validation part of three transmitters decides nothing. Where there are fewer than `ENOUGH`, simple methods are members of the
-answer from the start (training/mixture.py). A field that knows no paths is cross-validated over all of the transmitters, in
+answer from the start (training/fit_mixture.py). A field that knows no paths is cross-validated over all of the transmitters, in
 blocks (folds.py). One that knows paths takes too long for that; what it does with its validation part has to do.
 """
 

@@ -86,7 +86,7 @@ def confidence_of(
     """Returns how sure answers are, from the features and scores (SSIM) of some of them.
 
     Args:
-        known: features of the answers (`inference.confidence.features`).
+        known: features of the answers (`inference.intervals.features`).
         scores: what they scored.
         tx_index: their transmitters.
         rx_position: of the receivers, metres.

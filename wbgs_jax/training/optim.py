@@ -2,7 +2,7 @@
 decay together.
 
 Muon (Jordan et al. 2024) takes the steps of matrices in the direction of steepest descent under the spectral norm: the
-networks learn in 2,400 steps what Adam teaches them in 6,000 (docs/decisions.md).
+networks learn in 2,400 steps what Adam teaches them in 6,000 (docs/history.md).
 """
 
 import functools

@@ -2,12 +2,12 @@
 
 A length that is off by a tenth of a wavelength is hardly seen, one that is off by a whole one cannot be told from right. So
 low frequencies come first, and each narrows it down for the next: every mover of the facets, and the receiver, gets a small
-rigid motion whose effect on phases is first-order (propagation/motion.py), found by least squares (`adjustment.py`) or, where
-there are no snapshots, by descent (`descent.py`); now and then things are moved and paths traced again. Materials are named
-as far as places are known by then, since powers tell where phases cannot, and by phases once places are found; then all is
-gone through once more, or twice where thicknesses are unknown, and more often where a free receiver still moves. A prior
-keeps what no path sees where it was. What comes out is kept if it predicts training spectra surely better than the mesh as it
-was, each with the position uncertainty that suits it best.
+rigid motion whose effect on phases is first-order (propagation/displacement.py), found by least squares (`gauss_newton.py`)
+or, where there are no snapshots, by descent (`gradient.py`); now and then things are moved and paths traced again. Materials
+are named as far as places are known by then, since powers tell where phases cannot, and by phases once places are found; then
+all is gone through once more, or twice where thicknesses are unknown, and more often where a free receiver still moves. A
+prior keeps what no path sees where it was. What comes out is kept if it predicts training spectra surely better than the mesh
+as it was, each with the position uncertainty that suits it best.
 """
 
 import dataclasses

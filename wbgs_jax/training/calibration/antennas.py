@@ -25,7 +25,7 @@ UP = ("+x", "+y", "+z")
 """Axes that an antenna may stand along: upside down it differs by a sign."""
 LARGE, SURE_OF_LARGE = 0.3, 1.5
 """A gain of so much (natural logarithm: a quarter less is left) is taken by as many standard errors. With few transmitters it
-costs far more to miss the antenna than to take a wrong one, which gains nothing: docs/decisions.md has the chances of both."""
+costs far more to miss the antenna than to take a wrong one, which gains nothing: docs/history.md has the chances of both."""
 
 
 @dataclass(frozen=True)

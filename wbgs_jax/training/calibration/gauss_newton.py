@@ -1,8 +1,8 @@
 """Where surfaces and the receiver stand, by least squares over snapshots, as surveyors adjust a network.
 
 What a model leaves unexplained of a snapshot is linear in small motions: every path turns by its wavenumber times the change
-of its length (propagation/motion.py). With a normal prior of every motion this gives the normal equations of a Gauss-Newton
-step, and with their inverse how well every motion is known by now. What nobody has seen stays where it was.
+of its length (propagation/displacement.py). With a normal prior of every motion this gives the normal equations of a
+Gauss-Newton step, and with their inverse how well every motion is known by now. What nobody has seen stays where it was.
 
 Nobody knows the common factor of a snapshot: only what is orthogonal to the prediction counts. The noise level of every
 snapshot is unknown too (`losses.log_decorrelation`), which gives those that are explained badly less weight. Paths whose
