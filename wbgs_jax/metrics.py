@@ -1,4 +1,7 @@
-"""How good predicted spectra are, over all of them, by frequency and by sight: SSIM (scikit-image's), PSNR, MAE, beams."""
+"""How good predicted spectra are, over all of them, by frequency and by sight: SSIM (scikit-image's), PSNR, MAE, beams.
+
+What a link engineer loses by trusting a predicted spectrum: the wrong direction, the wrong beam.
+"""
 
 from typing import Any
 

@@ -1,4 +1,11 @@
-"""Pictures of a run: spectra (rectangular and polar), curves, SSIM by frequency. Written as PNG files, atomically."""
+"""Pictures of a run: spectra (rectangular and polar), curves, SSIM by frequency. Written as PNG files, atomically.
+
+Pictures of answers: spectra side by side, and quantities along a line, over a sweep, or query by query.
+
+Pictures of maps: a quantity over a floor, with the walls that the plane cuts and the receiver.
+
+Pictures of maps of received power over a floor plan.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple

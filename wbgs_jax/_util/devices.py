@@ -3,6 +3,11 @@
 The parts are made by `shard_map` in a jitted program, over the one axis (`AXIS`) of a mesh: left to itself, XLA divides the
 splatting renderer as well, but exchanges something between the devices for every tile (docs/scaling.md). With one device there
 is no mesh, and every function here returns what it was given.
+
+Several processes that train one field, on one machine or on many: who writes, and how they stay together.
+
+All of them do the same steps on the host and hold the same parameters; the first one alone writes files and prints. With one
+process every function here costs nothing.
 """
 
 import hashlib

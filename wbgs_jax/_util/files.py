@@ -1,4 +1,12 @@
-"""Files that are either whole or absent: written under a temporary name beside the target, then renamed."""
+"""Files that are either whole or absent: written under a temporary name beside the target, then renamed.
+
+Archives of arrays (.npz) as they come from disk: damaged, from elsewhere, or no archives at all.
+
+Whatever NumPy, zipfile, zlib and Python's tokenizer make of damaged bytes, it is one `UserError` in words of our own. Python
+objects are never read: unpickling them would run whatever the file says.
+
+Small YAML files that people write. What is no plain data is refused: aliases that unfold to gigabytes, endless nesting.
+"""
 
 import contextlib
 import csv

@@ -1,4 +1,7 @@
-"""What a trainer, an evaluation or an experiment sees of any data: links, observations, receivers, surface, split."""
+"""What a trainer, an evaluation or an experiment sees of any data: links, observations, receivers, surface, split.
+
+A checksum of a data set: a run keeps that of its data, so that nobody goes on with others under the same name.
+"""
 
 import dataclasses
 import hashlib

@@ -14,6 +14,8 @@ mesh point (x, y, z) lies at (x, z, -y) in the world. The layout knows no array;
 unknown element pattern.
 
     wbgs-jax layout SCENE.npz FOLDER      writes a scene file as such a folder
+
+The receiver of a folder of the published layout: gateway_info.yml.
 """
 
 import contextlib

@@ -1,4 +1,9 @@
-"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them."""
+"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them.
+
+Several data sets of one scene, each seen from receivers of its own, as one.
+
+What files and folders of other programs are, and the way from there.
+"""
 
 import os
 import warnings

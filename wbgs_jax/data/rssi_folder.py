@@ -1,11 +1,25 @@
 """Readings of received power at several fixed receivers from many places, read from folders and averaged over cells.
 
-    readings.csv (or calibration.csv)   x,y[,z][,room][,floor], and a column of dBm a receiver, named by its id (columns.py);
+    readings.csv (or calibration.csv)   x,y[,z][,room][,floor], and a column of dBm a receiver, named by its id;
                                         empty: not received
     receivers.csv (or anchors.csv)      id,x,y,z
     walls.csv (or layout.csv)           optional; floor_plan.py
 
-or in a layout of NeRF2 (nerf2.py). Metres and one frame throughout. Headers may be in capitals.
+or in a layout of NeRF2 (below). Metres and one frame throughout. Headers may be in capitals.
+
+Received powers as NeRF2 (Zhao et al., MobiCom 2023) publishes them, and as those publish who followed.
+
+    tx_pos.csv              x,y,z, a row a transmitter
+
+    gateway_position.yml    name: [x, y, z] of Bluetooth gateways, and
+    gateway_rssi.csv        dBm, one column a gateway, of its name; -100: not received
+
+    base-station.yml        base_station: [[x, y, z], ...], the antennas, or rx_positions.yml, name: [x, y, z], and
+    csidata.npy             complex channel state (transmitter, antenna, subcarrier)
+
+Of channel state its mean power over the subcarriers is taken, in dB of whatever it was measured in; carriers without a value
+(NaN, or zero throughout, as at direct current and at the edges of the band) do not count. NeRF2's own set of channel
+state has no `tx_pos.csv`: it asks for a downlink where an uplink is known, not where a transmitter stands.
 """
 
 import dataclasses

@@ -1,4 +1,9 @@
-"""What fields may ask about a data set's scene: its box, points spread over its surfaces, the surfaces themselves."""
+"""What fields may ask about a data set's scene: its box, points spread over its surfaces, the surfaces themselves.
+
+Which transmitters a receiver sees: the straight line between them meets no surface.
+
+Closed bodies among a scene's surfaces, in which no antenna can stand (NumPy, host).
+"""
 
 from dataclasses import dataclass
 

@@ -5,6 +5,8 @@ in wavelengths or metres. Snapshots contain the carrier phase exp(-j 2 pi f tau)
 versions, parts with their materials, seed, solver settings, sha256 of the meshes, ceilings).
 
 Files are written in format 2. Format 1 knew snapshots of one receiver only; its files are read and look like one of format 2.
+
+What the arrays of a scene file must be; whatever else they are is told in one line.
 """
 
 import json

@@ -1,4 +1,9 @@
-"""Which column of a table belongs to which receiver: by its name, in any usual spelling."""
+"""Which column of a table belongs to which receiver: by its name, in any usual spelling.
+
+CSV files that people write: headers in any case, empty cells, one line for every mistake.
+
+What numbers of readings may mean: values that stand for "not received", and numbers that are no metres and no dBm.
+"""
 
 import csv
 import re

@@ -6,6 +6,8 @@ Waves are coherent as far as the places of surfaces are known:
 
 with y_i the snapshot of path i alone. Where all places are known the coherence is 1 and the PAS that of the snapshot itself;
 where nobody knows them within a wavelength, powers add.
+
+The paths of many links, found on the host before a training: whoever trains materials asks for them again and again.
 """
 
 import dataclasses

@@ -12,6 +12,18 @@ with z what is known beforehand and tells where phases fail: the frequency, how 
 space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
 is. The weights are those by which validation links are explained best; they are zero unless, on transmitters left out a fifth
 at a time, they do better than one common share by more than a standard error.
+
+Noise of observations: what it does to their spectra, and how much of it fields have learned.
+
+White noise n of an array of N elements makes the spectrum of y = h + n brighter than that of the channel h where that is dark:
+
+    E |a^H y|^2 = |a^H h|^2 + N sigma^2
+
+A field that is trained on such spectra learns this floor, one that adds up paths cannot. The floor is taken out of what the
+one says, since the channel is asked for, and added where either is compared with observations to learn from that
+(`as_observed`). How high it is nobody says, but both tell: spectra of paths are most like the observed ones if the right floor
+is added, or a higher one if paths are missing; learned spectra are hardly anywhere darker than the floor, and less like them if
+they are raised to a higher one.
 """
 
 from collections.abc import Callable

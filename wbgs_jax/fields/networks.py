@@ -7,6 +7,8 @@
 A layer whose input is a concatenation of parts that depend on the Gaussian only, on the query only, or on both is evaluated
 part by part and added: the same function as a dense layer on the concatenation, without forming it N x B times. What depends
 on the Gaussian only can be evaluated once for all queries (`AttenuationNetwork.gaussian_sums`).
+
+Positional and frequency encodings of the EM feature networks (paper, section 4.2).
 """
 
 import math

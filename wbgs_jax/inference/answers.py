@@ -1,4 +1,9 @@
-"""What the commands share that ask a trained field: where and at which frequencies, what is doubtful there, and files."""
+"""What the commands share that ask a trained field: where and at which frequencies, what is doubtful there, and files.
+
+A run folder opened for one question: by what an earlier command left ready where that will do, else by reading the run.
+
+Where a trained field was trained, what is doubtful elsewhere, and how lines name links.
+"""
 
 import dataclasses
 import json

@@ -1,4 +1,9 @@
-"""Blocks of queries answered by a trained field: spectra, or any other quantity that `wbgs-jax predict --what` names."""
+"""Blocks of queries answered by a trained field: spectra, or any other quantity that `wbgs-jax predict --what` names.
+
+The whole channel of links: tables of paths, responses over a band, and matrices between two arrays.
+
+What a coherent field knows of a link beyond what its receiver's array sees of it, asked for transmitters at frequencies.
+"""
 
 from collections.abc import Callable
 from typing import Any

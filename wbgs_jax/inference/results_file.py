@@ -1,5 +1,8 @@
 """Answers to many queries, block by block: in a folder beside the file that they end in, so that nothing is lost and memory
-holds one block at a time."""
+holds one block at a time.
+
+Answers as files, and as lines for people.
+"""
 
 import contextlib
 import json

@@ -3,10 +3,15 @@
 Arrays by name: `power` (dB) and `phase` (degrees) of every path, `delay` (seconds), `aod_az`, `aod_el`, `aoa_az`, `aoa_el`
 (degrees, el from +z), `inter` (the interactions as the digits of a number, from the transmitter on: 1 reflection,
 2 diffraction, 3 scattering, 4 transmission, 0 none), `inter_pos`, `rx_pos` (N, 3), `tx_pos` (1, 3); NaN where a user has fewer
-paths. A scenario is a folder with a file each (deepmimo_folder.py).
+paths. A scenario is a folder with a file each.
 
 The channel at the carrier is the sum of sqrt(power) exp(j phase): phases hold the propagation. What DeepMIMO's converter makes
 of Sionna RT lacks it, as Sionna's coefficients do; lines of sight show which it is.
+
+Folders of DeepMIMO scenarios: which transmitters and users they hold, at which frequency, and their arrays.
+
+A file an array, such as power_t001_tx000_r000.npz (or .mat): set and number of the transmitter, set of the users; and
+params.json with the frequency and the sets. A set of users that are base stations too is taken if there is no other.
 """
 
 import re

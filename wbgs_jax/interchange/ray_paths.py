@@ -3,6 +3,9 @@
 Names, axes and conventions are Sionna's: R receivers, T transmitters, K paths, up to D interactions. Angles are radians in the
 world frame, theta from +z, phi from +x, at both ends outwards: where the wave leaves to, and where it comes from. Coefficients
 `a` lack the carrier phase of the delay: the channel at frequency f is the sum of a exp(-2 pi j f tau).
+
+What paths can be: delays that fit the places, angles in radians, gains without amplification. What is otherwise is of
+another unit, and refused by name.
 """
 
 from collections.abc import Mapping

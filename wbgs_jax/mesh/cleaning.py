@@ -2,6 +2,8 @@
 
 A surface that is there twice reflects twice, and lets pass what has passed two slabs; an edge between triangles that face both
 ways is none. Runs on the host.
+
+What is common to all that look at the triangles of a mesh: sides, names of sides, what hangs together. Runs on the host.
 """
 
 import warnings

@@ -1,6 +1,11 @@
 """The edges that waves are diffracted at: where two facets of one body meet at an angle.
 
 Runs on the host. Free edges of single sheets are no wedges and are left out, and so are inner corners.
+
+Edges and chains filled up to sizes that seldom change: surfaces that are moved a little have a few more or fewer of them,
+and everything that is compiled for one number would be compiled anew for the next.
+
+What is added is never a path: edges of no length, and mirror images that lie in the plane of their mirror (`image_method.py`).
 """
 
 import dataclasses

@@ -1,4 +1,9 @@
-"""Meshes and point clouds as PLY files, in and out; positions in metres, in whatever frame the file has."""
+"""Meshes and point clouds as PLY files, in and out; positions in metres, in whatever frame the file has.
+
+The PLY format (Turk 1994): elements, each with properties that are numbers or lists of numbers, as text or binary.
+
+The libraries that read it are under the GPL, or read no polygons of different sizes.
+"""
 
 import struct
 from collections.abc import Callable, Mapping

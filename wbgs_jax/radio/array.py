@@ -7,6 +7,8 @@ array serves every frequency. A plane wave from k arrives at element position p 
 A power angular spectrum (PAS) pixel is |a(k)^H y| / max: the AMPLITUDE of conventional beamforming of one complex snapshot
 y, scaled by its own maximum. Rows are zenith 0..90 degrees (row 0 = zenith), columns azimuth -180..180 degrees; both ends
 are included, so the first and last column are the same direction.
+
+The beams that a receiver chooses from: directions of the hemisphere, as pixels of its spectrum.
 """
 
 import functools

@@ -7,6 +7,11 @@ chain blends it. Two forms of the same image; the platform that the code is lowe
 * by jobs, on NVIDIA GPUs (fused_kernels.py): thousands are blended at once, each on its own, and then joined tile by tile.
 
 The backward passes recompute the chain instead of storing it and turn its pixel sums into matrix products.
+
+What a hand-written backward pass does not allow, refused in a sentence of our own.
+
+JAX refuses it too, but in words about a function that nobody asked for, or about a loop within it. Both functions below are
+the identity, and cost nothing when code runs.
 """
 
 from typing import Any, NoReturn

@@ -14,6 +14,10 @@ spare room in the lists costs nothing. Sums over pixels would take most of the t
 footprints are a matrix product, on tensor cores, and the others are taken of 16 arrays at once.
 
 Nothing is added atomically: all sums have one order, and a program gives the same bits whenever it runs.
+
+What Triton does not do by itself: it contracts no products and sums, and is careful with numbers too small to matter.
+
+Where kernels are interpreted, by plain operations on any device, these are the formulas that the instructions stand for.
 """
 
 import contextlib

@@ -7,6 +7,11 @@ choices keep the image well defined everywhere:
 * the azimuth standard deviation, which grows without bound near the poles, is capped so that a footprint never meets its
   own alias;
 * a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
+
+The footprint of a splat: a Gaussian that goes continuously to zero at `SUPPORT` standard deviations.
+
+With q the Mahalanobis distance squared, G(q) = max(0, exp(-q/2) - e0) / (1 - e0), e0 = exp(-SUPPORT^2 / 2). A plain Gaussian
+cut off by tile lists or by a threshold would make image and gradients depend on the tiling or jump; this one does neither.
 """
 
 import math

@@ -1,5 +1,13 @@
 """A dataset on the device, if a field can be trained on it: snapshots or 8-bit pixels of all links, of which a step makes the
-spectra of its batch."""
+spectra of its batch.
+
+Transmitters that nobody measured, with spectra that kriging gives them: what keeps a field that knows no paths from learning
+a few spectra by heart (host).
+
+Between few transmitters such a field makes up what it likes. Half of every batch are therefore links of transmitters somewhere
+between and around the known ones, whose spectra are ordinary kriging's (`inference.mixture`): the field starts from the kriged
+spectra, and varies over transmitters as smoothly as they do.
+"""
 
 import dataclasses
 import warnings

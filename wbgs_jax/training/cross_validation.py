@@ -3,7 +3,12 @@ from cross-validation (host).
 
 A validation part of three transmitters decides nothing. Where there are fewer than `ENOUGH`, simple methods are members of the
 answer from the start (training/fit_mixture.py). A field that knows no paths is cross-validated over all of the transmitters, in
-blocks (folds.py). One that knows paths takes too long for that; what it does with its validation part has to do.
+blocks (`held_out_blocks`). One that knows paths takes too long for that; what it does with its validation part has to do.
+
+What a field answers to links that it was not trained on: short trainings, each without a block of transmitters (host).
+
+A block lies together in space, so that its middle is as far from the data as queries are that come from elsewhere. Random
+transmitters would lie between those that are trained.
 """
 
 import dataclasses

@@ -4,6 +4,8 @@ The simple methods are members from the start. Their weights are those by which 
 at all distances: every one is left out, alone and with shares of the other transmitters, the nearest ones. The field gains
 a share as far as spectra that it was not trained on prove that it is better: of all shares the one whose gain over the simple
 methods has the largest lower confidence bound. Without evidence that is none.
+
+Stacking: the weights of a mixture of spectra, functions of one number, by which known spectra are explained best (SSIM).
 """
 
 import dataclasses

@@ -3,6 +3,8 @@
 A field asks for controls by name (`Field.controls`); the settings section of that name switches one on. A control may watch
 every step (`statistics` and `accumulate` are pure and run inside the epoch) and change parameters between epochs (`apply` runs
 on the host). It says how whatever is stored beside the parameters, such as optimiser moments, follows.
+
+What an optimiser stores beside the parameters, when these change their shapes.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,15 @@
 """The host loop: jitted epochs, host controls between them, checkpoints, curves, resume.
 
-A newcomer can read it top to bottom: `train` builds a `Run` (run.py), then repeats `Run.epoch` until the last step.
+A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step.
+
+The jitted epoch for the next size of a field, compiled while the device trains the present one.
+
+A field grows in steps that are known in advance. A call that runs no step compiles what the next size needs; when it is needed,
+it is there, or waited for.
+
+One training run: its state, its epochs, and what is done to the field between them.
+
+What a field is made of is the field's business; a run knows the seam alone (`fields.base.Field`).
 """
 
 import dataclasses

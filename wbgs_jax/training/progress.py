@@ -1,4 +1,10 @@
-"""What a person sees of a training: a live bar on a terminal, a plain line now and then in a log."""
+"""What a person sees of a training: a live bar on a terminal, a plain line now and then in a log.
+
+About how long a training will take on this machine: what it takes on a known one (`Field.seconds`), and how this one
+compares.
+
+Ctrl-C during a training: it is saved first, and the message says how to go on.
+"""
 
 import contextlib
 import signal

@@ -2,6 +2,8 @@
 
 config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pictures/*.png
 neighbours.npz   confidence.npz   power_confidence.npz
+
+One training a folder: two would write over each other's curves and checkpoints.
 """
 
 import contextlib

@@ -5,6 +5,12 @@ gets a material of its own, and a mover is left out if low frequencies are expla
 diffract in that trial, so some go unnoticed.) Then paths are traced and materials named again. That counts if it explains other
 snapshots, of all frequencies, surely better, as far as places are known; it lets others be seen, and the movers are gone
 through again. High frequencies are not asked: there a body that stands a little elsewhere is worse than none.
+
+Search for clutter: what stands in the way of waves and is not in the mesh (propagation/absorption.py).
+
+Its density is fitted to the spectra of most transmitters by gradient descent, all else being what it is. If those of the others
+are explained better with it, and not by chance, training goes on from there and learns it beside everything else; a few
+transmitters, or a mesh that lacks nothing, do not show that, and then there is no clutter.
 """
 
 import dataclasses
