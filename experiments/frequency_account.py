@@ -3,7 +3,7 @@
 Nothing is trained. Every spectrum of the validation transmitters is predicted from the *true* spectra of the same transmitter
 at the other frequencies: by their mean, which needs no frequency, by the four nearest and the four farthest, and pixel by pixel
 by polynomials in the logarithm of the frequency (least squares; "half a line" has half of its slope). The frequency is worth to
-such a law, at most, what a line gains over the mean. Writes experiments/results/frequency_account.json; docs/decisions.md
+such a law, at most, what a line gains over the mean. Writes experiments/results/frequency_account.json; docs/history.md
 quotes it.
 """
 

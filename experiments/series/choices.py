@@ -1,4 +1,4 @@
-"""Inputs, networks, density control and batch of the wideband field (docs/decisions.md, docs/performance.md).
+"""Inputs, networks, density control and batch of the wideband field (docs/history.md, docs/performance.md).
 
 The profiles are the `cpu` preset as it was when the choices were made, with and without octaves of the frequency.
 """

@@ -1,4 +1,4 @@
-"""What the parts of the coherent field are worth: one taken away at a time (docs/decisions.md)."""
+"""What the parts of the coherent field are worth: one taken away at a time (docs/history.md)."""
 
 from experiments.jobs import Job
 from experiments.results import Results
