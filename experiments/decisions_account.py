@@ -24,15 +24,10 @@ from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.fields import mixture as noise
+from wbgs_jax.fields import mixture
 from wbgs_jax.fields.mixture import SHARES
-from wbgs_jax.training import fit_kriging as neighbours
-from wbgs_jax.training.calibration import alignment as geometry
-from wbgs_jax.training.calibration import array_gains as tuning
-from wbgs_jax.training.calibration import obstacles as absent
-from wbgs_jax.training.calibration import obstacles as clutter
-from wbgs_jax.training.calibration import propagation_options as idealisations
-from wbgs_jax.training.calibration import thickness as thicknesses
+from wbgs_jax.training import fit_kriging
+from wbgs_jax.training.calibration import alignment, array_gains, obstacles, propagation_options, thickness
 from wbgs_jax.training.calibration.objective import surely_better
 from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
 from wbgs_jax.training.loop import CALIBRATED
@@ -67,15 +62,15 @@ def decisions() -> tuple[Decision, ...]:
     return (
         Decision("antennas", search.antenna_spectra, "train", search.antenna_sure, "isotropic, or what the data name"),
         Decision("materials, against the list", search.spectra, "train", search.sure, "an entry of the list"),
-        Decision("thicknesses", search.thickness_spectra, "train", thicknesses.SURE, "the thickness that is there"),
-        Decision("absent bodies", search.absent_spectra, "train", absent.SURE, "all bodies are there"),
-        Decision("idealisations", search.ideal_spectra, "train", idealisations.SURE, "as ray tracers have it"),
-        Decision("array tuning", search.tuning_spectra // 2, "train", tuning.SURE, "elements in tune"),
-        Decision("geometry", search.geometry_snapshots, "train", geometry.SURE, "the mesh as it is"),
-        Decision("clutter", search.clutter_spectra, "train", clutter.SURE, "none"),
-        Decision("noise floor", noise.COMPARED, "validation", noise.SURE, "none"),
+        Decision("thicknesses", search.thickness_spectra, "train", thickness.SURE, "the thickness that is there"),
+        Decision("absent bodies", search.absent_spectra, "train", obstacles.SURE, "all bodies are there"),
+        Decision("idealisations", search.ideal_spectra, "train", propagation_options.SURE, "as ray tracers have it"),
+        Decision("array tuning", search.tuning_spectra // 2, "train", array_gains.SURE, "elements in tune"),
+        Decision("geometry", search.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
+        Decision("clutter", search.clutter_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
+        Decision("noise floor", mixture.COMPARED, "validation", mixture.SURE, "none"),
         Decision("shares of the two fields by query", CALIBRATED, "validation", 1.0, "one share for all"),
-        Decision("residuals of neighbours", neighbours.SCORED, "validation", neighbours.SURE, "not used; never below 20"),
+        Decision("residuals of neighbours", fit_kriging.SCORED, "validation", fit_kriging.SURE, "not used; never below 20"),
         Decision("share of a field beside simple methods", 10_000, "validation", ERRORS, "the simple methods"),
         Decision("... of a field that follows paths", 10_000, "validation", ERRORS_WITH_PATHS, "the simple methods"),
     )

@@ -17,8 +17,7 @@ from wbgs_jax._util.devices import COORDINATOR, Devices, connect
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.inference import batching as maps
-from wbgs_jax.inference import predictor
+from wbgs_jax.inference import batching, predictor
 from wbgs_jax.training.loop import TrainResult, train
 from wbgs_jax.training.run_folder import TrainedField
 
@@ -44,13 +43,13 @@ def answers(result: TrainResult, dataset: Dataset) -> list[np.ndarray]:
     links = predictor.observe_links(result.field, result.params, dataset, np.arange(ASKED)).pas
     queries = predictor.observe_queries(trained, receiver, query, "pas")
     ask = predictor.predictor(trained, receiver)
-    return [links, queries, maps.predict_many(ask, query.tx_position, query.frequency_hz)]
+    return [links, queries, batching.predict_many(ask, query.tx_position, query.frequency_hz)]
 
 
 def asked_by_all_and_by_one(result: TrainResult, dataset: Dataset) -> float:
     """The largest difference between the answers of all devices and of one."""
     together = answers(result, dataset)
-    predictor.own_devices = maps.own_devices = Devices  # type: ignore[assignment]
+    predictor.own_devices = batching.own_devices = Devices  # type: ignore[assignment]
     alone = answers(result, dataset)
     return max(float(np.abs(a - b).max()) for a, b in zip(together, alone, strict=True))
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.mesh.edges import Edges, edges_of_facets
 from wbgs_jax.mesh.facets import Facets, facets_from_mesh
@@ -118,7 +118,7 @@ def field_of(parts, rx, permittivity=4.0, conductivity=0.02, thickness=0.1, exce
         excess_amplitude=excess_amplitude,
         **{"mirror_areas": (0.0, 0.0, 0.0)} | config,
     )
-    field = wave.make_field(mesh_of(*parts, thickness=thickness), settings)
+    field = coherent.make_field(mesh_of(*parts, thickness=thickness), settings)
     params = field.init(jax.random.key(0))
     return field, params, field.plan(params, make_receiver(rx, pattern=pattern))
 

@@ -18,7 +18,7 @@ from commands import assert_error_for_people, call
 from synthetic import tiny_dataset, tiny_scene, tiny_settings
 from untrained import make_coherent_run
 
-from wbgs_jax._util import files as archives
+from wbgs_jax._util import files
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_yaml, safe_name
 from wbgs_jax.commands import evaluate as evaluation
@@ -186,7 +186,7 @@ def test_a_pipe_is_no_file(tmp_path):
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(archives, "MOST_BYTES", 10_000_000)
+    monkeypatch.setattr(files, "MOST_BYTES", 10_000_000)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.npy", b"\0" * 20_000_000)
     assert (tmp_path / "bomb.npz").stat().st_size < 100_000

@@ -9,7 +9,7 @@ from rooms import box, mesh_of, room
 from synthetic import tiny_scene
 
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS
 from wbgs_jax.training.loop import Run
 from wbgs_jax.types import make_query
@@ -56,11 +56,11 @@ def heard_in(run, params, tx_positions, frequencies_hz):
     """Snapshots of all places at all frequencies (tx, 1, freq, 16), paths and all."""
     n_tx, n = len(tx_positions), len(frequencies_hz)
     query = make_query(np.repeat(tx_positions, n, 0), np.tile(frequencies_hz, n_tx))
-    heard = jax.jit(wave.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
+    heard = jax.jit(coherent.snapshots)(params, run.field.plan(params, run.dataset.receiver()), query)
     return np.asarray(heard).reshape(n_tx, 1, n, 16)
 
 
 @jax.jit
 def snapshots(params, plan, cache, links):
     """What the coherent field says of links of one receiver whose paths are prepared."""
-    return wave.path_snapshots(params, plan, cache.of(links), links.query.frequency_hz)
+    return coherent.path_snapshots(params, plan, cache.of(links), links.query.frequency_hz)

@@ -102,7 +102,7 @@ def score(
     Returns:
         n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
         strongest direction (median); beam_loss_db and beam_loss_top3_db, the power lost by using the best of one or three
-        predicted beams (means, `beams.py`). The same figures in per_frequency, a list by ascending frequency_ghz, and in
+        predicted beams (means). The same figures in per_frequency, a list by ascending frequency_ghz, and in
         in_sight and out_of_sight, where `sight` is given and there are such spectra.
 
     Raises:

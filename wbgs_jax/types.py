@@ -23,9 +23,8 @@ SurfaceSampling = Literal["solid_angle", "area"]
 MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 1e9, 100e9
 """The band of the paper."""
 LOWEST_OF_PATHS_HZ = 0.3e9
-"""Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms."""
-LOWEST_FREQUENCY_HZ, HIGHEST_FREQUENCY_HZ = LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
-"""What lies beyond can never be asked for: such data are of another unit, or nothing for this model."""
+"""Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms. Data below it, or
+above the paper's band, can never be asked for: they are of another unit, or nothing for this model."""
 LARGEST_COORDINATE_M = 2e3
 """Larger numbers are millimetres by mistake, or coordinates of a map: there single precision is too coarse for waves."""
 
@@ -211,7 +210,7 @@ def check_query(query: Query) -> None:
     check_array("tx_position", query.tx_position, ("b", 3))
     check_array("frequency_hz", query.frequency_hz, (query.tx_position.shape[0],))
     frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)
-    if frequency is not None and frequency.size and not frequency.min() >= LOWEST_FREQUENCY_HZ:
+    if frequency is not None and frequency.size and not frequency.min() >= LOWEST_OF_PATHS_HZ:
         raise ValueError(f"frequency_hz holds {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")
     if position is not None and position.size and not np.abs(position).max() <= LARGEST_COORDINATE_M:
         raise ValueError(f"tx_position holds {np.abs(position).max():g}; positions are in metres and finite")

@@ -17,7 +17,7 @@ from wbgs_jax._util.cli import say
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.coherent_settings import MAX_FACETS
 from wbgs_jax.types import Mesh, make_query, make_receiver
@@ -49,30 +49,30 @@ def measure(report: Report, effort: Effort) -> None:
 @jax.jit
 def answer(params: Any, plan: Any, paths: Any, place: Any, frequency_hz: Float[jax.Array, " b"]) -> Any:
     """Returns spectra, snapshots and powers of transmitters whose paths are known."""
-    return wave.observe(params, plan, jax.tree.map(lambda leaf: leaf[place], paths), frequency_hz)
+    return coherent.observe(params, plan, jax.tree.map(lambda leaf: leaf[place], paths), frequency_hz)
 
 
 def measure_scene(report: Report, effort: Effort, number: str) -> None:
     """A released scene by its own numbers: everything that does not depend on the query is planned."""
     say(f"rays: scene {number}")
     dataset = load_dataset(number)
-    field = wave.make_field(DatasetScene(dataset).mesh())
+    field = coherent.make_field(DatasetScene(dataset).mesh())
     params, receiver = tracers.known_params(field, dataset), dataset.receiver()
     plan = field.plan(params, receiver)
     asked = dataset.query(first_links(dataset, BLOCK_TX))
     some, tens = asked.tx_position, jnp.asarray(frequencies_of(dataset), jnp.float32)
 
     def block() -> Any:
-        paths = wave.trace(plan, some)
+        paths = coherent.trace(plan, some)
         return [answer(params, plan, paths, jnp.full(len(tens), one), tens) for one in range(len(some))]
 
     def single() -> Any:
-        return answer(params, plan, wave.trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
+        return answer(params, plan, coherent.trace(plan, some[:1]), jnp.zeros(len(tens), int), tens)
 
     def outside() -> Any:
         return field.render(params, plan, jax.tree.map(lambda leaf: leaf[:1], asked))
 
-    ready, traced = (lambda: field.plan(params, receiver)), (lambda: wave.trace(plan, some))
+    ready, traced = (lambda: field.plan(params, receiver)), (lambda: coherent.trace(plan, some))
     calls = {"receiver": ready, "trace": traced, "block": block, "single": single, "outside": outside}
     seconds = interleaved(calls, effort)
     report.add_time(f"rays_scene{number}_receiver_ready", seconds["receiver"])
@@ -86,13 +86,13 @@ def _measure_hall(report: Report, effort: Effort, facets: int) -> None:
     """A hall full of boxes: how work grows with the number of facets."""
     say(f"rays: a hall of {facets} facets")
     rng = np.random.default_rng([effort.seed, facets])
-    field = wave.make_field(hall(facets, rng), WaveConfig(max_facets=MAX_FACETS))
+    field = coherent.make_field(hall(facets, rng), WaveConfig(max_facets=MAX_FACETS))
     receiver, params = make_receiver(HALL * [0.1, 0.5, 0.9]), field.init(jax.random.key(0))
     plans: list[Any] = []
     ready = timed(lambda: plans.append(field.plan(params, receiver)))
     plan, tx = plans[0], rng.uniform(HALL * [0.1, 0.1, 0.8], HALL * 0.95, (CROWD, 3))
     query = make_query(tx, 28e9)
-    compiled = wave.trace.lower(plan, query.tx_position).compile()
+    compiled = coherent.trace.lower(plan, query.tx_position).compile()
     every = jnp.arange(CROWD)
     calls = {"query": lambda: answer(params, plan, compiled(plan, query.tx_position), every, query.frequency_hz)}
     seconds = interleaved(calls, dataclasses.replace(effort, repeats=3))["query"] / CROWD

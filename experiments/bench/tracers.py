@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, with_entry
@@ -42,7 +42,7 @@ def slab_of(name: str) -> tuple[str, float]:
     return entry.replace("_", " "), float(thickness)
 
 
-def known_params(field: wave.WaveField, dataset: Dataset) -> Any:
+def known_params(field: coherent.WaveField, dataset: Dataset) -> Any:
     """Returns parameters with the materials by the names that a released scene gives them."""
     params = field.init(jax.random.key(0))
     materials, names = params.materials, () if dataset.materials is None else dataset.materials.names
@@ -56,9 +56,9 @@ def known_params(field: wave.WaveField, dataset: Dataset) -> Any:
 class Ours:
     """The coherent field with its materials known, one isotropic element."""
 
-    def __init__(self, dataset: Dataset, config: wave.WaveConfig):
+    def __init__(self, dataset: Dataset, config: coherent.WaveConfig):
         begin = time.perf_counter()
-        field = wave.make_field(DatasetScene(dataset).mesh(), config)
+        field = coherent.make_field(DatasetScene(dataset).mesh(), config)
         self.params = known_params(field, dataset)
         self.plan = field.plan(self.params, make_receiver(dataset.receiver().position, element_positions=np.zeros((1, 3))))
         self.set_up_s = time.perf_counter() - begin
@@ -80,8 +80,8 @@ class Ours:
 
 @jax.jit
 def _ours(params: Any, plan: Any, tx: Any, frequencies_hz: Any) -> Any:
-    paths = wave.trace(plan, tx)
-    one = jax.vmap(lambda paths, f: wave.arrivals_at(params, plan, paths, f), (None, 0))
+    paths = coherent.trace(plan, tx)
+    one = jax.vmap(lambda paths, f: coherent.arrivals_at(params, plan, paths, f), (None, 0))
     return jax.vmap(one, (0, None))(paths, frequencies_hz)
 
 

@@ -20,7 +20,7 @@ from jax import export
 from experiments.bench.scene import random_scene
 from experiments.gpu_check.cases import ROOMS, SMALL_ROOMS, Case
 from experiments.gpu_check.record import NEEDED, NEEDED_OF_STAND_IN, Record, rounded
-from wbgs_jax.splat import fused_kernels as gpu_arithmetic
+from wbgs_jax.splat import fused_kernels
 
 TOLERANCE = {"values": 5e-3, "gradients": 2e-2}
 """Of the norm of a difference relative to the norm: phases at 94 GHz are known to 1e-3 radians in single precision. Positions
@@ -133,7 +133,7 @@ def for_cuda(case: Case) -> Any:
         return values
 
     anywhere = [export.DisabledSafetyCheck.platform()]
-    with gpu_arithmetic.interpreted():
+    with fused_kernels.interpreted():
         program = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=anywhere)(*leaves)
     return jax.device_get(jax.tree.unflatten(shape[0], program.call(*leaves)))
 

@@ -19,7 +19,7 @@ from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
-from wbgs_jax.inference import evaluate_quantities as asking
+from wbgs_jax.inference import evaluate_quantities
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.training import checkpoint
@@ -276,7 +276,7 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
     whole, out, part = tmp_path / "whole.npz", tmp_path / "a.npz", tmp_path / "a.npz.part"
     ask = [*hearing, "--line", "0,0,1:2,0,1:5", "--ghz", 2, 5, "--what", "power"]
     assert predict(*ask, "--out", whole).code == 0
-    real, asked = asking.answer_block, []
+    real, asked = evaluate_quantities.answer_block, []
 
     def interrupted(*arguments):
         if len(asked) == 1:
@@ -284,11 +284,11 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
         asked.append(arguments)
         return real(*arguments)
 
-    monkeypatch.setattr(asking, "answer_block", interrupted)
+    monkeypatch.setattr(evaluate_quantities, "answer_block", interrupted)
     stopped = predict(*ask, "--out", out)
     assert stopped.code == 130 and not out.exists() and part.is_dir()
     assert "1 of 3 blocks are kept" in stopped.err and stopped.lines[-1] == "interrupted"
-    monkeypatch.setattr(asking, "answer_block", lambda *arguments: asked.append(arguments) or real(*arguments))
+    monkeypatch.setattr(evaluate_quantities, "answer_block", lambda *arguments: asked.append(arguments) or real(*arguments))
     refused = predict(*ask, "--out", out)
     assert refused.code == 2 and "--resume" in refused.err
     refused = predict(*hearing, "--line", "0,0,1:2,0,1:6", "--ghz", 2, 5, "--what", "power", "--out", out, "--resume")
@@ -303,8 +303,10 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
 
 def test_a_picture_alone_asks_for_no_more_than_it_shows(hearing, tmp_path, monkeypatch):
     sizes = []
-    real = asking.answer_block
-    monkeypatch.setattr(asking, "answer_block", lambda *a: sizes.append(sum(len(p.rows) for p in a[-1])) or real(*a))
+    real = evaluate_quantities.answer_block
+    monkeypatch.setattr(
+        evaluate_quantities, "answer_block", lambda *a: sizes.append(sum(len(p.rows) for p in a[-1])) or real(*a)
+    )
     result = predict(*hearing, "--line", "0,0,1:2,0,1:900", "--ghz", 2, "--picture", tmp_path / "a.png")
     assert (result.code, sizes) == (0, [12])
 

@@ -141,7 +141,7 @@ def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tm
     (held_out,) = set(split.tx_index[split.validation])
     assert held_out not in split.tx_index[split.train]
     reports, drawn = {}, []
-    monkeypatch.setattr(eval_command.pictures, "draw_all", lambda folder, *_: drawn.append(folder) or [])
+    monkeypatch.setattr(eval_command.plotting, "draw_all", lambda folder, *_: drawn.append(folder) or [])
     for part in ("test", "validation"):
         result = call(eval_command.main, "--run", run, "--part", part, "--json", "--results", tmp_path / "results")
         assert result.code == 0, result.err

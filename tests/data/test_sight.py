@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from synthetic import RX, tiny_dataset
 
-from wbgs_jax.data import scene as sight
+from wbgs_jax.data import scene
 from wbgs_jax.data.scene import in_sight
 
 
@@ -41,7 +41,7 @@ def test_triangles_far_from_a_line_need_no_look(rng):
     normals = trimesh.unitize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     start = np.asarray(dataset.receivers.position, float)[0]
     ends = dataset.tx_positions[np.unique(dataset.tx_index, return_index=True)[1]]
-    expected = [not sight._obstructed(np.stack([start, end]), corners, normals) for end in ends]
+    expected = [not scene._obstructed(np.stack([start, end]), corners, normals) for end in ends]
     assert 0 < sum(expected) < 200
     np.testing.assert_array_equal(of_transmitters(dataset), expected)
 

@@ -8,13 +8,13 @@ from synthetic import tiny_dataset
 
 from experiments.bench import rays, timing, tracers
 from experiments.bench.tracers import Found, compare
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 
 
 @pytest.mark.parametrize("facets", [30, 500])
 def test_a_hall_has_the_facets_that_are_asked_for(facets, rng):
-    field = wave.make_field(rays.hall(facets, rng), WaveConfig(max_facets=facets + 100))
+    field = coherent.make_field(rays.hall(facets, rng), WaveConfig(max_facets=facets + 100))
     corners = np.asarray(field.facets.corners).reshape(-1, 3)
     assert facets - 6 < len(field.facets.offset) <= facets
     assert (corners >= -1e-5).all() and (corners <= rays.HALL + 1e-5).all()

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.fields import networks as encoding
+from wbgs_jax.fields import networks
 
-positional_encoding = jax.jit(encoding.positional_encoding, static_argnums=1)
-scale_frequency = jax.jit(encoding.scale_frequency, static_argnums=1)
-frequency_encoding = jax.jit(encoding.frequency_encoding, static_argnums=(1, 2))
+positional_encoding = jax.jit(networks.positional_encoding, static_argnums=1)
+scale_frequency = jax.jit(networks.scale_frequency, static_argnums=1)
+frequency_encoding = jax.jit(networks.frequency_encoding, static_argnums=(1, 2))
 
 
 def test_positional_encoding_equals_its_formula(rng, x64):
@@ -52,13 +52,13 @@ def test_neighbouring_bands_stay_apart_in_single_precision():
 
 def test_the_gradient_is_finite_over_six_decades():
     frequency = jnp.asarray(np.logspace(6, 12, 50), jnp.float32)
-    gradient = np.asarray(jax.jit(jax.grad(lambda f: jnp.sum(encoding.frequency_encoding(f, 4))))(frequency))
+    gradient = np.asarray(jax.jit(jax.grad(lambda f: jnp.sum(networks.frequency_encoding(f, 4))))(frequency))
     assert np.isfinite(gradient).all() and (gradient != 0).all()
 
 
 @pytest.mark.parametrize("degree", [1, 2, 5])
 def test_legendre_polynomials_are_numpys(rng, x64, degree):
     x = rng.uniform(-1, 1, (3, 4))
-    found = encoding.legendre(jnp.asarray(x), degree)
+    found = networks.legendre(jnp.asarray(x), degree)
     assert found.shape == (3, 4, degree)
     np.testing.assert_allclose(found, np.polynomial.legendre.legvander(x, degree)[..., 1:], rtol=1e-12, atol=1e-14)

@@ -17,8 +17,7 @@ from synthetic import FIELDS
 from wbgs_jax import fields
 from wbgs_jax._util.pytree import replaced, with_leaves
 from wbgs_jax.data.scene import surface_from_points
-from wbgs_jax.fields import coherent as wave
-from wbgs_jax.fields import get_field, wideband
+from wbgs_jax.fields import coherent, get_field, wideband
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.propagation.materials import Slabs
 from wbgs_jax.propagation.paths import Paths
@@ -68,7 +67,7 @@ def single_field_of(name):
             parts, materials = [*parts, box((4, 1, 0.5), (5, 2, 1.2))], [*materials, 2]
         tried = {"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 16}
         config = dataclasses.replace(FIELDS["wave"], mirror_areas=(0.0,), **tried)
-        made = wave.make_field(mesh_of(*parts, material=materials), config)
+        made = coherent.make_field(mesh_of(*parts, material=materials), config)
         made = dataclasses.replace(made, known_thickness=jnp.array([0.0, 0.1, 0.0]))
     elif name == "nerf2":
         made = Nerf2Field(jnp.array([[0.0, 0, 0], [6, 4, 3]]), Nerf2Config(**SMALL_VOLUME))

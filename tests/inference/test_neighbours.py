@@ -11,7 +11,7 @@ from synthetic import RX, tiny_dataset
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.inference import kriging as asked
+from wbgs_jax.inference import kriging
 from wbgs_jax.inference.kriging import NEAREST, NOISE, correct, for_receiver, read_neighbours, write_neighbours
 from wbgs_jax.training.fit_kriging import Choice, choices, images_of, make_neighbours
 from wbgs_jax.types import make_query, make_receiver
@@ -44,11 +44,11 @@ def by_the_equations(dataset, index, choice, values, position, frequency):
 def test_what_is_scored_is_not_asked(known):
     dataset, index, _, predicted = known
     neighbours = made(Choice("spectra", 1.0, 1.0), dataset, index, predicted)
-    left = asked.without_asked(neighbours, dataset.query(index[:5]))
+    left = kriging.without_asked(neighbours, dataset.query(index[:5]))
     np.testing.assert_array_equal(left.images, neighbours.images[5:])
     np.testing.assert_allclose(left.tx_position, dataset.tx_positions[index[5:]], rtol=1e-6)
     np.testing.assert_array_equal(left.frequency_hz, neighbours.frequency_hz[5:])
-    assert asked.without_asked(neighbours, dataset.query(index)) is None is asked.without_asked(None, dataset.query(index))
+    assert kriging.without_asked(neighbours, dataset.query(index)) is None is kriging.without_asked(None, dataset.query(index))
 
 
 @pytest.mark.parametrize("kind", ["residuals", "spectra"])
@@ -136,7 +136,7 @@ def test_they_belong_to_one_receiver_and_to_a_run_folder(known, tmp_path):
     found, query = read_neighbours(tmp_path), dataset.query(index[:4])
     own = jnp.asarray(predicted[:4])
     np.testing.assert_allclose(correct(found, own, query), correct(neighbours, own, query), atol=0.01)
-    (tmp_path / asked.FILE).write_bytes(b"PK\x03\x04 no archive")
+    (tmp_path / kriging.FILE).write_bytes(b"PK\x03\x04 no archive")
     with pytest.raises(UserError, match=r"neighbours\.npz is damaged"):
         read_neighbours(tmp_path)
     write_neighbours(tmp_path, None)

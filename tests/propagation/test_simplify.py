@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from rooms import box, mesh_of, rectangle
 
-from wbgs_jax.mesh import simplification as simplify
+from wbgs_jax.mesh import simplification
 from wbgs_jax.mesh.facets import areas, facets_from_mesh
 from wbgs_jax.mesh.simplification import decimated, distance_from, distances, facets_that_fit, simplified, welded
 
@@ -110,7 +110,7 @@ def test_what_fits_is_not_simplified():
 
 def test_of_many_facets_those_are_kept_that_make_up_the_surface(monkeypatch):
     """A city of equal blocks, and gravel: no fewer than cost little, no more than count."""
-    monkeypatch.setattr(simplify, "FEW", 10)
+    monkeypatch.setattr(simplification, "FEW", 10)
     blocks = [box((5 * i, 0, 0), (5 * i + 3, 2, 3)) for i in range(4)]
     gravel = [box((5 * i + 4, 0, 0), (5 * i + 4.1, 0.1, 0.1)) for i in range(4)]
     for parts, most, expected in (([*blocks, *gravel], 100, 24), ([blocks[0], *gravel], 100, 10), ([*blocks, *gravel], 23, 23)):

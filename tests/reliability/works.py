@@ -182,8 +182,8 @@ def warm() -> None:
     from matplotlib import pyplot
     from orbax.checkpoint import v1
 
-    from wbgs_jax import plotting as pictures
-    from wbgs_jax.inference import answers as opened
+    from wbgs_jax import plotting
+    from wbgs_jax.inference import answers
 
-    assert pyplot and v1 and opened and pictures
+    assert pyplot and v1 and answers and plotting
     assert not xla_bridge.backends_are_initialized(), "JAX runs already: a fork would hang"

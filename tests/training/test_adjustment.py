@@ -13,7 +13,7 @@ from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
 from wbgs_jax.propagation.displacement import Motion, length_changes, length_terms
-from wbgs_jax.training.calibration import gauss_newton as adjustment
+from wbgs_jax.training.calibration import gauss_newton
 from wbgs_jax.training.calibration.gauss_newton import adjust, adjusted_numbers, length_variances, normal_equations
 
 N_TX, FREQUENCIES = 6, np.array([1e9, 3e9])
@@ -141,7 +141,7 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
 @pytest.mark.parametrize("most", [3, 1000])
 def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch):
     """Any covariance of what is adjusted, and any variances of the rest: those of all lengths are J C J^T, written out."""
-    monkeypatch.setattr(adjustment, "MOST", most)
+    monkeypatch.setattr(gauss_newton, "MOST", most)
     numbers, movers = adjusted_numbers(run.cache, run.field.motion), len(run.field.motion.shift)
     size = ravel_pytree(run.field.motion)[0].size
     root, others = rng.normal(0, 1e-3, (len(numbers), 5)), rng.uniform(0, 1e-6, size)
@@ -162,7 +162,7 @@ def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch
 def test_the_movers_that_most_paths_meet_are_adjusted(run, monkeypatch):
     """All of them where there are few; every receiver in any case."""
     np.testing.assert_array_equal(adjusted_numbers(run.cache, run.field.motion), everything(run))
-    monkeypatch.setattr(adjustment, "MOST", 2)
+    monkeypatch.setattr(gauss_newton, "MOST", 2)
     movers, meets = len(run.field.motion.shift), np.zeros(len(run.field.motion.shift))
     for some in (run.cache.paths.specular, run.cache.paths.diffracted):
         number, derivative = jax.vmap(lambda paths: length_terms(paths, run.cache.surfaces, movers))(some)

@@ -3,12 +3,12 @@
 import pytest
 
 from wbgs_jax.fields import Field, default_field, get_field
-from wbgs_jax.training import progress as estimate
+from wbgs_jax.training import progress
 from wbgs_jax.training.progress import duration_words, expected_seconds
 
 
 def test_a_slower_machine_takes_longer(monkeypatch):
-    monkeypatch.setattr(estimate, "_probe", lambda: 2 * estimate.PROBE_SECONDS)
+    monkeypatch.setattr(progress, "_probe", lambda: 2 * progress.PROBE_SECONDS)
     field = get_field(default_field())
     whole = expected_seconds(field, "cpu")
     assert whole == 2 * field.seconds["cpu"]
@@ -17,7 +17,7 @@ def test_a_slower_machine_takes_longer(monkeypatch):
 
 
 def test_the_probe_takes_a_moment():
-    assert 0 < estimate._probe() < 5
+    assert 0 < progress._probe() < 5
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from synthetic import tiny_dataset
 from toys import RippleField, registered, toy_settings
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
-from wbgs_jax.training import cross_validation as folds
+from wbgs_jax.training import cross_validation
 from wbgs_jax.training.cross_validation import FOLDS, blocks, held_out_blocks, shortened
 
 
@@ -39,17 +39,17 @@ def test_links_of_a_transmitter_share_a_block(rng):
 def test_nothing_answers_that_was_trained_with_it(tmp_path, monkeypatch):
     dataset = hold_out_validation(tiny_dataset(15))
     trained = []
-    true_train = folds.train
+    true_train = cross_validation.train
 
     def watched(part, *arguments, **options):
         trained.append(part)
         return true_train(part, *arguments, **options)
 
-    monkeypatch.setattr(folds, "train", watched)
+    monkeypatch.setattr(cross_validation, "train", watched)
     said = []
     found = held_out_blocks(dataset, "ripple", shortened(toy_settings(), 8), 0, tmp_path, 0, said.append)
     known = training_links(dataset)
-    assert len(trained) == len(said) == FOLDS and not (tmp_path / folds.FOLDER).exists()
+    assert len(trained) == len(said) == FOLDS and not (tmp_path / cross_validation.FOLDER).exists()
     assert set(found.links) == set(known)
     for link, use, group in zip(found.links, found.known, found.group, strict=True):
         own = trained[group]
@@ -61,9 +61,9 @@ def test_nothing_answers_that_was_trained_with_it(tmp_path, monkeypatch):
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     dataset = hold_out_validation(tiny_dataset(9))
     asked = dataset, "ripple", shortened(toy_settings(), 8), 0, tmp_path, 0
-    monkeypatch.setattr(folds, "shutil", type("kept", (), {"rmtree": staticmethod(lambda *_, **__: None)}))
+    monkeypatch.setattr(cross_validation, "shutil", type("kept", (), {"rmtree": staticmethod(lambda *_, **__: None)}))
     first = held_out_blocks(*asked, lambda line: None)
-    monkeypatch.setattr(folds, "train", lambda *_, **__: pytest.fail("trained again"))
+    monkeypatch.setattr(cross_validation, "train", lambda *_, **__: pytest.fail("trained again"))
     second = held_out_blocks(*asked, lambda line: None)
     np.testing.assert_allclose(first.pas, second.pas, atol=1e-3)
 

@@ -13,8 +13,8 @@ from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.fields.mixture import SHARES
 from wbgs_jax.inference.mixture import answer
 from wbgs_jax.metrics import ssim
+from wbgs_jax.training import fit_mixture
 from wbgs_jax.training import fit_mixture as module
-from wbgs_jax.training import fit_mixture as stacking
 from wbgs_jax.training.fit_mixture import (
     ERRORS,
     ERRORS_WITH_PATHS,
@@ -59,7 +59,7 @@ def held(dataset, known, pas):
 
 
 def test_the_ssim_of_mixtures_is_that_of_scikit_image(rng, monkeypatch):
-    monkeypatch.setattr(stacking, "STRIDE", 1)
+    monkeypatch.setattr(fit_mixture, "STRIDE", 1)
     spectra, truth = rng.random((2, 3, 90, 360)), rng.random((2, 90, 360))
     weights = rng.dirichlet(np.ones(3), 2)
     mixed = np.einsum("nk,nkij->nij", weights, spectra)

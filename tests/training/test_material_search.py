@@ -11,7 +11,7 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, THICKNESS, places, run_in, snapshots
 
 from wbgs_jax.config import changed
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.calibration import pipeline as search_module
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, search_materials, with_entry
@@ -165,7 +165,7 @@ def test_it_is_left_out_when_resumed_or_switched_off(steps, rounds, run_on, tmp_
 
 
 _thickness = jax.jit(
-    jax.value_and_grad(lambda params, plan: jnp.sum(wave.slabs_at(params, plan, jnp.float32(28e9)).thickness)), inline=True
+    jax.value_and_grad(lambda params, plan: jnp.sum(coherent.slabs_at(params, plan, jnp.float32(28e9)).thickness)), inline=True
 )
 
 

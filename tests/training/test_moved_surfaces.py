@@ -11,9 +11,8 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
 
-from wbgs_jax.fields import coherent as wave
-from wbgs_jax.training.calibration import alignment as geometry
-from wbgs_jax.training.calibration import pipeline as search
+from wbgs_jax.fields import coherent
+from wbgs_jax.training.calibration import alignment, pipeline
 from wbgs_jax.training.calibration.alignment import GeometryReport, Place, frequencies_apart, learn_geometry
 from wbgs_jax.training.calibration.antennas import AntennaReport, antenna_candidates
 from wbgs_jax.training.calibration.objective import make_scores
@@ -112,12 +111,12 @@ def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_h
 @pytest.mark.heavy
 def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path, monkeypatch):
     run, likely, traced = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), {0: [Slab("wood", 0.02)]}, []
-    monkeypatch.setattr(geometry, "adjust", lambda field, params, cache, motion, covariance, *_: (motion, covariance))
+    monkeypatch.setattr(alignment, "adjust", lambda field, params, cache, motion, covariance, *_: (motion, covariance))
     cache = run.cache  # which is prepared when it is first asked for
     monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or cache)
-    heard = geometry._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
+    heard = alignment._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
     now = Place(run.field, run.state.params, run.cache, likely=likely)
-    assert geometry._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
+    assert alignment._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
 
 
 @pytest.mark.heavy
@@ -133,14 +132,14 @@ def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_
     there = run.field.moved(motion)
 
     def heard_by(plan, paths):
-        return wave.path_snapshots(params, plan, paths, query.frequency_hz)
+        return coherent.path_snapshots(params, plan, paths, query.frequency_hz)
 
-    paths = wave.trace(plan, query.tx_position)
+    paths = coherent.trace(plan, query.tx_position)
     elsewhere = there.plan(params, receiver)
     still, first_order = (
         np.asarray(jax.jit(heard_by)(p, paths)) for p in (plan, run.field.displaced(plan, motion.of_receiver(0)))
     )
-    exact = np.asarray(jax.jit(heard_by)(elsewhere, wave.trace(elsewhere, query.tx_position)))
+    exact = np.asarray(jax.jit(heard_by)(elsewhere, coherent.trace(elsewhere, query.tx_position)))
     error, change = (np.linalg.norm(x - exact, axis=-1) / np.linalg.norm(exact, axis=-1) for x in (first_order, still))
     assert np.median(error) < 0.2 * np.median(change) and np.median(change) > 0.02, (np.median(error), np.median(change))
 
@@ -166,8 +165,8 @@ def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     still = run.field.motion
     moved = run.field.moved(dataclasses.replace(still, shift=still.shift + 1e-3))
     report = GeometryReport(-1.0, -2.0, True, True, 1.0, 1.0, 0.0, 0.0, 0.0)
-    monkeypatch.setattr(search, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
-    run.controls = (search.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
+    monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
+    run.controls = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
     run.control()
     assert run.field is moved
     assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
@@ -179,14 +178,14 @@ def test_an_antenna_that_was_dropped_is_reported_no_more(truth, tmp_path, monkey
     new, antenna = run.state.params, antenna_candidates()["dipole along +x"]
     taken = {"transmitter": "dipole along +x", "element": "dipole along +x"}
     found = dataclasses.replace(new, transmitter=antenna, element=antenna)
-    monkeypatch.setattr(search, "search_antennas", lambda *_: (found, AntennaReport(-1.0, -2.0, taken)))
+    monkeypatch.setattr(pipeline, "search_antennas", lambda *_: (found, AntennaReport(-1.0, -2.0, taken)))
     report = GeometryReport(-1.0, -2.0, True, False, 1.0, 1.0, 0.0, 0.0, 0.0)
 
     def moved(place, *_):
         return dataclasses.replace(place, params=dataclasses.replace(place.params, transmitter=new.transmitter)), report
 
-    monkeypatch.setattr(search, "learn_geometry", moved)
-    run.controls = (search.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
+    monkeypatch.setattr(pipeline, "learn_geometry", moved)
+    run.controls = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
     run.control()
     assert list(json.loads((tmp_path / "metrics.jsonl").read_text())["antennas"]["taken"]) == ["element"]
 
@@ -214,8 +213,8 @@ def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, hig
 def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_it(truth, metres, tmp_path, rng, monkeypatch):
     run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []
     report = GeometryReport(-1.0, -1.0, False, True, 1.0, 1.0, 0.0, 0.0, 0.0)
-    monkeypatch.setattr(search, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
-    run.controls = (search.Search(SETTINGS.search),)
+    monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
+    run.controls = (pipeline.Search(SETTINGS.search),)
     run.control()
     found = json.loads((tmp_path / "metrics.jsonl").read_text())["doubt"]
     assert (len(asked) == 1) == (metres > 0) == (found["spread_mm"] > 0.5), found

@@ -10,7 +10,7 @@ from synthetic import tiny_scene, tiny_settings
 from wave_runs import PARTS, places, run_in
 
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.training.calibration import objective as scores
+from wbgs_jax.training.calibration import objective
 from wbgs_jax.training.calibration.material_fit import with_entry
 from wbgs_jax.training.calibration.objective import make_scores, surely_better
 from wbgs_jax.training.loop import Run
@@ -61,20 +61,20 @@ def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
     few = run.field.prepare(jax.tree.map(lambda leaf: leaf[one_tx], run.data.links), run.data.receivers)
     candidates = [other_materials(params, rng) for _ in range(11)]
     found = make_scores(run.field, run.cache, run.data, jnp.asarray(train))(candidates)
-    programs = scores._score._cache_size()
+    programs = objective._score._cache_size()
     np.testing.assert_allclose(
         make_scores(run.field, few, run.data, jnp.asarray(one_tx))(candidates[:9]), found[:9, np.isin(train, one_tx)], atol=1e-4
     )
-    assert scores._score._cache_size() == programs
+    assert objective._score._cache_size() == programs
     score = make_scores(run.field, run.cache, run.data, jnp.asarray(train))
     np.testing.assert_allclose(score(candidates[:1]), found[:1], atol=1e-4)  # one differs from nothing
     named = [dataclasses.replace(params, materials=with_entry(params.materials, 0, "wood", metres)) for metres in (None, 0.1)]
     score(named)
-    programs = scores._score._cache_size()
+    programs = objective._score._cache_size()
     assert (score(named[:1]).shape, score(named[1:]).shape) == ((1, len(train)), (1, len(train)))
-    assert scores._score._cache_size() == programs
+    assert objective._score._cache_size() == programs
     np.testing.assert_allclose(score(candidates * 4), np.tile(found, (4, 1)), atol=1e-4)  # 32, 6 and 6
-    assert scores._score._cache_size() == programs + 1
+    assert objective._score._cache_size() == programs + 1
 
 
 def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):

@@ -9,7 +9,7 @@ import pytest
 from synthetic import tiny_settings
 from wave_runs import PARTS, places, run_in
 
-from wbgs_jax.fields import coherent as wave
+from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning
 from wbgs_jax.training.calibration.objective import Told
 from wbgs_jax.types import make_query
@@ -48,7 +48,7 @@ def run(tmp_path_factory):
 
 def heard_by(run, field, params):
     query = make_query(np.repeat(PLACES, len(FREQUENCIES), 0), np.tile(FREQUENCIES, N_TX))
-    heard = jax.jit(wave.snapshots)(params, field.plan(params, run.dataset.receiver()), query)
+    heard = jax.jit(coherent.snapshots)(params, field.plan(params, run.dataset.receiver()), query)
     return np.asarray(heard).reshape(N_TX, 1, len(FREQUENCIES), 16)
 
 

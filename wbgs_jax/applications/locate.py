@@ -1,7 +1,7 @@
 """Where a transmitter stands, from what receivers observe of it: the place whose answers of a trained field are most alike.
 
 A grid over the scene is asked once; an observation is compared with it, and gradient steps lead on from the best places that
-stand apart (`descent.py`). A planar array cannot tell its front from its back, and rooms have places that sound alike: the
+stand apart (`multistart.py`). A planar array cannot tell its front from its back, and rooms have places that sound alike: the
 runners-up say how ambiguous an observation is.
 """
 

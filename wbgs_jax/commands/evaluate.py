@@ -18,7 +18,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from wbgs_jax import plotting as pictures
+from wbgs_jax import plotting
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
@@ -74,10 +74,10 @@ def main(arguments: list[str] | None = None) -> None:
     if command.pictures and dataset.kind != "power":
         entries = curves.read(command.run / "metrics.jsonl")
         folder = command.run / f"{with_part('pictures', command.part)}{beside}"
-        for path in pictures.draw_all(folder, dataset, index, predicted, report, entries):
+        for path in plotting.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
         if (displaced := trained.field.displaced_surfaces()) is not None:
-            console.print(f"picture: {pictures.draw_motion(folder, *displaced)}")
+            console.print(f"picture: {plotting.draw_motion(folder, *displaced)}")
     if command.json:
         print(json.dumps(report, allow_nan=False))
         return

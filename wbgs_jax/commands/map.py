@@ -68,7 +68,7 @@ def check(command: Command) -> None:
 
 
 def plane_of(command: Command, dataset: Any) -> Any:
-    """Returns the `floor.Plane` that is asked for; one that is empty or has too many places is a `UserError`."""
+    """Returns the `radio_map.Plane` that is asked for; one that is empty or has too many places is a `UserError`."""
     from wbgs_jax.data.scene import DatasetScene
     from wbgs_jax.inference.radio_map import plane_over
 

@@ -25,7 +25,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.inference import queries as asked
-from wbgs_jax.inference import results_file as writing
+from wbgs_jax.inference import results_file
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.inference.results_file import Answers, open_parts
 
@@ -228,14 +228,14 @@ def answer(command: Command, queries: Queries) -> None:
     opened = open_field(command.run, command.rx, command.what, queries, lowest, options, lambda: _load(command.run))
     _warn(opened, queries)
     answers = ask(command, queries, opened)
-    for line in writing.lines(command.what, answers, queries, opened.source):
+    for line in results_file.lines(command.what, answers, queries, opened.source):
         say(line)
     count = f"{len(queries)} queries"
     if not queries.paired:
         count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
     if command.out:
         replaced = ", in the place of another file" if command.out.exists() else ""
-        writing.write(command.out, command.what, answers, queries, opened.source)
+        results_file.write(command.out, command.what, answers, queries, opened.source)
         say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
         write_picture(command.picture, command.what, answers, queries)

@@ -45,9 +45,9 @@ from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, t
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.types import (
-    HIGHEST_FREQUENCY_HZ,
     LARGEST_COORDINATE_M,
-    LOWEST_FREQUENCY_HZ,
+    LOWEST_OF_PATHS_HZ,
+    MAX_FREQUENCY_HZ,
     make_receiver,
     stack_receivers,
 )
@@ -117,7 +117,7 @@ def ghz_to_hz(word: str, where: Path) -> float:
         hertz = float(Decimal(word).scaleb(9))
     except (ArithmeticError, ValueError):
         hertz = np.nan
-    if not LOWEST_FREQUENCY_HZ <= hertz <= HIGHEST_FREQUENCY_HZ:
+    if not LOWEST_OF_PATHS_HZ <= hertz <= MAX_FREQUENCY_HZ:
         raise UserError(f"{where}: the frequency {word[:40]!r} is no number of GHz from 0.3 to 100; write 0.92 for 920 MHz")
     return hertz
 
@@ -285,7 +285,7 @@ def _read_frequencies(
                 stacklevel=3,
             )
         single = NOMINAL_FREQUENCY_HZ if single is None else single
-        if not LOWEST_FREQUENCY_HZ <= single <= HIGHEST_FREQUENCY_HZ:
+        if not LOWEST_OF_PATHS_HZ <= single <= MAX_FREQUENCY_HZ:
             raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; the model knows 0.3 to 100 GHz")
         return np.full(n, single, np.float64)
     if wanted_hz is not None:

@@ -169,9 +169,7 @@ def load_dataset(
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.
     """
-    from wbgs_jax.data.image_folder import (
-        load_layout,  # here: `python -m wbgs_jax.data.image_folder` must not find itself imported
-    )
+    from wbgs_jax.data.image_folder import load_layout  # here: it needs `scene_dataset`
 
     if (path := released_scenes().get(str(source))) is not None:
         return scene_dataset(load_scene(path))

@@ -21,7 +21,7 @@ from jaxtyping import Complex, Float, Int, UInt8
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays, safe_name, told
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.types import HIGHEST_FREQUENCY_HZ, LARGEST_COORDINATE_M, LOWEST_FREQUENCY_HZ, ElementUnit
+from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, ElementUnit
 
 TRAIN, TEST, VALIDATION = 0, 1, 2
 """Values of `split`."""
@@ -148,10 +148,10 @@ def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
     if (power := arrays.get("power_db")) is not None:
         _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
     lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
-    band = f"the model knows {LOWEST_FREQUENCY_HZ:g} to {HIGHEST_FREQUENCY_HZ:g} Hz"
+    band = f"the model knows {LOWEST_OF_PATHS_HZ:g} to {MAX_FREQUENCY_HZ:g} Hz"
     _demand(lowest > 0, "frequencies_hz must be positive")
-    _demand(lowest >= LOWEST_FREQUENCY_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz, and {band}")
-    _demand(highest <= HIGHEST_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz, and {band}")
+    _demand(lowest >= LOWEST_OF_PATHS_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz, and {band}")
+    _demand(highest <= MAX_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz, and {band}")
     split = np.isin(arrays["split"], (TRAIN, TEST, VALIDATION))
     _demand(split.all(), "split must hold 0 (train), 1 (test) and 2 (validation) only")
     lengths = np.linalg.norm(arrays["rx_orientation"], axis=-1)
@@ -164,8 +164,6 @@ def _check_texts(arrays: dict[str, np.ndarray], n_receivers: int) -> None:
     _demand(unit.shape == () and str(unit) in units, f"element_unit must be {' or '.join(units)}")
     _demand(pattern.dtype.kind == "U" and shape in ((), (n_receivers,)), "element_pattern must be a name, or one a receiver")
 
-
-__all__ = ["FORMAT", "TEST", "TRAIN", "VALIDATION", "SceneFile", "load_scene", "save_scene"]
 
 FORMAT = 2
 """Of files that are written; older ones are read."""

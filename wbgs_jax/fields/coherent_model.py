@@ -85,7 +85,7 @@ class WaveParams:
     stand from where they are said to be."""
     thick: Float[Array, ""]
     """1 where waves behind slabs lack the phase of the air that stood there, as in nature, 0 where not, as in ray tracers
-    (`slab.slab_coefficients`)."""
+    (`materials.slab_coefficients`)."""
     curved: Float[Array, ""]
     """1 where waves reach the array as spheres, as in nature, 0 where they are plane (`transport.element_voltages`)."""
     clutter: Float[Array, "x y z 2"] | None

@@ -4,7 +4,7 @@ The coherent field is right to the phase where mesh and physics are, and can be 
 needs neither and blurs. Its networks may see what the coherent field says, and so learn where that is wrong: behind furniture
 that the mesh lacks, say. In training they see it for half of the queries, so that the field has two opinions: one of its own,
 which errs in other places than the coherent field, and an informed one. Both fields are trained on the same batches; what the
-three opinions count for, query by query, is what explains validation transmitters best (trust.py).
+three opinions count for, query by query, is what explains validation transmitters best (mixture.py).
 Without a mesh it is the splatting field by itself.
 """
 
@@ -212,7 +212,7 @@ class HybridField(Field):
 
     def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
         """Returns the parameters with the shares that explain best what neither field was trained on; of what was not observed,
-        spectra or powers, the coherent field's are taken. With them, the floor under noisy spectra is found (noise.py)."""
+        spectra or powers, the coherent field's are taken. With them, the floor under noisy spectra is found (mixture.py)."""
         if self.wave is None or not batches:
             return params, {}
         raw = dataclasses.replace(params, trust=dataclasses.replace(params.trust, floor=jnp.zeros(())))

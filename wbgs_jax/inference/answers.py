@@ -122,18 +122,6 @@ def frequencies(ghz: tuple[float, ...], source: str = "--ghz") -> Float[np.ndarr
     return np.array(ghz) * 1e9
 
 
-__all__ = [
-    "bounds_of",
-    "check_frequencies",
-    "doubts",
-    "frequencies",
-    "link_words",
-    "point_words",
-    "receiver_at",
-    "source_of",
-    "write_answer",
-]
-
 SHORTEST = 1e-3
 """Of quaternions that are taken."""
 
@@ -226,7 +214,7 @@ class Opened(NamedTuple):
     """Who answers, and what lines and files say of it."""
 
     answer: Callable[[list[Product]], dict[str, np.ndarray]]
-    """Answers a block of queries (`asking.answer_block`)."""
+    """Answers a block of queries (`evaluate_quantities.answer_block`)."""
     bounds: Bounds
     source: dict[str, Any]
     """Scene, field, step, version and receiver (`answers.source_of`)."""
@@ -289,7 +277,7 @@ def _opened_run(
     run: Path, rx: str, what: str, queries: Queries, lowest_hz: float, options: Options, load: Callable[[], Any], few: bool
 ) -> Opened:
     # Here: what was left ready needs nothing of all this, and it takes seconds to load.
-    from wbgs_jax.inference import evaluate_quantities as asking
+    from wbgs_jax.inference import evaluate_quantities
     from wbgs_jax.inference.predictor import at_receiver
     from wbgs_jax.inference.quantities import check_known, known_quantities
 
@@ -311,7 +299,7 @@ def _opened_run(
             return _opened_ready(ready, what, queries)
 
     def answer(block: list[Product]) -> dict[str, np.ndarray]:
-        found = asking.answer_block(what, trained, dataset, receiver, options, block)
+        found = evaluate_quantities.answer_block(what, trained, dataset, receiver, options, block)
         rows = np.concatenate([product.rows for product in block])
         positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])
         return _masked(found, bounds, positions[np.argsort(rows)])

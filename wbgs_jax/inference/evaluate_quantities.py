@@ -224,8 +224,8 @@ ASKED = ("tx_positions", "frequencies_hz")
 def answer_block(
     what: str, trained: Trained, dataset: Dataset, receiver: Receiver, options: Options, block: list[Product]
 ) -> dict[str, np.ndarray]:
-    """Returns the answers to a block of queries by name, their leading axis the queries in order, and `parts.SHARED` arrays;
-    of paths a table, in the queries' order, whose `tx` says which transmitter a row belongs to."""
+    """Returns the answers to a block of queries by name, their leading axis the queries in order, and `results_file.SHARED`
+    arrays; of paths a table, in the queries' order, whose `tx` says which transmitter a row belongs to."""
     ask, found = _asker(what, trained, dataset, receiver, options), []
     for product in block:
         answer = ask(product.tx_positions, product.frequencies_hz)

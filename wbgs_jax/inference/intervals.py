@@ -43,7 +43,7 @@ class Confidence:
     """What has been learned about the scores of answers, over all receivers of the data alike."""
 
     rx_position: Float[Array, "*r 3"]
-    """Of the receivers, metres; of one alone where answers are asked for (`neighbours.for_receiver`)."""
+    """Of the receivers, metres; of one alone where answers are asked for (`kriging.for_receiver`)."""
     tx_position: Float[Array, "m 3"]
     """Of the transmitters that were trained, metres."""
     mean: Float[Array, " k"]

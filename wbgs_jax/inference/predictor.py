@@ -111,7 +111,7 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
 
     What does not depend on the query is planned here, once, for the receiver (default: the first of the data the field was
     trained on, which are read for it; for one that it was not trained on, `at_receiver` comes first). Compiles for every new
-    number of queries; `maps.predict_many` keeps that number fixed.
+    number of queries; `batching.predict_many` keeps that number fixed.
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)

@@ -20,7 +20,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.types import HIGHEST_FREQUENCY_HZ, LOWEST_FREQUENCY_HZ
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
 NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
 """`sionna.rt.InteractionType`."""
@@ -226,7 +226,7 @@ def frequency_of(value: Any) -> float:
         found = float(np.reshape(value, -1)[0])
     except (ValueError, TypeError, IndexError):
         found = np.nan
-    if not LOWEST_FREQUENCY_HZ <= found <= HIGHEST_FREQUENCY_HZ:
+    if not LOWEST_OF_PATHS_HZ <= found <= MAX_FREQUENCY_HZ:
         raise UserError(f"the frequency of these paths is {found:g} Hz; give hertz, 28e9 for 28 GHz")
     return found
 

@@ -85,7 +85,7 @@ class PowerMap:
 
 
 def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None = None) -> PowerMap:
-    """Returns the map that follows from means of readings (`readings.cell_means`), in float32.
+    """Returns the map that follows from means of readings (`rssi_folder.cell_means`), in float32.
 
     Args:
         readings: at most `MAX_PLACES` places.

@@ -74,7 +74,7 @@ class Search(Surfaces):
     """World frame, metres."""
     outline: Outline
     planes: Float[AnyArray, "5 4 p"]
-    """Of the facets and their sides, as legs are cut with them (`crossings.planes_of`)."""
+    """Of the facets and their sides, as legs are cut with them (`occlusion.planes_of`)."""
     chains: tuple[Chains, ...]
     """Of orders 1, 2, ..."""
     diffracted: DiffractedChains
@@ -97,7 +97,7 @@ def make_search(
         mirror_areas: smallest facets that reflect on paths of 1, 2, ... reflections, square metres each.
         mirror_area_after_edge: smallest facet that reflects a wave after an edge has diffracted it, square metres.
         mirror_area_before_edge: smallest facet that reflects a wave before an edge diffracts it, square metres.
-        padded: whether chains and pairs are filled up to sizes that seldom change (`padding.py`).
+        padded: whether chains and pairs are filled up to sizes that seldom change (mesh/edges.py).
 
     Returns:
         float32 and int32 arrays on the device.

@@ -178,8 +178,8 @@ def covariance_from_paths(
 
     Args:
         arrived, receiver, frequency_hz, curved: as in `element_voltages`.
-        coherence: what is left of the mean product of two paths' amplitudes (`motion.coherence`); where it is 1 everywhere
-            the result is the snapshot's own product.
+        coherence: what is left of the mean product of two paths' amplitudes (`displacement.coherence`); where it is 1
+            everywhere the result is the snapshot's own product.
     """
     voltages = element_voltages(arrived, receiver, frequency_hz, curved)
     parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # real products: four times as fast on a CPU

@@ -1,4 +1,4 @@
-"""Splatting onto the receiver's hemisphere: project.py -> tiles.py -> composite.py, composed by render.py.
+"""Splatting onto the receiver's hemisphere: projection.py -> tiles.py -> composite.py, composed by render.py.
 
 `reference.py` is the dense, readable oracle of the same image.
 """

@@ -1,4 +1,4 @@
-"""Gaussians -> PAS: composes project.py, tiles.py and composite.py.
+"""Gaussians -> PAS: composes projection.py, tiles.py and composite.py.
 
 The receiver is fixed, so everything geometric (projection, depth order, tile lists) is built once as a `GeometryPlan` and
 shared by any number of queries, which differ only in attenuation and signal.

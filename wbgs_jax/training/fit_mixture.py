@@ -189,8 +189,8 @@ def share_scores(
     simple: Float[np.ndarray, "n 90 360"],
     distance: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n shares"], Float[np.ndarray, " n"]]:
-    """Returns the SSIM of what was held out, by the share of the field (`trust.SHARES`), and the scaled logarithms of its
-    distances to what was known; `simple` and `distance` are `simple_answers`."""
+    """Returns the SSIM of what was held out, by the share of the field (`fields.mixture.SHARES`), and the scaled logarithms of
+    its distances to what was known; `simple` and `distance` are `simple_answers`."""
     truth = np.asarray(dataset.pas(held.links))
     return similarity(truth, held.pas, simple), np.asarray(scaled(mixture, jnp.asarray(distance)))
 
@@ -351,7 +351,7 @@ def choose_share(
     """Returns bias and slope of the logit of the field's share, and whether the field is as good by itself.
 
     Args:
-        scores: SSIM of held-out links by the share of the field (`trust.SHARES`).
+        scores: SSIM of held-out links by the share of the field (`fields.mixture.SHARES`).
         u: scaled logarithm of the distance to the nearest known transmitter.
         group: links of one are alike.
         errors: standard errors below the mean gain at which the bound lies.

@@ -1,7 +1,7 @@
 """A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
 
 config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pictures/*.png
-neighbours.npz   confidence.npz   power_confidence.npz
+kriging.npz   intervals.npz   power_confidence.npz
 
 One training a folder: two would write over each other's curves and checkpoints.
 """
@@ -36,8 +36,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.inference import intervals as confidence
-from wbgs_jax.inference import kriging as neighbours
+from wbgs_jax.inference import intervals, kriging
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence, read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import Beside, read_neighbours
 from wbgs_jax.training import checkpoint
@@ -124,7 +123,7 @@ class TrainedField:
 
 def sources_of(folder: Path, config: RunConfig) -> list[Path]:
     """Returns the files and folders that a trained field and its data are read from."""
-    beside = ("config.json", "checkpoints", neighbours.FILE, confidence.FILE, confidence.POWER_FILE)
+    beside = ("config.json", "checkpoints", kriging.FILE, intervals.FILE, intervals.POWER_FILE)
     return [*(folder / name for name in beside), *source_paths(config.source)]
 
 

@@ -1,7 +1,7 @@
 """Where surfaces and the receiver stand, by gradient descent, for data that hold spectra and no snapshots.
 
 Steps are in proportion to the wavelength of the highest frequency, and waves as coherent as places are known by then. Materials
-and corrections are learned beside the motion. With snapshots `adjustment.py` is faster and nearer to the truth.
+and corrections are learned beside the motion. With snapshots `gauss_newton.py` is faster and nearer to the truth.
 """
 
 import dataclasses

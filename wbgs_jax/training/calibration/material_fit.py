@@ -148,7 +148,7 @@ def with_properties(materials: Any, material: int, permittivity: float, c: float
 
 def _with(leaf: Float[Array, " m"], index: int, value: float | None) -> Float[Array, " m"]:
     """Returns what `leaf.at[index].set(value)` does, in an eighth of the time: there are thousands of candidates. Without a
-    value it is a copy, so that candidates of all kinds differ in the same leaves and have one program (scores.py)."""
+    value it is a copy, so that candidates of all kinds differ in the same leaves and have one program (objective.py)."""
     copy = np.array(leaf)
     if value is not None:
         copy[index] = value

@@ -111,7 +111,7 @@ def absent_movers(params: Any, told: Told, config: SearchConfig) -> Int[np.ndarr
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
-    # First those that differ: what is there as it is then needs no program of its own (scores.py).
+    # First those that differ: what is there as it is then needs no program of its own (objective.py).
     without_one = score([_of_air(params, one) for one in tried], config.absent_glance)
     gains = score([params], config.absent_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]

@@ -2,7 +2,7 @@
 
 What passes a slab, or comes back from its far side, has turned by its optical thickness, t sqrt(eps_r), in wavelengths. At low
 frequencies few thicknesses can be told from each other and one look at all of them is enough; every higher frequency then tells
-those apart that the ones before it left, just as surfaces are put in place (geometry.py). Entries of the list of materials are
+those apart that the ones before it left, just as surfaces are put in place (alignment.py). Entries of the list of materials are
 tried with the thickness that keeps the optical thickness as it is. Materials as thick as is usual are the beginning; what comes
 out is taken if it explains snapshots surely better than the materials that were named without it.
 """
