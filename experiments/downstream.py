@@ -39,8 +39,8 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.baselines import nearest_tx
 from wbgs_jax.evaluation.report import provenance
 from wbgs_jax.inference.predictor import observe
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.training.checkpoint import checkpoint_steps
-from wbgs_jax.training.run_folder import TrainedField
 
 RUNS = Path("runs/downstream")
 SETTINGS = (

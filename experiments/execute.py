@@ -23,9 +23,10 @@ from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import default_field
 from wbgs_jax.inference.predictor import corrected, predict_spectra
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.training.fit_kriging import learn_neighbours
 from wbgs_jax.training.loop import train
-from wbgs_jax.training.run_folder import RunConfig, prepare_folder
+from wbgs_jax.training.run_folder import prepare_folder
 
 CURVE_POINTS = 200
 ENVIRONMENT = environment()

@@ -33,11 +33,12 @@ from wbgs_jax.fields import default_field, get_field
 from wbgs_jax.inference.intervals import LEVEL
 from wbgs_jax.inference.mixture import Mixture
 from wbgs_jax.inference.predictor import predict_spectra
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training.cross_validation import Training, cross_validated
 from wbgs_jax.training.fit_mixture import HeldOut, Known, learn_members, predict_members, share_scores, simple_answers
 from wbgs_jax.training.loop import train
-from wbgs_jax.training.run_folder import RunConfig, load_trained, write_config
+from wbgs_jax.training.run_folder import load_trained, write_config
 
 ROWS = FOLDER / "few"
 SHARED = Path("..") / "shared" / "data"

@@ -24,9 +24,9 @@ from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset, released_scenes
 from wbgs_jax.evaluation.report import provenance
-from wbgs_jax.inference.predictor import at_receiver, observe_queries
+from wbgs_jax.inference.predictor import observe_queries
+from wbgs_jax.inference.trained_field import TrainedField, at_receiver
 from wbgs_jax.metrics import score
-from wbgs_jax.training.run_folder import TrainedField
 
 KEPT = ("median_ssim", "mean_ssim", "p10_ssim")
 SAME_M = 1e-3

@@ -18,8 +18,8 @@ from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.inference import batching, predictor
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.training.loop import TrainResult, train
-from wbgs_jax.training.run_folder import TrainedField
 
 FOUR = {"optim": {"batch": 4}, "loop": {"epoch_steps": 4, "checkpoint_every": 4}}
 ASKED = 35

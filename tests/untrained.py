@@ -15,8 +15,9 @@ from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.coherent import WaveField
 from wbgs_jax.fields.wideband import WidebandField, WidebandParams
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.run_folder import RunConfig, TrainedField, write_config
+from wbgs_jax.training.run_folder import write_config
 
 SETTINGS = tiny_settings()
 STEP = 5

@@ -54,9 +54,9 @@ from .inference.export import export_field as export_field
 from .inference.export import load_exported as load_exported
 from .inference.intervals import expected_power as expected_power
 from .inference.intervals import expected_ssim as expected_ssim
-from .inference.predictor import at_receiver as at_receiver
 from .inference.predictor import power_predictor as power_predictor
 from .inference.predictor import predictor as predictor
+from .inference.trained_field import at_receiver as at_receiver
 from .interchange.deepmimo import as_deepmimo as as_deepmimo
 from .interchange.deepmimo import from_deepmimo as from_deepmimo
 from .interchange.deepmimo import load_deepmimo as load_deepmimo

@@ -24,8 +24,8 @@ from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.intervals import FEATURES, POWER_FEATURES, Confidence, PowerConfidence
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training.batches import TrainingData, training_data
-from wbgs_jax.training.run_folder import RunConfig, TrainedField
 
 ON_THE_HOST = frozenset(
     """

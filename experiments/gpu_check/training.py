@@ -27,10 +27,11 @@ from wbgs_jax.commands import train
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.fields import get_field
 from wbgs_jax.inference.predictor import observe
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.batches import limited
-from wbgs_jax.training.run_folder import MANIFEST, TrainedField, load_trained
+from wbgs_jax.training.run_folder import MANIFEST, load_trained
 
 WRFGS_GHZ = 37
 """The frequency of WRF-GS: near the 28 GHz of mobile networks, and in both scenes among the trained frequencies."""

@@ -22,8 +22,9 @@ from wbgs_jax.fields import Observation
 from wbgs_jax.inference import evaluate_quantities
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.training import checkpoint
-from wbgs_jax.training.run_folder import RunConfig, write_config
+from wbgs_jax.training.run_folder import write_config
 
 INSIDE = ["1,0.5,1.5", "-1,1,1.2"]
 

@@ -15,9 +15,10 @@ from wbgs_jax.fields import mixture as noise
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed, _Seen
 from wbgs_jax.fields.mixture import FEATURES, Opinions, Shares, constant, reported, with_floor, without_floor
 from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.radio.array import snapshot_to_pas
 from wbgs_jax.training.loop import Run, train
-from wbgs_jax.training.run_folder import RunConfig, load_trained, prepare_folder
+from wbgs_jax.training.run_folder import load_trained, prepare_folder
 
 SETTINGS = tiny_settings(
     "hybrid", optim={"steps": 4}, density={"every": 2, "start": 2, "gradient_threshold": 0.0, "max_gaussians": 90}

@@ -20,7 +20,8 @@ from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import coherent as wave
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.coherent import WaveConfig, WaveField
-from wbgs_jax.inference.predictor import at_receiver, observe_links, predictor
+from wbgs_jax.inference.predictor import observe_links, predictor
+from wbgs_jax.inference.trained_field import at_receiver
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
 from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db

@@ -20,7 +20,8 @@ from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Observation
-from wbgs_jax.inference.predictor import Trained, check_power
+from wbgs_jax.inference.predictor import check_power
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 from wbgs_jax.types import Query, Receiver
@@ -124,7 +125,7 @@ class Locator:
 
 
 def locator(
-    trained: Trained,
+    trained: TrainedField,
     frequencies_hz: Any,
     what: What = "spectra",
     receivers: Sequence[Receiver] | None = None,

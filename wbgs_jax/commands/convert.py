@@ -98,7 +98,7 @@ def check(command: Command) -> None:
 def hand_on(command: Command) -> str:
     """Writes what a field knows, and returns a line about it."""
     from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at
-    from wbgs_jax.inference.predictor import at_receiver
+    from wbgs_jax.inference.trained_field import at_receiver
     from wbgs_jax.training.run_folder import open_run
 
     assert command.run is not None and command.ghz is not None, "checked"

@@ -26,10 +26,11 @@ from wbgs_jax._util.files import check_writable, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
-from wbgs_jax.inference.predictor import BLOCK, at_receivers
+from wbgs_jax.inference.predictor import BLOCK
+from wbgs_jax.inference.trained_field import TrainedField, at_receivers
 from wbgs_jax.training import curves
 from wbgs_jax.training.manifest import write_manifest
-from wbgs_jax.training.run_folder import MANIFEST, TrainedField, open_run
+from wbgs_jax.training.run_folder import MANIFEST, open_run
 
 
 @dataclass(frozen=True)

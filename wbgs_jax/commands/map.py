@@ -98,8 +98,8 @@ def make_maps(command: Command) -> None:
         source_of,
         write_answer,
     )
-    from wbgs_jax.inference.predictor import at_receiver
     from wbgs_jax.inference.radio_map import ask_plane, cut_at, pieces
+    from wbgs_jax.inference.trained_field import at_receiver
     from wbgs_jax.training.run_folder import open_run
 
     frequencies_hz = frequencies(command.ghz)

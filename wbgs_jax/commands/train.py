@@ -27,6 +27,7 @@ from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.kriging import write_neighbours
+from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.training.batches import check_data, limited
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.cross_validation import Training, is_few, learn_few
@@ -35,7 +36,7 @@ from wbgs_jax.training.fit_kriging import Learned, learn_neighbours
 from wbgs_jax.training.loop import TrainResult, train
 from wbgs_jax.training.manifest import write_manifest
 from wbgs_jax.training.progress import Interrupted, duration_words, expected_seconds
-from wbgs_jax.training.run_folder import RunConfig, load_trained, locked, prepare_folder
+from wbgs_jax.training.run_folder import load_trained, locked, prepare_folder
 
 PROGRAM = "wbgs-jax train"
 

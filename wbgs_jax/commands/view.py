@@ -20,7 +20,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
 from wbgs_jax.inference.answers import check_frequencies, frequencies, receiver_at
-from wbgs_jax.inference.predictor import at_receiver
+from wbgs_jax.inference.trained_field import at_receiver
 from wbgs_jax.training.run_folder import open_run
 
 if TYPE_CHECKING:

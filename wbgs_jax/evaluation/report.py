@@ -13,6 +13,7 @@ import wbgs_jax
 from wbgs_jax.config import to_dict
 from wbgs_jax.data.load import source_names
 from wbgs_jax.data.splits import VALIDATION
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 
 
 def environment() -> dict[str, Any]:
@@ -36,8 +37,8 @@ def _commit() -> str | None:
     return git.stdout.strip() or None
 
 
-def provenance(trained: Any) -> dict[str, Any]:
-    """Returns where the figures of a trained field come from; `trained` is a `training.run_folder.TrainedField`."""
+def provenance(trained: TrainedField) -> dict[str, Any]:
+    """Returns where the figures of a trained field come from."""
     return environment() | {
         "command": "wbgs-jax train " + shlex.join(_training_arguments(trained.config)),
         "preset": trained.config.preset,
@@ -49,7 +50,7 @@ def provenance(trained: Any) -> dict[str, Any]:
     }
 
 
-def _training_arguments(config: Any) -> list[str]:
+def _training_arguments(config: RunConfig) -> list[str]:
     sources = [Path(name) for name in source_names(config.source)]
     data = ["--data" if sources[0].is_dir() else "--scene", ",".join(path.name for path in sources)]
     if config.frequency_ghz is not None:

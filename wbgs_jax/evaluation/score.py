@@ -32,7 +32,8 @@ from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver, without_asked
-from wbgs_jax.inference.predictor import BLOCK, Trained, as_observed, observe, observe_links, render_pas
+from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_links, render_pas
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import plane_normal
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
@@ -187,7 +188,9 @@ Part = Literal["test", "validation"]
 """What is held out: for the final figures, or for choices."""
 
 
-def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
+def evaluate(
+    trained: TrainedField, dataset: Dataset, part: Part = "test"
+) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
     Raises:
@@ -197,7 +200,7 @@ def evaluate(trained: Trained, dataset: Dataset, part: Part = "test") -> tuple[d
     tested = part == "test"
     if not tested and trained.neighbours is not None:  # they know the validation part
         asked = without_asked(trained.neighbours, dataset.query(index))
-        trained = dataclasses.replace(trained, neighbours=asked)  # type: ignore[type-var]
+        trained = dataclasses.replace(trained, neighbours=asked)
     others_know = with_validation_trained(dataset) if tested else dataset
     seen = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
@@ -296,7 +299,7 @@ def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " 
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
 
 
-def time_queries(trained: Trained, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
+def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
     """Returns milliseconds a PAS, for single queries and in blocks: medians over repeats after compilation."""
     plan = trained.field.plan(trained.params, dataset.receiver())
     neighbours = for_receiver(trained.neighbours, dataset.receiver())

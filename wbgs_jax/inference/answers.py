@@ -21,9 +21,10 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import field_names, get_field
-from wbgs_jax.inference.predictor import Trained, trained_band
+from wbgs_jax.inference.predictor import trained_band
 from wbgs_jax.inference.queries import Product, Queries
 from wbgs_jax.inference.ready import MOST, QUANTITIES, Ready, load_ready, make_ready
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.mesh.solids import ClosedBody, inside
 from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ, Receiver
 
@@ -144,7 +145,7 @@ def receiver_at(word: str, dataset: Dataset) -> Receiver:
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 
 
-def lowest_answered(trained: Trained, dataset: Dataset) -> float:
+def lowest_answered(trained: TrainedField, dataset: Dataset) -> float:
     """Returns the lowest frequency (hertz) at which a field can be asked: that of the model's band, or of its training; paths
     hold below, too."""
     if "paths" in trained.field.known():
@@ -152,7 +153,7 @@ def lowest_answered(trained: Trained, dataset: Dataset) -> float:
     return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
 
 
-def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> None:
+def check_frequencies(trained: TrainedField, dataset: Dataset, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below what it answers."""
     if lowest_hz < (lowest := lowest_answered(trained, dataset)) * (1 - ROUNDED):
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
@@ -186,7 +187,7 @@ def write_answer(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> 
         np.savez_compressed(stream, **known, meta=np.array(json.dumps(source)))
 
 
-def source_of(trained: Trained, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
+def source_of(trained: TrainedField, dataset: Dataset, receiver: Receiver) -> dict[str, Any]:
     """Returns where an answer comes from: scene, field, step, version, and the receiver that was asked; and the chance that
     true values lie in the intervals beside it, where there are any."""
     asked = {name: np.asarray(getattr(receiver, name)).tolist() for name in ("position", "orientation")}
@@ -278,8 +279,8 @@ def _opened_run(
 ) -> Opened:
     # Here: what was left ready needs nothing of all this, and it takes seconds to load.
     from wbgs_jax.inference import evaluate_quantities
-    from wbgs_jax.inference.predictor import at_receiver
     from wbgs_jax.inference.quantities import check_known, known_quantities
+    from wbgs_jax.inference.trained_field import at_receiver
 
     trained, watched = load()
     dataset = trained.dataset()

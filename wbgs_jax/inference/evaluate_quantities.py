@@ -19,10 +19,11 @@ from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.inference.answers import Options
 from wbgs_jax.inference.intervals import expect_many
 from wbgs_jax.inference.kriging import for_receiver
-from wbgs_jax.inference.predictor import BLOCK, Trained, observe_queries
+from wbgs_jax.inference.predictor import BLOCK, observe_queries
 from wbgs_jax.inference.quantities import ask_channel
 from wbgs_jax.inference.queries import Product
 from wbgs_jax.inference.results_file import SHARED
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.propagation.transport import mimo_matrix
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
@@ -34,7 +35,7 @@ WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
 SIGHT = "line of sight"
 
 
-def check_paths(trained: Trained) -> None:
+def check_paths(trained: TrainedField) -> None:
     """Raises a `UserError` where a field knows no paths."""
     if "paths" not in trained.field.known():
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
@@ -42,7 +43,7 @@ def check_paths(trained: Trained) -> None:
 
 
 def ask_paths(
-    trained: Trained,
+    trained: TrainedField,
     dataset: Dataset,
     receiver: Receiver,
     tx_positions: Float[np.ndarray, "tx 3"],
@@ -79,7 +80,9 @@ def ask_paths(
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 
 
-def arrivals_of(trained: Trained, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float) -> Arrivals:
+def arrivals_of(
+    trained: TrainedField, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float
+) -> Arrivals:
     """Returns what arrives over every path from transmitters at one frequency, as NumPy arrays with a leading axis for them.
 
     Raises:
@@ -148,7 +151,7 @@ def describe_interactions(kinds: np.ndarray, materials: np.ndarray, names: tuple
 
 
 def ask_response(
-    trained: Trained,
+    trained: TrainedField,
     receiver: Receiver,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
@@ -180,7 +183,7 @@ def ask_response(
 
 
 def ask_mimo(
-    trained: Trained,
+    trained: TrainedField,
     receiver: Receiver,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
@@ -222,7 +225,7 @@ ASKED = ("tx_positions", "frequencies_hz")
 
 
 def answer_block(
-    what: str, trained: Trained, dataset: Dataset, receiver: Receiver, options: Options, block: list[Product]
+    what: str, trained: TrainedField, dataset: Dataset, receiver: Receiver, options: Options, block: list[Product]
 ) -> dict[str, np.ndarray]:
     """Returns the answers to a block of queries by name, their leading axis the queries in order, and `results_file.SHARED`
     arrays; of paths a table, in the queries' order, whose `tx` says which transmitter a row belongs to."""
@@ -245,7 +248,7 @@ def answer_block(
 
 
 def _asker(
-    what: str, trained: Trained, dataset: Dataset, receiver: Receiver, options: Options
+    what: str, trained: TrainedField, dataset: Dataset, receiver: Receiver, options: Options
 ) -> Callable[[Any, Any], dict[str, np.ndarray]]:
     """Returns a function of transmitters and frequencies, every one at every other."""
     if what == "spectra":
@@ -261,7 +264,7 @@ def _asker(
 
 
 def ask_spectra(
-    trained: Trained,
+    trained: TrainedField,
     receiver: Receiver,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],

@@ -28,7 +28,8 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.inference.kriging import correct, for_receiver
-from wbgs_jax.inference.predictor import OnAnyShape, Predictor, Trained, trained_band
+from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.types import Query, Receiver
 
 FORMAT = 1
@@ -51,7 +52,7 @@ class ExportedField:
 
 
 def export_field(
-    trained: Trained, path: Path | str, platforms: Sequence[str] = ("cpu", "cuda"), dataset: Dataset | None = None
+    trained: TrainedField, path: Path | str, platforms: Sequence[str] = ("cpu", "cuda"), dataset: Dataset | None = None
 ) -> None:
     """Writes a trained field to one file (a zip archive) for all of `platforms`: any of `PLATFORMS`.
 
@@ -74,7 +75,7 @@ def export_field(
             archive.writestr(info, data)
 
 
-def _metadata(trained: Trained, dataset: Dataset, platforms: Sequence[str]) -> dict[str, Any]:
+def _metadata(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "scene": dataset.name,
@@ -90,7 +91,7 @@ def _metadata(trained: Trained, dataset: Dataset, platforms: Sequence[str]) -> d
     }
 
 
-def _serialize(trained: Trained, receiver: Receiver, platforms: Sequence[str]) -> bytes:
+def _serialize(trained: TrainedField, receiver: Receiver, platforms: Sequence[str]) -> bytes:
     """Returns the field with its parameters and plan as constants, for any number of queries."""
     plan = trained.field.portable(trained.field.plan(trained.params, receiver))
     neighbours = for_receiver(trained.neighbours, receiver)

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.intervals import Confidence, PowerConfidence
-from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside, correct, for_receiver
+from wbgs_jax.inference.kriging import Beside, correct, for_receiver
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
@@ -31,81 +31,7 @@ Predictor = Callable[[Any, Any], Array]
 """(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360) or power (*b,); leading axes broadcast like NumPy's."""
 
 
-@runtime_checkable
-class Trained(Protocol):
-    """A field with parameters, and the data it was trained on (`training.run_folder.TrainedField`)."""
-
-    @property
-    def field(self) -> Field:
-        """The field."""
-        ...
-
-    @property
-    def params(self) -> Any:
-        """Its parameters."""
-        ...
-
-    @property
-    def neighbours(self) -> Beside:
-        """Known spectra that are asked beside it."""
-        ...
-
-    @property
-    def confidence(self) -> Confidence | None:
-        """How sure its answers are."""
-        ...
-
-    @property
-    def power_confidence(self) -> PowerConfidence | None:
-        """How sure the received powers are that it says."""
-        ...
-
-    def dataset(self) -> Dataset:
-        """Returns the data."""
-        ...
-
-    def origin(self) -> dict[str, Any]:
-        """Returns where it comes from: field, preset, seed and step."""
-        ...
-
-
-T = TypeVar("T", bound=Trained)
-
-
-def at_receiver(trained: T, receiver: Receiver, dataset: Dataset | None = None) -> T:
-    """Returns a trained field for another receiver than those of its data: another place, orientation or array. At one of its
-    own receivers it is what it was; elsewhere it is the part that holds anywhere (the coherent field), without neighbours and
-    without a word on how sure it is, which nobody has measured there. `dataset` is what it was trained on, where it is read
-    already.
-
-    Raises:
-        UserError: nothing of the field holds elsewhere.
-    """
-    dataset = trained.dataset() if dataset is None else dataset
-    if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
-        return trained
-    field, params = trained.field.anywhere(trained.params)
-    nothing = dict.fromkeys(("neighbours", "confidence", "power_confidence"))
-    return dataclasses.replace(trained, field=field, params=params, **nothing)  # type: ignore[type-var]
-
-
-def at_receivers(trained: T, dataset: Dataset) -> T:
-    """Returns a trained field for all receivers of other data (`at_receiver`): as it is if it was trained at every one."""
-    own = trained.dataset()
-    for number in range(dataset.n_receivers):
-        if (elsewhere := at_receiver(trained, dataset.receiver(number), own)) is not trained:
-            return elsewhere
-    return trained
-
-
-def _same(a: Receiver, b: Receiver) -> bool:
-    if np.vdot(a.orientation, b.orientation) < 0:  # a quaternion and its negative are one turn
-        b = dataclasses.replace(b, orientation=-b.orientation)
-    leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)
-
-
-def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
+def predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, for `jit`, `vmap` and one reverse-mode
     `grad`.
 
@@ -118,7 +44,7 @@ def predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
     return OnAnyShape(_Shared("pas", (trained.field, trained.params, plan), (neighbours,)))
 
 
-def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predictor:
+def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> received power relative to the transmitted
     power (dB); otherwise as `predictor`.
 
@@ -255,7 +181,7 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
     return _gathered(answers(), len(index))
 
 
-def observe_queries(trained: Trained, receiver: Receiver, query: Query, quantity: str | None = None) -> Any:
+def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, quantity: str | None = None) -> Any:
     """Returns what a trained field says of any number of queries, as NumPy arrays in their order: an `Observation`, its spectra
     with what the neighbours say, or one of its quantities by name (nothing else is computed then).
 
@@ -308,7 +234,7 @@ def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.
         yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
-def observe(trained: Trained, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
     """Returns what `observe_links` does, the spectra with what the neighbours say."""
     seen = observe_links(trained.field, trained.params, dataset, index)
     if dataset.n_receivers > 1:

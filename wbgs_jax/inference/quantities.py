@@ -15,7 +15,8 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.fields.base import Quantity
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power
-from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, check_spectra, observe_queries
+from wbgs_jax.inference.predictor import BLOCK, check_power, check_spectra, observe_queries
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import cbf, pas_directions, steering_vector
@@ -27,7 +28,7 @@ OfArrivals = Callable[[channel.Arrivals, Receiver, Any], Any]
 
 def ask_channel(
     what: str,
-    trained: Trained,
+    trained: TrainedField,
     dataset: Dataset,
     receiver: Receiver,
     tx_positions: Float[np.ndarray, "tx 3"],
@@ -38,7 +39,7 @@ def ask_channel(
     Args:
         what: a name of `CHANNEL`.
         trained: the field, and the data it was trained on: `dataset`.
-        receiver: at which it is asked (`predictor.at_receiver`).
+        receiver: at which it is asked (`trained_field.at_receiver`).
         tx_positions: world frame, metres.
         frequencies_hz: of the carrier.
 
@@ -58,7 +59,7 @@ def ask_channel(
     return {name: values} | asked | ({} if sure is None else expected_errors(sure, values, receiver, **asked))
 
 
-def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
+def check_known(what: str, trained: TrainedField, dataset: Dataset) -> None:
     """Raises a `UserError` where a field knows nothing of a quantity."""
     if what == "spectra":
         check_spectra(trained.field, dataset)
@@ -72,7 +73,7 @@ def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
         check_power(trained.field, dataset)
 
 
-def known_quantities(trained: Trained, dataset: Dataset) -> list[str]:
+def known_quantities(trained: TrainedField, dataset: Dataset) -> list[str]:
     """Returns what a field can be asked for beside what follows from paths alone: spectra, and names of `OBSERVED`."""
     found = []
     for what in ("spectra", *OBSERVED):
@@ -82,7 +83,7 @@ def known_quantities(trained: Trained, dataset: Dataset) -> list[str]:
     return found
 
 
-def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, function: OfArrivals) -> np.ndarray:
+def _measured(trained: TrainedField, plan: Any, query: Query, receiver: Receiver, function: OfArrivals) -> np.ndarray:
     """Returns what follows from the arrivals of queries, in blocks of one shape: one compilation."""
     count, parts = len(query.frequency_hz), []
     size = min(BLOCK, count)

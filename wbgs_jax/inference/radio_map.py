@@ -9,8 +9,9 @@ import trimesh
 from jaxtyping import Float
 
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.inference.predictor import Trained, observe_queries
+from wbgs_jax.inference.predictor import observe_queries
 from wbgs_jax.inference.quantities import ask_channel, check_known
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import best_beams, codebook, pas_directions
 from wbgs_jax.radio.geometry import direction_to_angles
 from wbgs_jax.types import Receiver, make_query
@@ -43,7 +44,7 @@ def plane_over(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], height
 
 def ask_plane(
     what: str,
-    trained: Trained,
+    trained: TrainedField,
     dataset: Dataset,
     receiver: Receiver,
     plane: Plane,
@@ -89,7 +90,7 @@ def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:
 
 
 def _best_beams(
-    trained: Trained, receiver: Receiver, places: Float[np.ndarray, "places 3"], frequencies_hz: Float[np.ndarray, " freq"]
+    trained: TrainedField, receiver: Receiver, places: Float[np.ndarray, "places 3"], frequencies_hz: Float[np.ndarray, " freq"]
 ) -> dict[str, np.ndarray]:
     query = make_query(np.repeat(places, len(frequencies_hz), 0), np.tile(frequencies_hz, len(places)))
     spectra = observe_queries(trained, receiver, query, "pas")

@@ -86,7 +86,7 @@ def make_ready(
         run: its folder.
         rx: the word that the receiver was asked for with.
         count: of the queries.
-        trained: the field at the receiver (`predictor.at_receiver`).
+        trained: the field at the receiver (`trained_field.at_receiver`).
         receiver: at which it is asked.
         watched: files and folders that it follows from.
         meta: what is to be known of it (`Ready.meta`).

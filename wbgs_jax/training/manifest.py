@@ -8,7 +8,8 @@ from typing import Any
 
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import provenance
-from wbgs_jax.training.run_folder import MANIFEST, TrainedField
+from wbgs_jax.inference.trained_field import TrainedField
+from wbgs_jax.training.run_folder import MANIFEST
 
 FORMAT = 1
 PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax")

@@ -11,7 +11,6 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,102 +22,19 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import left_by_killed, read_json, write_json
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax._util.typed import misfit
-from wbgs_jax.config import Settings, check, from_dict, sections, to_dict
-from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.data.dataset import Dataset, check_data
-from wbgs_jax.data.load import load_dataset, source_paths
-from wbgs_jax.data.splits import (
-    VALIDATION,
-    fewer_transmitters,
-    hold_out_box,
-    hold_out_validation,
-    select_receivers,
-    unseen_frequencies,
-)
-from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.config import check, from_dict, sections, to_dict
+from wbgs_jax.data.load import source_paths
+from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference import intervals, kriging
-from wbgs_jax.inference.intervals import Confidence, PowerConfidence, read_confidence, read_power_confidence
-from wbgs_jax.inference.kriging import Beside, read_neighbours
+from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
+from wbgs_jax.inference.kriging import read_neighbours
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training import checkpoint
 
 FIRST_PRESET = "cpu"
 
 MANIFEST = "manifest.json"
 """Written last, when a training is finished."""
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """Everything that determines a run."""
-
-    source: str
-    """Scene number, scene file or folder; several with commas between them."""
-    field: str
-    preset: str
-    seed: int
-    frequency_ghz: float | None
-    """Frequency of a single-frequency folder that does not say."""
-    settings: Settings
-    train_ghz: tuple[float, ...] = ()
-    """Train at these frequencies and test at the others; none: train and test at all."""
-    train_tx: int = 0
-    """Number of training transmitters; 0: all."""
-    validation: float = VALIDATION
-    """Share of the training transmitters that is held out for validation, where the data name none."""
-    test_box: tuple[float, ...] = ()
-    """Test at the transmitters in a box, lowest and highest corner (metres), and train elsewhere; none: as the data say."""
-    receiver: int | None = None
-    """Number of the only receiver that is looked at; None: all."""
-    neighbours: bool = True
-    """Whether known spectra are asked beside the field, where that gains on validation."""
-    convention: ConventionName | None = None
-    """In which the pixels of a folder are ordered; None where there is no folder, or as it is not known yet."""
-
-    def other_data(self, source: str, convention: ConventionName | None = None) -> Dataset:
-        """Returns data of any name, read as those that the run was trained on."""
-        frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
-        return load_dataset(source, frequency_hz=frequency, seed=self.seed, convention=convention)
-
-    def dataset(self) -> Dataset:
-        """Returns the data that the run was trained on."""
-        dataset = self.other_data(self.source, self.convention)
-        if self.receiver is not None:
-            dataset = select_receivers(dataset, [self.receiver])
-        if self.test_box:
-            dataset = hold_out_box(dataset, self.test_box[:3], self.test_box[3:])
-        if self.train_ghz:
-            dataset = unseen_frequencies(dataset, self.train_ghz)
-        if self.train_tx:
-            dataset = fewer_transmitters(dataset, self.train_tx, self.seed)
-        return hold_out_validation(dataset, self.validation) if self.validation else dataset
-
-
-@dataclass(frozen=True)
-class TrainedField:
-    """A field with the parameters of a run's newest checkpoint."""
-
-    config: RunConfig
-    field: Field
-    params: Any
-    step: int
-    seconds: float
-    """Training time."""
-    neighbours: Beside = None
-    """Known spectra that are asked beside it."""
-    confidence: Confidence | None = None
-    """How sure its answers are."""
-    power_confidence: PowerConfidence | None = None
-    """How sure the received powers are that it says."""
-    data: str = ""
-    """Checksum of the data that it was trained on; empty where nobody has kept it."""
-
-    def dataset(self) -> Dataset:
-        """Returns the data that it was trained on; others under the same name are a `UserError`."""
-        return check_data(self.config.dataset(), self.data, f"this run ({self.config.source})")
-
-    def origin(self) -> dict[str, Any]:
-        """Returns where it comes from: field, preset, seed and step."""
-        return {name: getattr(self.config, name) for name in ("field", "preset", "seed")} | {"step": self.step}
 
 
 def sources_of(folder: Path, config: RunConfig) -> list[Path]:

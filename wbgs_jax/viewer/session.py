@@ -18,8 +18,9 @@ from wbgs_jax.inference.answers import bounds_of
 from wbgs_jax.inference.evaluate_quantities import describe_interactions, names_of
 from wbgs_jax.inference.intervals import Expected, expected_ssim
 from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
-from wbgs_jax.inference.predictor import Trained, as_observed, check_power
+from wbgs_jax.inference.predictor import as_observed, check_power
 from wbgs_jax.inference.radio_map import Plane, ask_plane, pieces
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
@@ -87,7 +88,7 @@ class Asker:
     Materials and thicknesses may be changed; everything else is as it was trained.
     """
 
-    def __init__(self, trained: Trained, dataset: Dataset, receiver: Receiver):
+    def __init__(self, trained: TrainedField, dataset: Dataset, receiver: Receiver):
         self.trained, self.dataset, self.receiver = trained, dataset, receiver
         self.plan = self._planned = trained.field.plan(trained.params, receiver)
         self._neighbours, self._confidence = (
@@ -173,16 +174,16 @@ class Asker:
     def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
         """Gives a material another permittivity and conductivity at 1 GHz (S/m) from now on."""
         params = self.trained.field.with_material(self.trained.params, number, permittivity, conductivity)
-        self.trained = dataclasses.replace(self.trained, params=params)  # type: ignore[type-var]
+        self.trained = dataclasses.replace(self.trained, params=params)
         self._samples.clear()
 
     def change_thickness(self, number: int, metres: float) -> None:
         """Makes all walls of a material this thick from now on."""
         field, self.plan = self.trained.field.with_thickness(self.plan, number, metres)
-        self.trained = dataclasses.replace(self.trained, field=field)  # type: ignore[type-var]
+        self.trained = dataclasses.replace(self.trained, field=field)
         self._samples.clear()
 
-    def restore(self, trained: Trained) -> None:
+    def restore(self, trained: TrainedField) -> None:
         """Asks a field as it was trained from now on."""
         self.trained, self.plan = trained, self._planned
         self._samples.clear()
