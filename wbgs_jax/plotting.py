@@ -8,7 +8,7 @@ Pictures of maps of received power over a floor plan.
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +21,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from wbgs_jax import metrics
+from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.inference.answers import point_words
+from wbgs_jax.inference.quantities import QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NOT_HEARD_DB
@@ -192,14 +193,6 @@ def _save(figure: Figure, path: Path) -> Path:
 
 
 COLORS = "viridis"
-LABELS = {
-    "power_db": "received power [dB of the transmitted]",
-    "beamforming_gain_db": "beamforming gain [dB]",
-    "k_factor_db": "K-factor [dB]",
-    "angular_spread_deg": "spread of the azimuth of arrival [deg]",
-    "delay_spread_s": "r.m.s. delay spread [ns]",
-}
-NANO = 1e9
 
 
 def draw_answers(
@@ -223,13 +216,12 @@ def draw_answers(
     return figure
 
 
-def draw_sweeps(name: str, values: Float[np.ndarray, " *shape"], queries: Queries) -> Figure:
+def draw_sweeps(quantity: Quantity, values: Float[np.ndarray, " *shape"], queries: Queries) -> Figure:
     """Returns a figure of a quantity: over the frequency where there are more of these than transmitters, a curve each; else
     over the distance from the first transmitter along the way to the last; of single queries over their numbers."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
-    values = values * NANO if name == "delay_spread_s" else values
-    values = values.reshape(*queries.shape, -1)[..., 0]
+    values = quantity.scale * values.reshape(*queries.shape, -1)[..., 0]
     if queries.paired:
         curves, places, legend = values[None], np.arange(1, len(queries) + 1.0), [""]
         axis.set_xlabel("query")
@@ -247,7 +239,7 @@ def draw_sweeps(name: str, values: Float[np.ndarray, " *shape"], queries: Querie
         axis.plot(places, curves[number], ".-", ms=3, lw=1, label=legend[number], color=colormaps[COLORS](share))
     if legend != [""]:
         axis.legend(fontsize=8)
-    axis.set_ylabel(LABELS.get(name, name))
+    axis.set_ylabel(quantity.label)
     axis.grid(alpha=0.3)
     return figure
 
@@ -256,32 +248,12 @@ SHOWN_MAPS = 6
 """Frequencies in a picture."""
 
 
-class Look(NamedTuple):
-    """How a quantity is drawn."""
-
-    name: str
-    """In the answer."""
-    label: str
-    scale: float = 1.0
-    """Drawn units in one of the answer's."""
-    colors: str = "viridis"
-
-
-LOOKS: dict[str, Look] = {
-    "power": Look("power_db", "received power [dB of the transmitted]"),
-    "best-beam": Look("best_beam", "azimuth of the best beam [deg]", colors="twilight"),
-    "k-factor": Look("k_factor_db", "K-factor [dB]"),
-    "delay-spread": Look("delay_spread_s", "r.m.s. delay spread [ns]", 1e9),
-    "angular-spread": Look("angular_spread_deg", "spread of the azimuth of arrival [deg]"),
-}
-
-
 def draw_maps(
     what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
 ) -> Figure:
     """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star."""
-    look, xs, ys = LOOKS[what], answer["xs"], answer["ys"]
-    values = _drawn(look, answer)[:SHOWN_MAPS]
+    quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
+    values = _drawn(quantity, answer)[:SHOWN_MAPS]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
     extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
     wide = extent[1] - extent[0] > extent[3] - extent[2]
@@ -294,23 +266,23 @@ def draw_maps(
         if i >= len(values):
             axis.axis("off")
             continue
-        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=look.colors, aspect="equal", **span)
+        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=quantity.colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
         axis.plot(*rx[:2], "*", color="white", markeredgecolor="black", markersize=14)
         axis.set(xlim=extent[:2], ylim=extent[2:])
         axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
     figure.supxlabel("x [m]", fontsize=9)
     figure.supylabel("y [m]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{look.label}, transmitters {answer['height']:.3g} m high")
+    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label}, transmitters {answer['height']:.3g} m high")
     return figure
 
 
-def _drawn(look: Look, answer: dict[str, np.ndarray]) -> Float[np.ndarray, "freq ny nx"]:
-    values = answer[look.name]
-    if look.name == "best_beam":
+def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarray, "freq ny nx"]:
+    values = answer[quantity.outputs[0]]
+    if quantity.name == "best-beam":
         return answer["beam_azimuth_deg"][values]
-    heard = values > NOT_HEARD_DB if look.name == "power_db" else np.ones(values.shape, bool)
-    drawn = look.scale * np.where(heard, values, np.nan)
+    received = values > NOT_HEARD_DB if quantity.name == "power" else np.ones(values.shape, bool)
+    drawn = quantity.scale * np.where(received, values, np.nan)
     return drawn[..., 0] if drawn.ndim > 3 else drawn
 
 

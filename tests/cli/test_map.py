@@ -12,9 +12,9 @@ from untrained import make_coherent_run, make_run
 
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
-from wbgs_jax.inference.answers import bounds_of
+from wbgs_jax.inference.evaluate_quantities import domain_of
+from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.radio_map import BEST_BEAM, cut_at, pieces, plane_over
-from wbgs_jax.plotting import LOOKS
 from wbgs_jax.radio.array import codebook
 from wbgs_jax.training.run_folder import load_trained
 
@@ -40,7 +40,7 @@ def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
     assert result.code == 0, result.err
     with np.load(out) as found:
         xs, ys, height = found["xs"], found["ys"], float(found["height"])
-        name = LOOKS[what].name
+        name = QUANTITIES[what].outputs[0]
         values = found[name]
         assert values.shape[:3] == (len(ghz), 2, 4) and height == 1.3
         np.testing.assert_allclose(xs, [-0.75, -0.25, 0.25, 0.75])
@@ -83,7 +83,7 @@ def test_a_map_marks_places_without_confidence(runs, tmp_path):
     out = tmp_path / "wide.npz"
     assert ask(runs, "wave", "--ghz", 28, "--what", "power", "--area", "-60,-60:60,60", "--step", 20, "--out", out).code == 0
     with np.load(out) as found:
-        low, high = bounds_of(load_trained(runs["wave"]).dataset()).box[:, :2]
+        low, high = domain_of(load_trained(runs["wave"]).dataset()).box[:, :2]
         x, y = np.meshgrid(found["xs"], found["ys"])
         within = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
         assert found["no_confidence"].dtype == bool and found["no_confidence"].shape == found["power_db"].shape[1:]

@@ -19,7 +19,7 @@ from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
-from wbgs_jax.inference import evaluate_quantities
+from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.export import load_exported
 from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.inference.trained_field import RunConfig
@@ -277,7 +277,7 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
     whole, out, part = tmp_path / "whole.npz", tmp_path / "a.npz", tmp_path / "a.npz.part"
     ask = [*hearing, "--line", "0,0,1:2,0,1:5", "--ghz", 2, 5, "--what", "power"]
     assert predict(*ask, "--out", whole).code == 0
-    real, asked = evaluate_quantities.answer_block, []
+    real, asked = LoadedField.answer, []
 
     def interrupted(*arguments):
         if len(asked) == 1:
@@ -285,11 +285,11 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
         asked.append(arguments)
         return real(*arguments)
 
-    monkeypatch.setattr(evaluate_quantities, "answer_block", interrupted)
+    monkeypatch.setattr(LoadedField, "answer", interrupted)
     stopped = predict(*ask, "--out", out)
     assert stopped.code == 130 and not out.exists() and part.is_dir()
     assert "1 of 3 blocks are kept" in stopped.err and stopped.lines[-1] == "interrupted"
-    monkeypatch.setattr(evaluate_quantities, "answer_block", lambda *arguments: asked.append(arguments) or real(*arguments))
+    monkeypatch.setattr(LoadedField, "answer", lambda *arguments: asked.append(arguments) or real(*arguments))
     refused = predict(*ask, "--out", out)
     assert refused.code == 2 and "--resume" in refused.err
     refused = predict(*hearing, "--line", "0,0,1:2,0,1:6", "--ghz", 2, 5, "--what", "power", "--out", out, "--resume")
@@ -304,10 +304,8 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
 
 def test_a_picture_alone_asks_for_no_more_than_it_shows(hearing, tmp_path, monkeypatch):
     sizes = []
-    real = evaluate_quantities.answer_block
-    monkeypatch.setattr(
-        evaluate_quantities, "answer_block", lambda *a: sizes.append(sum(len(p.rows) for p in a[-1])) or real(*a)
-    )
+    real = LoadedField.answer
+    monkeypatch.setattr(LoadedField, "answer", lambda *a: sizes.append(sum(len(p.rows) for p in a[-1])) or real(*a))
     result = predict(*hearing, "--line", "0,0,1:2,0,1:900", "--ghz", 2, "--picture", tmp_path / "a.png")
     assert (result.code, sizes) == (0, [12])
 
@@ -322,8 +320,8 @@ def test_a_field_that_was_left_ready_says_the_same(tmp_path, monkeypatch, what, 
     monkeypatch.setenv("WBGS_CACHE", str(tmp_path / "cache"))
     assert predict(*ask, tmp_path / "first.npz").code == 0
     loaded = []
-    real = predict_command._load
-    monkeypatch.setattr(predict_command, "_load", lambda run: loaded.append(run) or real(run))
+    real = predict_command.load_field
+    monkeypatch.setattr(predict_command, "load_field", lambda run, *more: loaded.append(run) or real(run, *more))
     again = predict(*ask, tmp_path / "second.npz")
     assert (again.code, loaded) == (0, [])
     with np.load(tmp_path / "plain.npz") as plain:

@@ -8,7 +8,8 @@ import trimesh
 from synthetic import tiny_dataset
 
 from wbgs_jax.data.scene import closed_bodies
-from wbgs_jax.inference.answers import Bounds, _masked, bounds_of
+from wbgs_jax.inference.domain import Domain
+from wbgs_jax.inference.evaluate_quantities import domain_of
 from wbgs_jax.mesh.solids import ClosedBody, inside
 
 BESIDE = np.array([3.0, 3, 0])
@@ -68,23 +69,23 @@ def test_an_answer_from_within_a_body_or_from_far_away_has_no_confidence():
     dataset = tiny_dataset()
     receiver = np.asarray(dataset.receivers.position[0], float)
     centre = receiver + BESIDE
-    bounds = bounds_of(scene_with(at(trimesh.creation.box((0.5, 0.5, 0.5)), *centre)))
-    bounds = Bounds.from_json(bounds.as_json())
+    domain = domain_of(scene_with(at(trimesh.creation.box((0.5, 0.5, 0.5)), *centre)))
+    domain = Domain.from_json(domain.as_json())
     places = np.array([centre, centre + np.array([0, 0, 0.4]), dataset.tx_positions[0], [500.0, 0, 1]])
-    low, high = bounds.box
+    low, high = domain.box
     within = ((places >= low) & (places <= high)).all(1)
-    np.testing.assert_array_equal(bounds.without_confidence(places), [True, not within[1], False, True])
-    (line,) = bounds.doubts(receiver, centre[None], np.array([bounds.band[0]]))
+    np.testing.assert_array_equal(domain.outside(places), [True, not within[1], False, True])
+    (line,) = domain.warnings(receiver, centre[None], np.array([domain.band[0]]))
     assert "is inside a closed body (part 0 of" in line and "where no antenna can stand" in line
 
 
 def test_without_surfaces_places_nearby_keep_their_confidence():
     """Transmitters alone do not close a room."""
     dataset = dataclasses.replace(tiny_dataset(), faces=np.zeros((0, 3), np.int32), face_part=None, materials=None)
-    bounds = bounds_of(dataset)
-    size = np.linalg.norm(bounds.box[1] - bounds.box[0])
-    places = bounds.box[1] + np.array([[0.1, 0, 0], [size, 0, 0]])
-    np.testing.assert_array_equal(bounds.without_confidence(places), [False, True])
+    domain = domain_of(dataset)
+    size = np.linalg.norm(domain.box[1] - domain.box[0])
+    places = domain.box[1] + np.array([[0.1, 0, 0], [size, 0, 0]])
+    np.testing.assert_array_equal(domain.outside(places), [False, True])
 
 
 @pytest.mark.parametrize("n", [0, 1])
@@ -94,10 +95,10 @@ def test_no_place_is_none(n):
 
 
 def test_arrays_of_an_answer_lose_their_confidence_there_alone():
-    bounds = Bounds("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11))
+    domain = Domain("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11))
     answer = {"pas": np.ones((2, 90, 360), np.float32), "expected": np.full((2, 3), 0.9, np.float32)}
-    found = _masked(answer, bounds, np.array([[1.0, 1, 1], [500, 0, 1]]))
+    found = domain.without_intervals(answer, np.array([[1.0, 1, 1], [500, 0, 1]]))
     np.testing.assert_array_equal(found["pas"], answer["pas"])
     np.testing.assert_array_equal(found["expected"], np.array([[0.9] * 3, [np.nan] * 3], np.float32))
     assert found["expected"].dtype == np.float32
-    assert _masked({"pas": answer["pas"]}, bounds, np.zeros((2, 3))).keys() == {"pas"}
+    assert domain.without_intervals({"pas": answer["pas"]}, np.zeros((2, 3))).keys() == {"pas"}

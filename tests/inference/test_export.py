@@ -24,9 +24,12 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.hybrid import HybridConfig
+from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.inference.quantities import QUANTITIES
+from wbgs_jax.inference.queries import Product
 from wbgs_jax.training.fit_intervals import learn_confidence
 
 
@@ -79,6 +82,48 @@ def test_the_answers_are_those_of_the_predictor(exported, predict):
         exported(TX, 28.0)
 
 
+def test_all_outputs_and_their_intervals(tmp_path):
+    """Of a field that outputs power and snapshots, with intervals of its spectra."""
+    dataset = hold_out_validation(tiny_dataset(30))
+    field = get_field("wave").make(WaveConfig(specular_tried=32, specular_kept=8, diffracted_kept=8), DatasetScene(dataset), 0)
+    params = field.init(jax.random.key(1))
+    confidence, of_powers = learn_confidence(field, params, dataset, None)
+    whole = dataclasses.replace(
+        make_trained(tmp_path), field=field, params=params, confidence=confidence, power_confidence=of_powers
+    )
+    export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
+    found = load_exported(tmp_path / "field.zip").observe(TX, HZ)
+    loaded = LoadedField(whole, dataset, dataset.receiver())
+    block = [Product(np.arange(3)[i : i + 1], np.arange(1), TX[i : i + 1], HZ[i : i + 1]) for i in range(3)]
+    compared = set()
+    for what in ("spectra", "power", "snapshot"):
+        expected = {
+            name: np.concatenate([loaded.answer(what, [one])[name] for one in block]) for name in QUANTITIES[what].outputs
+        }
+        for name, values in expected.items():
+            known = np.isfinite(values)
+            assert known.any() and found[name].shape == values.shape
+            np.testing.assert_allclose(np.asarray(found[name])[known], values[known], rtol=1e-3, atol=2e-4, err_msg=name)
+            compared.add(name)
+    assert compared == {"pas", "expected", "power_db", "expected_error_db", "within_db", "snapshots"} == set(found)
+
+
+def test_files_of_the_first_format_are_read(tmp_path):
+    """They hold spectra alone."""
+
+    def spectra(tx_position, frequency_hz):
+        return jnp.broadcast_to((tx_position[:, :1] * frequency_hz[:, None])[..., None], (tx_position.shape[0], 90, 360))
+
+    (n,) = jax.export.symbolic_shape("n")
+    shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
+    with zipfile.ZipFile(tmp_path / "old.zip", "w") as archive:
+        archive.writestr("metadata.json", json.dumps({"format": 1, "scene": "box"}))
+        archive.writestr("field.bin", jax.export.export(jax.jit(spectra), platforms=["cpu"])(*shapes).serialize(vjp_order=1))
+    old = load_exported(tmp_path / "old.zip")
+    np.testing.assert_allclose(old(TX, HZ)[:, 3, 4], TX[:, 0] * HZ, rtol=1e-6)
+    assert old.observe(TX[:0], HZ[0]).keys() == {"pas"}
+
+
 def test_the_gradient_too(exported, predict, rng):
     weight = jnp.asarray(rng.normal(size=(3, 90, 360)), jnp.float32)
 
@@ -94,12 +139,13 @@ def test_the_gradient_too(exported, predict, rng):
 
 def test_metadata(exported):
     said = exported.metadata
-    assert (said["format"], said["scene"], said["field"], said["step"]) == (1, "box", "wideband", STEP)
+    assert (said["format"], said["scene"], said["field"], said["step"]) == (2, "box", "wideband", STEP)
     np.testing.assert_allclose(said["rx_position"], RX, rtol=1e-6)
     assert said["rx_orientation"] == [1, 0, 0, 0]
     assert said["frequency_range_hz"] == [FREQUENCIES_HZ.min(), FREQUENCIES_HZ.max()]
     assert np.shape(said["scene_box"]) == (2, 3)
     assert said["platforms"] == ["cpu", "cuda"]
+    assert said["outputs"] == ["pas", "power_db"]
     assert said["versions"] == {"wbgs_jax": wbgs_jax.__version__, "jax": jax.__version__}
 
 
@@ -163,7 +209,7 @@ def metadata(**changes):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (metadata(format=2), ["export format 2", "reads 1"]),
+        (metadata(format=3), ["export format 3", "reads 1 and 2"]),
         (lambda m: m.update({"metadata.json": b"[]"}), ["export format None"]),
         (lambda m: m.update({"metadata.json": b"{"}), ["damaged"]),
         (lambda m: m.pop("metadata.json"), ["metadata.json"]),

@@ -1,9 +1,6 @@
 """Tables of paths, responses and matrices against closed forms, and against each other."""
 
 import dataclasses
-from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +10,12 @@ from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
 from wbgs_jax.data.tables import read_table
-from wbgs_jax.inference.evaluate_quantities import SIGHT, as_rows, ask_mimo, ask_paths, ask_response
+from wbgs_jax.inference.evaluate_quantities import LoadedField, mimo_matrices
+from wbgs_jax.inference.path_table import SIGHT
 from wbgs_jax.inference.predictor import observe_queries
+from wbgs_jax.inference.quantities import Options
+from wbgs_jax.inference.results_file import Answers, table_rows
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
 from wbgs_jax.types import make_query
 
@@ -26,32 +27,16 @@ TX, GHZ = np.array([[4.5, 3.0, 1.6]]), np.array([6e9])
 NOTHING = np.zeros(3)
 
 
-@dataclass(frozen=True)
-class Known:
-    """A field that nobody has trained."""
-
-    field: Any
-    params: Any
-    neighbours: None = None
-    confidence: None = None
-    power_confidence: None = None
-
-    def dataset(self):
-        raise AssertionError("it is given")
-
-    def origin(self):
-        return {}
-
-
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory):
     run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(2), np.array([6e9]))
-    trained = Known(run.field, run.state.params)
-    return SimpleNamespace(trained=trained, dataset=run.dataset, receiver=run.dataset.receiver())
+    trained = TrainedField(RunConfig("room", "wave", "smoke", 0, None, SETTINGS), run.field, run.state.params, 0, 0.0)
+    return LoadedField(trained, run.dataset, run.dataset.receiver())
 
 
 def paths(asked, tx=TX, tx_velocity=NOTHING, rx_velocity=NOTHING, ghz=GHZ):
-    return ask_paths(asked.trained, asked.dataset, asked.receiver, tx, ghz, tx_velocity, rx_velocity)
+    moving = dataclasses.replace(asked, options=Options(tx_velocity, rx_velocity))
+    return moving.evaluate("paths", tx, ghz)
 
 
 def amplitudes(table, name="element"):
@@ -136,7 +121,7 @@ def test_doppler_shifts_are_rates_of_lengths(asked, rng):
 
 def test_a_response_is_that_of_the_paths(asked):
     band, points = 40e6, 16
-    answer = ask_response(asked.trained, asked.receiver, TX, GHZ, band, points)
+    answer = dataclasses.replace(asked, options=Options(band_hz=band, points=points)).evaluate("frequency-response", TX, GHZ)
     response, table = answer["frequency_response"][0, 0], paths(asked)
     assert response.shape == (points, 16) and answer["offsets_hz"][points // 2] == 0
     turns = np.exp(-2j * np.pi * answer["offsets_hz"][:, None] * table["delay_ns"] * 1e-9)
@@ -154,15 +139,15 @@ def test_a_response_is_that_of_the_paths(asked):
 @pytest.mark.heavy
 def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
     elements = planar_array(2, 2)
-    matrix = ask_mimo(asked.trained, asked.receiver, TX, GHZ, elements)["mimo"][0, 0]
+    matrix = dataclasses.replace(asked, options=Options(tx_array=(2, 2))).evaluate("mimo", TX, GHZ)["mimo"][0, 0]
     assert matrix.shape == (16, 4)
     for curved in (0.0, 1.0):
         params = dataclasses.replace(asked.trained.params, curved=jnp.asarray(curved))
-        own = SimpleNamespace(**vars(asked) | {"trained": dataclasses.replace(asked.trained, params=params)})
-        centre = ask_mimo(own.trained, asked.receiver, TX, GHZ, np.zeros((1, 3)))["mimo"][0, 0]
+        own = dataclasses.replace(asked, trained=dataclasses.replace(asked.trained, params=params))
+        centre = mimo_matrices(own, TX, GHZ, np.zeros((1, 3)))[0, 0]
         np.testing.assert_allclose(centre[:, 0], snapshot(own)[0], rtol=1e-3, atol=1e-7)
     small = elements * 0.02  # plane waves hold for small arrays
-    found = ask_mimo(asked.trained, asked.receiver, TX, GHZ, small)["mimo"][0, 0]
+    found = mimo_matrices(asked, TX, GHZ, small)[0, 0]
     for column, place in zip(found.T, small, strict=True):
         truth = snapshot(asked, TX + place * SPEED_OF_LIGHT / GHZ[0])[0]
         np.testing.assert_allclose(column, truth, atol=0.01 * np.abs(truth).max())
@@ -171,7 +156,7 @@ def test_a_matrix_is_what_elements_elsewhere_would_send(asked):
 
 def test_a_table_becomes_a_file(asked, tmp_path):
     table = paths(asked, tx=np.concatenate([TX, TX + 0.5]))
-    write_csv(tmp_path / "paths.csv", as_rows(table))
+    write_csv(tmp_path / "paths.csv", table_rows(Answers([table])))
     header, rows = read_table(tmp_path / "paths.csv")
     assert header == list(table) and len(rows) == len(table["tx"]) and set(table["tx"]) == {0, 1}
     powers = np.array([float(row[header.index("power_db")]) for row in rows])

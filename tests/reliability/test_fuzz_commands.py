@@ -21,7 +21,6 @@ from wbgs_jax.commands import convert, map, measure, predict, train, view
 from wbgs_jax.commands import evaluate as evaluation
 from wbgs_jax.commands import export_folder as layout
 from wbgs_jax.commands import main as cli
-from wbgs_jax.inference import answers as opened
 from wbgs_jax.training import run_folder
 from wbgs_jax.training.run_folder import load_trained
 
@@ -78,9 +77,9 @@ def no_work(monkeypatch, place):
     monkeypatch.setattr(run_folder, "load_trained", load)
     monkeypatch.setattr(train, "train", reached)
     monkeypatch.setattr(evaluation, "evaluate", reached)
-    monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.answer_block", reached)
-    monkeypatch.setattr(opened, "make_ready", lambda *_: None)
-    monkeypatch.setattr("wbgs_jax.inference.radio_map.ask_plane", reached)
+    monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.LoadedField.answer", reached)
+    monkeypatch.setattr("wbgs_jax.inference.cached_field.make_cached", lambda *_: None)
+    monkeypatch.setattr("wbgs_jax.inference.radio_map.evaluate_plane", reached)
     monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.arrivals_of", reached)
     monkeypatch.setattr("wbgs_jax.viewer.app.Viewer", reached)
     monkeypatch.setattr(measure, "learn_map", reached)

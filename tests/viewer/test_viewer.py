@@ -10,6 +10,7 @@ from untrained import make_coherent_run, make_run
 
 from experiments.viewer_pictures import chromium, drag, window
 from wbgs_jax.commands import view
+from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.predictor import predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions
 from wbgs_jax.training.run_folder import load_trained
@@ -26,14 +27,14 @@ DRAGS = 10
 def coherent(tmp_path_factory):
     trained = load_trained(make_coherent_run(tmp_path_factory.mktemp("view") / "box"))
     dataset = trained.dataset()
-    return Asker(trained, dataset, dataset.receiver())
+    return Asker(LoadedField(trained, dataset, dataset.receiver()))
 
 
 @pytest.fixture(scope="module")
 def splatting(tmp_path_factory):
     trained = load_trained(make_run(tmp_path_factory.mktemp("view") / "box"))
     dataset = trained.dataset()
-    return Asker(trained, dataset, dataset.receiver())
+    return Asker(LoadedField(trained, dataset, dataset.receiver()))
 
 
 @pytest.mark.heavy
@@ -62,7 +63,7 @@ def test_the_nearest_sample_is_the_datas(coherent):
 
 
 def test_a_sample_is_compared_with_what_would_be_observed(coherent, monkeypatch):
-    asker = Asker(coherent.trained, coherent.dataset, coherent.receiver)
+    asker = Asker(dataclasses.replace(coherent.loaded, trained=coherent.trained))
     truth = coherent.dataset.pas(coherent.dataset.test[:1])
     monkeypatch.setattr(type(coherent.trained.field), "as_observed", lambda self, params, pas: jnp.asarray(truth))
     link = int(coherent.dataset.test[0])
@@ -93,7 +94,8 @@ def test_another_thickness_is_seen_at_once_where_the_data_know_one_and_taken_bac
         found.append(coherent.ask(PLACE, HZ).power_db)
     assert abs(found[1] - found[0]) > 0.01
     assert coherent.materials()[1].thickness == pytest.approx(0.25 * SPEED_OF_LIGHT / HZ / np.sqrt(6))
-    anew = Asker(coherent.trained, coherent.dataset, coherent.receiver)  # as maps are asked: planned with that thickness
+    planned = dataclasses.replace(coherent.loaded, trained=coherent.trained)  # as for maps: planned with that thickness
+    anew = Asker(planned)
     assert anew.ask(PLACE, HZ).power_db == pytest.approx(found[1], abs=1e-4)
     coherent.restore(trained)
     assert coherent.ask(PLACE, HZ).power_db == before and coherent.plan is plan

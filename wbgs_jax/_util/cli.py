@@ -77,3 +77,13 @@ def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "me
     if len(values) != 3 or not (np.abs(values) <= FURTHEST).all():
         raise UserError(f"{option} {word[:60]} is no {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
     return values
+
+
+def point_words(position: Float[np.ndarray, "3"]) -> str:
+    """Returns "(x, y, z) m"."""
+    return "({:.6g}, {:.6g}, {:.6g}) m".format(*position)
+
+
+def link_words(tx_position: Float[np.ndarray, "3"], frequency_hz: float) -> str:
+    """Returns how a line names a link."""
+    return f"TX {point_words(tx_position)} at {frequency_hz / 1e9:g} GHz"

@@ -25,6 +25,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
+from wbgs_jax.commands.options import load_field, parse_frequencies, warn
 from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # What takes JAX is imported where it is wanted, as in predict.py.
@@ -97,22 +98,13 @@ def check(command: Command) -> None:
 
 def hand_on(command: Command) -> str:
     """Writes what a field knows, and returns a line about it."""
-    from wbgs_jax.inference.answers import check_frequencies, doubts, frequencies, receiver_at
-    from wbgs_jax.inference.trained_field import at_receiver
-    from wbgs_jax.training.run_folder import open_run
-
     assert command.run is not None and command.ghz is not None, "checked"
     positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
-    hertz = frequencies((command.ghz,))
-    trained = open_run(command.run)
-    dataset = trained.dataset()
-    receiver = receiver_at(command.rx, dataset)
-    trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, dataset, float(hertz[0]))
-    for line in doubts(dataset, np.asarray(receiver.position), positions, hertz)[:3]:
-        say(f"warning: {line}")
+    hertz = parse_frequencies((command.ghz,))
+    field = load_field(command.run, command.rx, float(hertz[0]))
+    warn(field.domain, field.receiver.position, positions, hertz, 3)
     write = _write_gaussians if command.out.suffix == ".ply" else _write_paths
-    return write(command, trained, receiver, positions, float(hertz[0]))
+    return write(command, field.trained, field.receiver, positions, float(hertz[0]))
 
 
 def _write_gaussians(

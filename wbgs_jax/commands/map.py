@@ -10,7 +10,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -20,12 +20,16 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
+from wbgs_jax.inference.quantities import INTERVALS, names_for
 
 # What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
 
 MOST_PLACES = 1_000_000
-SUFFIXES = {"out": ".npz", "picture": ".png"}
-What = Literal["power", "best-beam", "k-factor", "delay-spread", "angular-spread"]
+if TYPE_CHECKING:
+    What = str
+else:
+    What = Literal[names_for("map")]
 
 
 @dataclass(frozen=True)
@@ -57,10 +61,7 @@ def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for what cannot be."""
     if not (command.out or command.picture):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
-    for name, suffix in SUFFIXES.items():
-        path = getattr(command, name)
-        if path is not None and path.suffix != suffix:
-            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
+    check_suffixes(command, {"out": (".npz",), "picture": (".png",)})
     if not (np.isfinite(command.step) and command.step > 0):
         raise UserError(f"--step {command.step:g} is no distance; give metres, such as --step 0.25")
     if command.height is not None and not np.isfinite(command.height):
@@ -88,46 +89,30 @@ def plane_of(command: Command, dataset: Any) -> Any:
 
 
 def make_maps(command: Command) -> None:
-    """Asks, and writes what is wanted."""
-    from wbgs_jax.inference.answers import (
-        CONFIDENCES,
-        bounds_of,
-        check_frequencies,
-        frequencies,
-        receiver_at,
-        source_of,
-        write_answer,
-    )
-    from wbgs_jax.inference.radio_map import ask_plane, cut_at, pieces
-    from wbgs_jax.inference.trained_field import at_receiver
-    from wbgs_jax.training.run_folder import open_run
+    """Evaluates the maps, and writes what is wanted."""
+    from wbgs_jax.inference.radio_map import cut_at, evaluate_plane, pieces
+    from wbgs_jax.inference.results_file import write_arrays
 
-    frequencies_hz = frequencies(command.ghz)
-    trained = open_run(command.run)
-    dataset = trained.dataset()
-    plane, receiver = plane_of(command, dataset), receiver_at(command.rx, dataset)
-    trained = at_receiver(trained, receiver, dataset)
-    check_frequencies(trained, dataset, float(frequencies_hz.min()))
-    rx = np.asarray(receiver.position)
+    frequencies_hz = parse_frequencies(command.ghz)
+    field = load_field(command.run, command.rx, float(frequencies_hz.min()))
+    plane, rx = plane_of(command, field.dataset), np.asarray(field.receiver.position)
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
-    bounds = bounds_of(dataset)
-    for line in bounds.doubts(rx, corners, frequencies_hz):
-        say(f"warning: {line}")
+    warn(field.domain, rx, corners, frequencies_hz)
     with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
-        answer = ask_plane(command.what, trained, dataset, receiver, plane, frequencies_hz, progress.advance)
-    nowhere = bounds.without_confidence(plane.positions()).reshape(len(plane.ys), len(plane.xs))
-    for name in answer.keys() & set(CONFIDENCES):
-        answer[name] = np.where(nowhere, np.nan, answer[name])
-    answer["no_confidence"] = nowhere
+        answer = evaluate_plane(command.what, field, plane, frequencies_hz, progress.advance)
+    outside = field.domain.outside(plane.positions()).reshape(len(plane.ys), len(plane.xs))
+    for name in answer.keys() & set(INTERVALS):
+        answer[name] = np.where(outside, np.nan, answer[name])
+    answer["no_confidence"] = outside
     size = f"{len(plane.xs)} x {len(plane.ys)} places at {len(frequencies_hz)} frequencies"
     if command.out:
-        write_answer(command.out, answer, source_of(trained, dataset, receiver) | {"what": command.what})
+        write_arrays(command.out, answer, field.source | {"what": command.what})
         say(f"map: {command.out} ({size})")
     if command.picture:
         from wbgs_jax.plotting import draw_maps
 
         with atomic_write(command.picture) as stream:
-            draw_maps(command.what, answer, cut_at(dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
+            draw_maps(command.what, answer, cut_at(field.dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
         say(f"picture: {command.picture}")
 
 

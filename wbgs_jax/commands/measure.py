@@ -29,18 +29,19 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
+from wbgs_jax.commands.options import check_suffixes
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
 from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
 from wbgs_jax.data.tables import check_positions
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.inference.answers import Bounds
+from wbgs_jax.inference.domain import Domain
 from wbgs_jax.plotting import draw_power_maps
 from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_power
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 BEYOND_M = 2.0
 """How far from readings, receivers and walls an answer still has an interval: the next room, not the next building."""
-SUFFIXES = {"out": ".json", "picture": ".png", "answers": ".csv", "mesh": ".ply"}
+SUFFIXES = {"out": (".json",), "picture": (".png",), "answers": (".csv",), "mesh": (".ply",)}
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,7 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
-    for name, suffix in SUFFIXES.items():
-        path = getattr(command, name)
-        if path is not None and path.suffix != suffix:
-            raise UserError(f"--{name} {path} does not end in {suffix}; rename it")
+    check_suffixes(command, SUFFIXES)
     if command.data is None and (command.floor_plan is None or command.mesh is None):
         raise UserError("give --data FOLDER with readings, or --floor-plan walls.csv --mesh walls.ply")
     if command.data is None and (command.tx or command.out or command.picture):
@@ -112,25 +110,25 @@ def table(found: list[Score]) -> Table:
     return shown
 
 
-def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Bounds) -> list[list[str]]:
+def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain) -> list[list[str]]:
     """Returns a header and a row a transmitter: its place, then mean and half of the 90 % interval at every receiver; NaN for
     an interval outside of what was measured."""
     mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(places, jnp.float32)))
-    std = np.where(where.without_confidence(places)[:, None], np.nan, std)
+    std = np.where(where.outside(places)[:, None], np.nan, std)
     names = [f"{name}_{r + 1}" for r in range(mean.shape[1]) for name in ("dbm", "within_db")]
     pairs = np.stack([mean, NINETY * std], -1).reshape(len(places), -1)
     rows = [[*(f"{x:g}" for x in place), *(f"{x:.2f}" for x in row)] for place, row in zip(places, pairs, strict=True)]
     return [["x", "y", "z", *names], *rows]
 
 
-def measured_bounds(cells: Readings, walls: Walls) -> Bounds:
+def measured_domain(cells: Readings, walls: Walls) -> Domain:
     """Returns the box around readings, receivers and walls."""
     points = np.concatenate([cells.places, cells.receivers])
     low, high = points.min(0), points.max(0)
     ends = np.asarray(walls.ends).reshape(-1, 2)
     if len(ends):
         low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
-    return Bounds("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
+    return Domain("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
 
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
@@ -178,9 +176,9 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"about the data: {line}")
     learned = learn_map(cells, walls)
     if command.tx:
-        where = measured_bounds(cells, walls)
+        where = measured_domain(cells, walls)
         rows = answers(learned, places, where)
-        for row, outside in zip(rows[1:], where.without_confidence(places), strict=True):
+        for row, outside in zip(rows[1:], where.outside(places), strict=True):
             what = "mean dBm" if outside else "mean dBm, 90 % within"
             powers = [row[3 + 2 * r] + ("" if outside else f" ± {row[4 + 2 * r]}") for r in range(len(cells.receivers))]
             listed = ", ".join(f"{r}: {power}" for r, power in enumerate(powers, 1))

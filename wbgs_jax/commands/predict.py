@@ -14,7 +14,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -24,33 +24,26 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.inference import queries as asked
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
+from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference import results_file
+from wbgs_jax.inference.quantities import QUANTITIES, Options, names_for
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.inference.results_file import Answers, open_parts
 
 # What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
 
-SUFFIXES = {"out": (".npz",), "picture": (".png",), "export": (".zip",)}
-What = Literal[
-    "spectra",
-    "snapshot",
-    "power",
-    "beamforming-gain",
-    "k-factor",
-    "angular-spread",
-    "delay-spread",
-    "paths",
-    "frequency-response",
-    "mimo",
-]
-SCALARS = ("power", "beamforming-gain", "k-factor", "angular-spread", "delay-spread")
-"""Of `What`: a number a query, or two."""
+if TYPE_CHECKING:
+    from wbgs_jax.inference.cached_field import CachedField
+    from wbgs_jax.inference.evaluate_quantities import LoadedField
+
+    What = str
+else:
+    What = Literal[names_for("predict")]
+
 MOST_POINTS = 4096
 BLOCK = 256
-"""Queries that are asked, and kept, at a time."""
-SHOWN = 12
-"""Warnings."""
+"""Queries that are answered, and kept, at a time."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +91,9 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
-    for name, suffixes in SUFFIXES.items():
-        path = getattr(command, name)
-        allowed = (*suffixes, *([".csv"] if name == "out" and command.what in (*SCALARS, "paths") else []))
-        if path is not None and path.suffix not in allowed:
-            raise UserError(f"--{name} {path} does not end in {' or '.join(allowed)}; rename it")
+    form = QUANTITIES[command.what].form
+    out = (".npz",) if form == "array" else (".npz", ".csv")
+    check_suffixes(command, {"out": out, "picture": (".png",), "export": (".zip",)})
     places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
     bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
     asks, writes = bool(places or bands), bool(command.out or command.picture)
@@ -115,32 +106,31 @@ def check(command: Command) -> None:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
-    asked.parse_array(command.tx_array)
+    parsing.parse_array(command.tx_array)
     if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
         raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
-    if command.what not in ("spectra", *SCALARS) and (command.picture or (asks and not command.out)):
+    drawn = command.what == "spectra" or form == "scalar"
+    if not drawn and (command.picture or (asks and not command.out)):
         raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
 
 
 def queries_of(command: Command) -> Queries:
-    """Returns what is asked; frequencies that no field answers are a `UserError`."""
-    from wbgs_jax.inference.answers import frequencies
-
+    """Returns the queries; frequencies that no field answers are a `UserError`."""
     if command.queries:
-        positions, ghz = asked.read_queries(command.queries)
-        return Queries(positions, frequencies(ghz, str(command.queries)), paired=True)
+        positions, ghz = parsing.read_queries(command.queries)
+        return Queries(positions, parse_frequencies(ghz, str(command.queries)), paired=True)
     if command.line or command.grid:
-        positions = asked.parse_line(command.line) if command.line else asked.parse_grid(command.grid)
+        positions = parsing.parse_line(command.line) if command.line else parsing.parse_grid(command.grid)
     else:
         positions = parse_positions(command.tx)
     option = "--sweep" if command.sweep else "--ghz"
-    found = Queries(positions, frequencies(asked.parse_sweep(command.sweep) if command.sweep else command.ghz, option))
-    asked.check_count(len(found), "this command")
+    found = Queries(positions, parse_frequencies(parsing.parse_sweep(command.sweep) if command.sweep else command.ghz, option))
+    parsing.check_count(len(found), "this command")
     return found
 
 
-def lowest_asked(command: Command, queries: Queries) -> float:
-    """Returns the lowest frequency (hertz) that is asked for; a band that reaches beyond what fields know is a `UserError`."""
+def lowest_queried(command: Command, queries: Queries) -> float:
+    """Returns the lowest frequency (hertz) that of the queries; a band that reaches beyond the model's is a `UserError`."""
     from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
     half = 0.5e6 * command.band_mhz if command.what == "frequency-response" else 0.0
@@ -156,51 +146,55 @@ def _velocities(command: Command) -> dict[str, str]:
     return {"tx": command.tx_velocity, "rx": command.rx_velocity}
 
 
-def _load(run: Path) -> tuple[Any, list[Path]]:
-    from wbgs_jax.training.run_folder import open_run, sources_of
-
-    trained = open_run(run)
-    return trained, sources_of(run, trained.config)
-
-
 def _export(command: Command) -> None:
+    from wbgs_jax.inference.evaluate_quantities import check_quantity
     from wbgs_jax.inference.export import export_field
-    from wbgs_jax.inference.quantities import check_known
+    from wbgs_jax.training.run_folder import open_run
 
     assert command.export is not None
-    trained = _load(command.run)[0]
-    check_known("spectra", trained, trained.dataset())
-    export_field(trained, command.export)
+    trained = open_run(command.run)
+    dataset = trained.dataset()
+    check_quantity("spectra", trained.field, dataset)
+    export_field(trained, command.export, dataset=dataset)
     say(f"exported: {command.export} ({command.export.stat().st_size / 1e6:.1f} MB)")
 
 
-def _warn(opened: Any, queries: Queries) -> None:
-    """Says what of the question is doubtful."""
-    positions, frequencies = queries.tx_positions, queries.frequencies_hz
-    if queries.paired:
-        positions, frequencies = np.unique(positions, axis=0), np.unique(frequencies)
-    lines = opened.bounds.doubts(np.asarray(opened.source["receiver"]["position"]), positions, frequencies)
-    for line in lines[:SHOWN]:
-        say(f"warning: {line}")
-    if len(lines) > SHOWN:
-        say(f"warning: and {len(lines) - SHOWN} more like these")
+def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField":
+    """Returns the field that answers the queries. The first command leaves it ready for those that follow."""
+    from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
+
+    lowest, few = lowest_queried(command, queries), len(queries) <= MOST
+    if cached := load_cached(command.run, command.rx, command.what, len(queries), lowest):
+        return cached
+    from wbgs_jax.inference.evaluate_quantities import check_quantity
+    from wbgs_jax.inference.export import FROZEN
+    from wbgs_jax.training.run_folder import sources_of
+
+    tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
+    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
+    loaded = load_field(command.run, command.rx, lowest, options)
+    check_quantity(command.what, loaded.trained.field, loaded.dataset)
+    if few and command.what in FROZEN:
+        watched = sources_of(command.run, loaded.trained.config)
+        return make_cached(command.run, command.rx, len(queries), loaded, watched) or loaded
+    return loaded
 
 
-def ask(command: Command, queries: Queries, opened: Any) -> Answers:
+def answer_blocks(command: Command, queries: Queries, field: "CachedField | LoadedField") -> Answers:
     """Returns the answers to all queries, block by block; those of several blocks are kept in a folder until they are written.
     Ctrl-C leaves them there."""
     blocks = queries.blocks(BLOCK)
     target = command.out or command.picture
     assert target is not None, "checked"
     if len(blocks) == 1:
-        return Answers([opened.answer(blocks[0])])
-    parts = open_parts(target, _question(command, queries, opened), command.resume)
+        return Answers([field.answer(command.what, blocks[0])])
+    parts = open_parts(target, _question(command, queries, field.source), command.resume)
     if len(parts):
         say(f"going on after {len(parts)} of {len(blocks)} blocks of {BLOCK} queries")
     try:
         with CountProgress(f"{command.what}, blocks of {BLOCK}", len(blocks), len(parts)) as progress:
             for block in blocks[len(parts) :]:
-                parts.add(opened.answer(block))
+                parts.add(field.answer(command.what, block))
                 progress.advance()
     except KeyboardInterrupt:
         say(f"{len(parts)} of {len(blocks)} blocks are kept in {parts.folder}; the same command with --resume goes on")
@@ -208,34 +202,32 @@ def ask(command: Command, queries: Queries, opened: Any) -> Answers:
     return parts
 
 
-def _question(command: Command, queries: Queries, opened: Any) -> dict[str, Any]:
-    """Returns what a resumed command must ask as well."""
+def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dict[str, Any]:
+    """Returns what a resumed command must have in common with the one that it resumes."""
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
-    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": opened.source}
+    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
 
 
 def answer(command: Command, queries: Queries) -> None:
-    """Asks, and writes what is wanted."""
-    from wbgs_jax.inference.answers import Options, open_field
-
-    tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
-    options = Options(tx, rx, 1e6 * command.band_mhz, command.points, asked.parse_array(command.tx_array))
+    """Answers the queries, and writes what is wanted."""
     if command.what == "spectra" and command.out is None:
         queries = queries.some(shown_rows(len(queries)))  # no others are drawn
-    lowest = lowest_asked(command, queries)
-    opened = open_field(command.run, command.rx, command.what, queries, lowest, options, lambda: _load(command.run))
-    _warn(opened, queries)
-    answers = ask(command, queries, opened)
-    for line in results_file.lines(command.what, answers, queries, opened.source):
+    field = open_field(command, queries)
+    positions, frequencies = queries.tx_positions, queries.frequencies_hz
+    if queries.paired:
+        positions, frequencies = np.unique(positions, axis=0), np.unique(frequencies)
+    warn(field.domain, field.source["receiver"]["position"], positions, frequencies)
+    answers = answer_blocks(command, queries, field)
+    for line in results_file.lines(command.what, answers, queries, field.source):
         say(line)
     count = f"{len(queries)} queries"
     if not queries.paired:
         count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
     if command.out:
         replaced = ", in the place of another file" if command.out.exists() else ""
-        results_file.write(command.out, command.what, answers, queries, opened.source)
+        results_file.write(command.out, command.what, answers, queries, field.source)
         say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
         write_picture(command.picture, command.what, answers, queries)
@@ -253,7 +245,7 @@ def write_picture(path: Path, what: str, answers: Answers, queries: Queries) -> 
         positions, frequencies = queries.flat()
         figure = draw_answers(answers.rows(name, shown), positions[shown], frequencies[shown])
     else:
-        figure = draw_sweeps(name, answers.whole(name), queries)
+        figure = draw_sweeps(QUANTITIES[what], answers.whole(name), queries)
     with atomic_write(path) as stream:
         figure.savefig(stream, format="png", dpi=110)
 

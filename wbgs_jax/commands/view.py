@@ -19,9 +19,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
-from wbgs_jax.inference.answers import check_frequencies, frequencies, receiver_at
-from wbgs_jax.inference.trained_field import at_receiver
-from wbgs_jax.training.run_folder import open_run
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies
 
 if TYPE_CHECKING:
     from wbgs_jax.viewer.app import Viewer
@@ -54,8 +52,7 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for a command line that cannot work."""
-    if command.html is not None and command.html.suffix != ".html":
-        raise UserError(f"--html {command.html} does not end in .html; rename it")
+    check_suffixes(command, {"html": (".html",)})
     if not 0 <= command.port <= 65535:
         raise UserError(f"--port {command.port} is no port; give a number from 1 to 65535")
     try:
@@ -69,14 +66,10 @@ def start(command: Command) -> "Viewer":
     from wbgs_jax.viewer.app import Viewer
     from wbgs_jax.viewer.session import Asker
 
-    trained = open_run(command.run)
-    dataset = trained.dataset()
-    receiver = receiver_at(command.rx, dataset)
-    trained = at_receiver(trained, receiver, dataset)
-    if command.ghz is not None:
-        check_frequencies(trained, dataset, float(frequencies((command.ghz,))[0]))
-    page = command.html or Path(f"{dataset.name}.html")
-    viewer = Viewer(Asker(trained, dataset, receiver), command.host, command.port, page, command.up)
+    lowest = None if command.ghz is None else float(parse_frequencies((command.ghz,))[0])
+    field = load_field(command.run, command.rx, lowest)
+    page = command.html or Path(f"{field.dataset.name}.html")
+    viewer = Viewer(Asker(field), command.host, command.port, page, command.up)
     if command.ghz is not None:
         viewer.set_ghz(command.ghz)
     if command.tx:

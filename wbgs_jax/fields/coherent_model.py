@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.complex_math import phasor
 from wbgs_jax._util.pytree import pytree, same, static
 from wbgs_jax.fields.base import Observation
@@ -337,12 +338,7 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
 
 
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:
-    n, parts = len(positions), []
-    size = min(n, TRACED_AT_ONCE)
-    for start in range(0, n, size):
-        index = np.minimum(np.arange(start, start + size), n - 1)  # blocks of one shape: one compilation
-        parts.append(jax.tree.map(np.asarray, trace(plan, jnp.asarray(positions[index]))))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:n], *parts)
+    return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, TRACED_AT_ONCE)
 
 
 def _stacked(some: list[Paths]) -> Paths:

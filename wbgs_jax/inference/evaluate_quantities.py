@@ -1,83 +1,308 @@
-"""Blocks of queries answered by a trained field: spectra, or any other quantity that `wbgs-jax predict --what` names.
+"""The functions of `quantities.QUANTITIES`: a trained field at one receiver, queried for transmitters at frequencies."""
 
-The whole channel of links: tables of paths, responses over a band, and matrices between two arrays.
-
-What a coherent field knows of a link beyond what its receiver's array sees of it, asked for transmitters at frequencies.
-"""
-
+import contextlib
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Complex, Float
 
+import wbgs_jax
+from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
+from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.inference.answers import Options
-from wbgs_jax.inference.intervals import expect_many
+from wbgs_jax.inference.domain import Domain
+from wbgs_jax.inference.intervals import expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver
-from wbgs_jax.inference.predictor import BLOCK, observe_queries
-from wbgs_jax.inference.quantities import ask_channel
+from wbgs_jax.inference.path_table import path_table
+from wbgs_jax.inference.predictor import BLOCK, check_power, check_spectra, observe_queries, trained_band
+from wbgs_jax.inference.quantities import QUANTITIES, Options
 from wbgs_jax.inference.queries import Product
 from wbgs_jax.inference.results_file import SHARED
 from wbgs_jax.inference.trained_field import TrainedField
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
-from wbgs_jax.propagation.transport import mimo_matrix
-from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
-from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
-from wbgs_jax.types import Query, Receiver, make_query
+from wbgs_jax.propagation.transport import mimo_matrix, snapshots_from_paths
+from wbgs_jax.radio import channel
+from wbgs_jax.radio.array import best_beams, cbf, pas_directions, planar_array, steering_vector
+from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Query, Receiver, make_query
 
-WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
-"""What a wave does: through a wall, off a floor, around a cabinet's edge."""
-SIGHT = "line of sight"
-
-
-def check_paths(trained: TrainedField) -> None:
-    """Raises a `UserError` where a field knows no paths."""
-    if "paths" not in trained.field.known():
-        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
-        raise UserError(f"the {trained.field.name} field of this run knows no paths; train --field {able} on data with a mesh")
+Answer = dict[str, np.ndarray]
+"""Arrays by name: leading axes (tx, freq), or the columns of a table."""
+DEFAULTS = Options()
+OfArrivals = Callable[[Arrivals, Receiver, Any], Array]
+"""(arrivals of one link, receiver, frequency_hz) -> a quantity of it."""
 
 
-def ask_paths(
-    trained: TrainedField,
-    dataset: Dataset,
-    receiver: Receiver,
+@dataclass(frozen=True)
+class LoadedField:
+    """A trained field at one receiver."""
+
+    trained: TrainedField
+    """At that receiver (`trained_field.at_receiver`)."""
+    dataset: Dataset
+    """On which it was trained."""
+    receiver: Receiver
+    options: Options = DEFAULTS
+
+    @cached_property
+    def plan(self) -> Any:
+        """What does not depend on the query."""
+        return self.trained.field.plan(self.trained.params, self.receiver)
+
+    @cached_property
+    def domain(self) -> Domain:
+        """Where it was trained."""
+        return domain_of(self.dataset)
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials of the data; none where these have none."""
+        return () if self.dataset.materials is None else self.dataset.materials.names
+
+    @property
+    def source(self) -> dict[str, Any]:
+        """Where its answers come from: scene, field, step, version, receiver, and the levels of its prediction intervals."""
+        receiver = {name: np.asarray(getattr(self.receiver, name)).tolist() for name in ("position", "orientation")}
+        origin = {name: value for name, value in self.trained.origin().items() if name in ("field", "step")}
+        learned = {"interval_level": self.trained.confidence, "power_interval_level": self.trained.power_confidence}
+        levels = {name: round(float(own.level), 4) for name, own in learned.items() if own is not None}
+        return {"scene": self.dataset.name, "version": wbgs_jax.__version__, "receiver": receiver} | origin | levels
+
+    def evaluate(
+        self, what: str, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
+    ) -> Answer:
+        """Returns a quantity of every transmitter at every frequency: {name with unit: values (tx, freq, ...)}, and arrays of
+        `results_file.SHARED`; of paths the columns of a table.
+
+        Args:
+            what: a name of `QUANTITIES`.
+            tx_positions: world frame, metres.
+            frequencies_hz: of the carrier.
+
+        Raises:
+            UserError: the field has no such quantity.
+        """
+        check_quantity(what, self.trained.field, self.dataset)
+        return EVALUATE[what](self, np.asarray(tx_positions), np.asarray(frequencies_hz))
+
+    def answer(self, what: str, block: list[Product]) -> Answer:
+        """Returns the answers to a block of queries, their leading axis the queries in order, intervals NaN where none holds; a
+        table in the order of the queries, whose `tx` is the number of the transmitter."""
+        found = [self.evaluate(what, product.tx_positions, product.frequencies_hz) for product in block]
+        if QUANTITIES[what].form == "table":
+            for product, table in zip(block, found, strict=True):
+                table["tx"] = product.tx_numbers[table["tx"]]
+            order = np.argsort(np.concatenate([table["tx"] for table in found]), kind="stable")
+            return {name: np.concatenate([table[name] for table in found])[order] for name in found[0]}
+        order = np.argsort(np.concatenate([product.rows for product in block]))
+        answers = {
+            name: values
+            if name in SHARED
+            else np.concatenate([own[name].reshape(-1, *own[name].shape[2:]) for own in found])[order]
+            for name, values in found[0].items()
+        }
+        positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])
+        return self.domain.without_intervals(answers, positions[order])
+
+
+def domain_of(dataset: Dataset) -> Domain:
+    """Returns where a field is trained by a data set."""
+    box = np.asarray(DatasetScene(dataset).box, np.float64)
+    beyond = 0.0 if len(dataset.faces) else 0.5 * float(np.linalg.norm(box[1] - box[0]))
+    return Domain(dataset.name, box, trained_band(dataset), beyond, closed_bodies(dataset))
+
+
+def lowest_frequency(field: Field, dataset: Dataset) -> float:
+    """Returns the lowest frequency (hertz) at which a field can be queried: that of the model's band, or of its training; paths
+    hold below, too."""
+    if "paths" in field.known():
+        return LOWEST_OF_PATHS_HZ
+    return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
+
+
+def check_quantity(what: str, field: Field, dataset: Dataset | None = None) -> None:
+    """Raises a `UserError` where a field has no such quantity, or learned nothing of it from the data."""
+    needs = set(QUANTITIES[what].needs)
+    if not needs & set(field.known()):
+        able = " or ".join(name for name in field_names() if needs & set(get_field(name).gives))
+        if needs == {"paths"}:
+            lacks = "knows no paths" if what == "paths" else f"has no {what}: it knows no paths"
+            raise UserError(f"the {field.name} field {lacks}; train --field {able} on data with a mesh")
+        raise UserError(f"the {field.name} field has no {what}, only spectra; train --field {able}")
+    if dataset is not None and "pas" in needs:
+        check_spectra(field, dataset)
+    if dataset is not None and "power" in needs:
+        check_power(field, dataset)
+
+
+def known_quantities(field: Field, dataset: Dataset) -> list[str]:
+    """Returns the names of the quantities that a field has."""
+    found = []
+    for what in QUANTITIES:
+        with contextlib.suppress(UserError):
+            check_quantity(what, field, dataset)
+            found.append(what)
+    return found
+
+
+def _queries(tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
+    """Returns every transmitter at every frequency, the frequency fastest."""
+    return make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
+
+
+def _shaped(found: Any, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> np.ndarray:
+    values = np.asarray(found)
+    return values.reshape(len(tx_positions), len(frequencies_hz), *values.shape[1:])
+
+
+def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """Spectra `pas` (tx, freq, 90, 360); with prediction intervals also `expected` (tx, freq, 3): the expected SSIM, and
+    the ends of its interval."""
+    query = _queries(tx_positions, frequencies_hz)
+    seen = observe_queries(at.trained, at.receiver, query)
+    answer = {"pas": _shaped(seen.pas, tx_positions, frequencies_hz)}
+    confidence = for_receiver(at.trained.confidence, at.receiver)
+    if confidence is not None:
+        power = None if seen.power_db is None else np.asarray(seen.power_db)
+        expected = expect_many(
+            confidence, np.asarray(seen.pas), np.asarray(query.tx_position), np.asarray(query.frequency_hz), power
+        )
+        answer["expected"] = _shaped(np.stack(expected, -1), tx_positions, frequencies_hz)
+    return answer
+
+
+def _snapshots(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    found = observe_queries(at.trained, at.receiver, _queries(tx_positions, frequencies_hz), "snapshots")
+    return {"snapshots": _shaped(found, tx_positions, frequencies_hz)}
+
+
+def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """Received powers, dB relative to the transmitted power, and their prediction intervals where the run has any."""
+    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_confidence
+    power = observe_queries(at.trained, at.receiver, query, "power_db")
+    answer = {"power_db": power}
+    if learned is not None:
+        sure = expected_power(learned, jnp.asarray(power, jnp.float32), query, at.receiver.position)
+        answer |= {"expected_error_db": np.asarray(sure.error_db), "within_db": np.asarray(sure.within_db)}
+    return {name: _shaped(values, tx_positions, frequencies_hz) for name, values in answer.items()}
+
+
+def _best_beams(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """Numbers of the beams of `radio.array.codebook` that receive most."""
+    spectra = observe_queries(at.trained, at.receiver, _queries(tx_positions, frequencies_hz), "pas")
+    return {"best_beam": _shaped(best_beams(spectra), tx_positions, frequencies_hz)}
+
+
+def _from_arrivals(
+    name: str, function: OfArrivals, at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
+) -> Answer:
+    """A number, or two, that follow from the arrivals of single links."""
+    found = map_blocks(
+        lambda block: _measure(at.trained.field, at.trained.params, at.plan, at.receiver, block, function),
+        _queries(tx_positions, frequencies_hz),
+        BLOCK,
+    )
+    return {name: _shaped(found, tx_positions, frequencies_hz)}
+
+
+@partial(jax.jit, static_argnames=("function",))
+def _measure(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfArrivals) -> Any:
+    arrivals = field.arrivals(params, plan, query)
+    return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
+
+
+def _beamforming_gain(arrivals: Arrivals, receiver: Receiver, frequency_hz: Any) -> Array:
+    y = snapshots_from_paths(arrivals, receiver, frequency_hz)
+    directions = jnp.asarray(pas_directions(), jnp.float32)
+    strongest = jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
+    return channel.beamforming_gain_db(y, strongest)
+
+
+def _k_factor(arrivals: Arrivals, *_: Any) -> Array:
+    return channel.k_factor_db(arrivals)
+
+
+def _angular_spread(arrivals: Arrivals, *_: Any) -> Array:
+    return channel.angular_spread_deg(arrivals)
+
+
+def _delay_spread(arrivals: Arrivals, *_: Any) -> Array:
+    return channel.delay_spread_s(arrivals)
+
+
+def _paths(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """A table (`path_table`)."""
+    velocities = at.options.tx_velocity, at.options.rx_velocity
+    field, params = at.trained.field, at.trained.params
+    return path_table(field, params, at.plan, tx_positions, frequencies_hz, velocities, at.materials)
+
+
+def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """The response of every element over a band around each carrier, (tx, freq, points, elements), and its inverse Fourier
+    transform over the delays that the band resolves (no window). Every frequency of the band is a query by itself, so that
+    materials may change over it."""
+    band_hz, points = at.options.band_hz, at.options.points
+    offsets = (np.arange(points) - points // 2) * band_hz / points
+    bands = frequencies_hz[:, None] + offsets
+    query = _queries(tx_positions, bands.reshape(-1))
+    response = observe_queries(at.trained, at.receiver, query, "snapshots").reshape(len(tx_positions), *bands.shape, -1)
+    return {
+        "frequency_response": response,
+        "impulse_response": np.fft.ifft(np.fft.ifftshift(response, 2), axis=2).astype(np.complex64),
+        "offsets_hz": offsets,
+        "delays_s": np.arange(points) / band_hz,
+    }
+
+
+def _mimo(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
+    """The matrix between all elements of the receiver and those of a planar array at each transmitter, (tx, freq, elements, m).
+    `tx_elements` are in wavelengths around the transmitter's position, world frame; each is like the antenna it replaces."""
+    elements = planar_array(*at.options.tx_array)
+    return {"mimo": mimo_matrices(at, tx_positions, frequencies_hz, elements), "tx_elements": elements}
+
+
+def mimo_matrices(
+    at: LoadedField,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
-    tx_velocity: Float[np.ndarray, "3"],
-    rx_velocity: Float[np.ndarray, "3"],
-) -> dict[str, np.ndarray]:
-    """Returns a table with a row a path, its columns by name: which link it belongs to, what it meets, length, delay, angles,
-    amplitudes and Doppler shift; of each link the strongest path first.
+    tx_elements: Float[np.ndarray, "m 3"],
+) -> Complex[np.ndarray, "tx freq elements m"]:
+    """Returns the matrices between the receiver's elements and M elements, in wavelengths around each transmitter."""
+    elements = jnp.asarray(tx_elements, jnp.float32)
+    found = map_blocks(
+        lambda block: _matrices(at.trained.field, at.trained.params, at.plan, block, at.receiver, elements),
+        _queries(tx_positions, frequencies_hz),
+        1,
+    )
+    return _shaped(found, tx_positions, frequencies_hz)
 
-    Angles of arrival are in the receiver's frame, those of departure in the world's, zenith 0 upwards. Amplitudes are relative
-    to the transmitted one, carrier phase included: what an element of the array sees, and what isotropic elements would see
-    that are polarised along theta-hat and phi-hat. They add up to the snapshot where waves are plane.
 
-    Args:
-        trained: the field.
-        dataset: it was trained on, which names the materials.
-        receiver: at which it is asked.
-        tx_positions: world frame, metres.
-        frequencies_hz: of the carrier.
-        tx_velocity, rx_velocity: metres a second, world frame.
+@jax.jit
+def _matrices(field: Field, params: Any, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
+    arrivals = field.arrivals(params, plan, query)
+    return jax.vmap(lambda one, hertz: mimo_matrix(one, receiver, hertz, elements))(arrivals, query.frequency_hz)
 
-    Raises:
-        UserError: the field knows no paths.
-    """
-    check_paths(trained)
-    plan, tables = trained.field.plan(trained.params, receiver), []
-    velocities = jnp.asarray(tx_velocity, jnp.float32), jnp.asarray(rx_velocity, jnp.float32)
-    for number, position in enumerate(tx_positions):
-        for frequency in frequencies_hz:
-            found, shift = _link(trained.field, trained.params, plan, make_query(position[None], frequency[None]), *velocities)
-            link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
-            tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, names_of(dataset)))
-    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
+    "spectra": _spectra,
+    "snapshot": _snapshots,
+    "power": _power,
+    "beamforming-gain": partial(_from_arrivals, "beamforming_gain_db", _beamforming_gain),
+    "k-factor": partial(_from_arrivals, "k_factor_db", _k_factor),
+    "angular-spread": partial(_from_arrivals, "angular_spread_deg", _angular_spread),
+    "delay-spread": partial(_from_arrivals, "delay_spread_s", _delay_spread),
+    "best-beam": _best_beams,
+    "paths": _paths,
+    "frequency-response": _frequency_response,
+    "mimo": _mimo,
+}
+"""A function for each of `quantities.QUANTITIES`: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> answer."""
 
 
 def arrivals_of(
@@ -86,198 +311,15 @@ def arrivals_of(
     """Returns what arrives over every path from transmitters at one frequency, as NumPy arrays with a leading axis for them.
 
     Raises:
-        UserError: the field knows no paths.
+        UserError: the field has no paths.
     """
-    check_paths(trained)
-    plan, parts, count = trained.field.plan(trained.params, receiver), [], len(tx_positions)
-    size = min(BLOCK, count)
-    for start in range(0, count, size):
-        index = np.minimum(np.arange(start, start + size), count - 1)  # the last one fills the last block up
-        query = make_query(tx_positions[index], np.full(size, frequency_hz))
-        found = jax.tree.map(np.asarray, _arrivals(trained.field, trained.params, plan, query))
-        parts.append(jax.tree.map(lambda leaf, start=start: leaf[: count - start], found))
-    together: Arrivals = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return together
+    check_quantity("paths", trained.field)
+    plan = trained.field.plan(trained.params, receiver)
+    query = make_query(np.asarray(tx_positions), np.full(len(tx_positions), frequency_hz))
+    found: Arrivals = map_blocks(lambda block: _arrivals(trained.field, trained.params, plan, block), query, BLOCK)
+    return found
 
 
 @jax.jit
 def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> Arrivals:
     return field.arrivals(params, plan, query)
-
-
-@jax.jit
-def _link(
-    field: Field, params: Any, plan: Any, query: Query, tx_velocity: Any, rx_velocity: Any
-) -> tuple[Arrivals, Float[jax.Array, " k"]]:
-    """Returns the paths of one query, and their Doppler shifts."""
-    found: Any = jax.tree.map(lambda leaf: leaf[0], field.arrivals(params, plan, query))
-    return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)
-
-
-def names_of(dataset: Dataset) -> tuple[str, ...]:
-    """Returns the names of a data set's materials; none where it has none."""
-    return () if dataset.materials is None else dataset.materials.names
-
-
-def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    power = np.asarray(decibels(jnp.asarray(np.abs(found.amplitude) ** 2)))
-    order = np.argsort(-power, kind="stable")
-    order = order[(np.abs(found.polarised[order]) > 0).any(-1)]
-    columns: dict[str, np.ndarray] = {name: np.full(len(order), value) for name, value in link.items()}
-    columns["interactions"] = np.array(
-        [describe_interactions(found.interaction[i], found.material[i], names) for i in order], dtype=np.str_
-    )
-    columns["length_m"] = found.length[order]
-    columns["delay_ns"] = found.length[order] / SPEED_OF_LIGHT * 1e9
-    for end, direction in (("arrival", found.direction), ("departure", found.departure)):
-        zenith = np.degrees(np.arccos(np.clip(direction[order, 2], -1, 1)))
-        azimuth = np.degrees(np.arctan2(direction[order, 1], direction[order, 0]))
-        columns |= {f"{end}_zenith_deg": zenith, f"{end}_azimuth_deg": azimuth}
-    columns["power_db"] = power[order]
-    parts = {"element": found.amplitude, "theta": found.polarised[:, 0], "phi": found.polarised[:, 1]}
-    for name, amplitude in parts.items():
-        columns |= {f"{name}_re": amplitude[order].real, f"{name}_im": amplitude[order].imag}
-    return columns | {"doppler_hz": shift[order]}
-
-
-def describe_interactions(kinds: np.ndarray, materials: np.ndarray, names: tuple[str, ...]) -> str:
-    """Returns what a path meets: "off concrete, through glass"."""
-    met = [
-        f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"
-        for kind, material in zip(kinds, materials, strict=True)
-        if int(kind) in WORDS
-    ]
-    return ", ".join(met) or SIGHT
-
-
-def ask_response(
-    trained: TrainedField,
-    receiver: Receiver,
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-    band_hz: float,
-    points: int,
-) -> dict[str, np.ndarray]:
-    """Returns the response of every element over a band around each carrier, (tx, freq, points, elements), and its inverse
-    Fourier transform over the delays that the band can tell apart (no window).
-
-    Every frequency of the band is asked for by itself, so materials may change over it.
-
-    Raises:
-        UserError: the field knows no paths.
-    """
-    check_paths(trained)
-    offsets = (np.arange(points) - points // 2) * band_hz / points
-    asked = frequencies_hz[:, None] + offsets
-    shape = len(tx_positions), *asked.shape
-    query = make_query(np.repeat(tx_positions, asked.size, 0), np.tile(asked.reshape(-1), shape[0]))
-    response = observe_queries(trained, receiver, query, "snapshots").reshape(*shape, -1)
-    return {
-        "frequency_response": response,
-        "impulse_response": np.fft.ifft(np.fft.ifftshift(response, 2), axis=2).astype(np.complex64),
-        "offsets_hz": offsets,
-        "delays_s": np.arange(points) / band_hz,
-        "tx_positions": tx_positions,
-        "frequencies_hz": frequencies_hz,
-    }
-
-
-def ask_mimo(
-    trained: TrainedField,
-    receiver: Receiver,
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-    tx_elements: Float[np.ndarray, "m 3"],
-) -> dict[str, np.ndarray]:
-    """Returns the matrix between all elements of the receiver and M of each transmitter, (tx, freq, elements, m).
-
-    `tx_elements` are in wavelengths around the transmitter's position, world frame; each is like the antenna it replaces.
-
-    Raises:
-        UserError: the field knows no paths.
-    """
-    check_paths(trained)
-    plan, elements = trained.field.plan(trained.params, receiver), jnp.asarray(tx_elements, jnp.float32)
-    queries = [make_query(tx[None], frequency[None]) for tx in tx_positions for frequency in frequencies_hz]
-    found = np.array([_matrix(trained.field, trained.params, plan, query, receiver, elements) for query in queries])
-    matrices = found.reshape(len(tx_positions), len(frequencies_hz), *found.shape[1:])
-    return {"mimo": matrices, "tx_elements": tx_elements, "tx_positions": tx_positions, "frequencies_hz": frequencies_hz}
-
-
-@jax.jit
-def _matrix(field: Field, params: Any, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
-    found: Any = jax.tree.map(lambda leaf: leaf[0], field.arrivals(params, plan, query))
-    return mimo_matrix(found, receiver, query.frequency_hz[0], elements)
-
-
-def as_rows(table: dict[str, np.ndarray]) -> list[list[Any]]:
-    """Returns columns of one length as rows with a header; numbers have seven digits."""
-    body = [
-        [f"{value:.7g}" if isinstance(value, np.floating) else value for value in row]
-        for row in zip(*table.values(), strict=True)
-    ]
-    return [list(table), *body]
-
-
-PATHS = "paths"
-ASKED = ("tx_positions", "frequencies_hz")
-"""What answers repeat of the question."""
-
-
-def answer_block(
-    what: str, trained: TrainedField, dataset: Dataset, receiver: Receiver, options: Options, block: list[Product]
-) -> dict[str, np.ndarray]:
-    """Returns the answers to a block of queries by name, their leading axis the queries in order, and `results_file.SHARED`
-    arrays; of paths a table, in the queries' order, whose `tx` says which transmitter a row belongs to."""
-    ask, found = _asker(what, trained, dataset, receiver, options), []
-    for product in block:
-        answer = ask(product.tx_positions, product.frequencies_hz)
-        if what == PATHS:
-            answer["tx"] = product.tx_numbers[answer["tx"]]
-        found.append({name: values for name, values in answer.items() if name not in ASKED and values is not None})
-    if what == PATHS:
-        order = np.argsort(np.concatenate([answer["tx"] for answer in found]), kind="stable")
-        return {name: np.concatenate([answer[name] for answer in found])[order] for name in found[0]}
-    order = np.argsort(np.concatenate([product.rows for product in block]))
-    return {
-        name: found[0][name]
-        if name in SHARED
-        else np.concatenate([answer[name].reshape(-1, *answer[name].shape[2:]) for answer in found])[order]
-        for name in found[0]
-    }
-
-
-def _asker(
-    what: str, trained: TrainedField, dataset: Dataset, receiver: Receiver, options: Options
-) -> Callable[[Any, Any], dict[str, np.ndarray]]:
-    """Returns a function of transmitters and frequencies, every one at every other."""
-    if what == "spectra":
-        return lambda tx, freq: ask_spectra(trained, receiver, tx, freq)
-    if what == PATHS:
-        velocities = options.tx_velocity, options.rx_velocity
-        return lambda tx, freq: ask_paths(trained, dataset, receiver, tx, freq, *velocities)
-    if what == "frequency-response":
-        return lambda tx, freq: ask_response(trained, receiver, tx, freq, options.band_hz, options.points)
-    if what == "mimo":
-        return lambda tx, freq: ask_mimo(trained, receiver, tx, freq, planar_array(*options.tx_array))
-    return lambda tx, freq: ask_channel(what, trained, dataset, receiver, tx, freq)
-
-
-def ask_spectra(
-    trained: TrainedField,
-    receiver: Receiver,
-    tx_positions: Float[np.ndarray, "tx 3"],
-    frequencies_hz: Float[np.ndarray, " freq"],
-) -> dict[str, np.ndarray]:
-    """Returns the spectra `pas` (tx, freq, 90, 360) of every transmitter at every frequency, and `expected` (tx, freq, 3): the
-    SSIM that is expected of each, and the ends of its interval, where the run knows how sure it is."""
-    shape = len(tx_positions), len(frequencies_hz)
-    tx, frequency = np.repeat(tx_positions, shape[1], axis=0), np.tile(frequencies_hz, shape[0])
-    seen = observe_queries(trained, receiver, make_query(tx, frequency))
-    pas, power = np.asarray(seen.pas), None if seen.power_db is None else np.asarray(seen.power_db)
-    answer = {"pas": pas.reshape(*shape, *pas.shape[1:])}
-    confidence = for_receiver(trained.confidence, receiver)
-    if confidence is not None:
-        expected = np.stack(expect_many(confidence, pas, tx, frequency, power), -1)
-        answer["expected"] = expected.reshape(*shape, 3)
-    return answer

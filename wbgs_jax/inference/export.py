@@ -1,24 +1,29 @@
 """A trained field as one file that runs without its training code, and back.
 
 The file is a zip archive of `metadata.json` (scene, receiver, what it was trained on, versions) and `field.bin`: the field as
-a function (tx_position (n, 3), frequency_hz (n,)) -> PAS (n, 90, 360) in StableHLO, parameters included, written by
-`jax.export` for any n >= 1 with one reverse-mode derivative. JAX and NumPy read it alone (docs/inference.md):
+a function (tx_position (n, 3), frequency_hz (n,)) -> {"pas": (n, 90, 360), ...} in StableHLO, parameters included, written by
+`jax.export` for any n >= 1 with one reverse-mode derivative. The dictionary holds what the field outputs (`pas`, `power_db`,
+`snapshots`) with its prediction intervals (`expected`, `expected_error_db`, `within_db`). JAX and NumPy read it alone
+(docs/inference.md):
 
     with zipfile.ZipFile(path) as archive:
         predict = jax.export.deserialize(bytearray(archive.read("field.bin"))).call
+
+Files of format 1 hold spectra alone, as an array.
 """
 
 import contextlib
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.export
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -27,15 +32,65 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.fields import Field
+from wbgs_jax.inference.evaluate_quantities import known_quantities
+from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
+from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.types import Query, Receiver
 
-FORMAT = 1
+FORMAT = 2
 METADATA, FIELD = "metadata.json", "field.bin"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """What `jax.export` can lower for, on any machine."""
+FROZEN = ("spectra", "power", "snapshot")
+"""Quantities that `answer_all` gives."""
+
+
+class FrozenField(NamedTuple):
+    """All that answers follow from at one receiver: a tree of arrays."""
+
+    field: Field
+    params: Any
+    plan: Any
+    neighbours: Any
+    confidence: Any
+    power_confidence: PowerConfidence | None
+    receiver: Receiver
+
+
+def freeze(trained: TrainedField, receiver: Receiver) -> FrozenField:
+    """Returns a trained field at a receiver (`trained_field.at_receiver`), planned."""
+    neighbours, confidence = (for_receiver(one, receiver) for one in (trained.neighbours, trained.confidence))
+    plan = trained.field.plan(trained.params, receiver)
+    return FrozenField(trained.field, trained.params, plan, neighbours, confidence, trained.power_confidence, receiver)
+
+
+def answer_all(frozen: FrozenField, query: Query, names: Sequence[str]) -> dict[str, Array]:
+    """Returns the outputs of a field and their prediction intervals for B queries, as far as there are any (pure, jittable).
+
+    Args:
+        frozen: the field.
+        query: of B links.
+        names: of the arrays that are wanted (`quantities.Quantity.outputs`).
+    """
+    seen = frozen.field.render(frozen.params, frozen.plan, query)
+    pas = correct(frozen.neighbours, seen.pas, query)
+    found: dict[str, Array | None] = {"pas": pas, "power_db": seen.power_db, "snapshots": seen.snapshots}
+    if frozen.confidence is not None:
+        found["expected"] = jnp.stack(expected_ssim(frozen.confidence, pas, query, seen.power_db), -1)
+    if frozen.power_confidence is not None and seen.power_db is not None:
+        interval = expected_power(frozen.power_confidence, seen.power_db, query, frozen.receiver.position)
+        found |= {"expected_error_db": interval.error_db, "within_db": interval.within_db}
+    return {name: values for name, values in found.items() if values is not None and name in names}
+
+
+def frozen_outputs(trained: TrainedField, dataset: Dataset) -> tuple[str, ...]:
+    """Returns the names of the arrays that `answer_all` can give of a field."""
+    known = [what for what in FROZEN if what in known_quantities(trained.field, dataset)]
+    return tuple(name for what in known for name in QUANTITIES[what].outputs)
 
 
 @dataclass(frozen=True)
@@ -44,8 +99,10 @@ class ExportedField:
     batches. One reverse-mode `jax.grad` is."""
 
     metadata: dict[str, Any]
-    """What `metadata.json` says."""
+    """The content of `metadata.json`."""
     predict: Predictor
+    observe: Callable[[Any, Any], dict[str, Array]]
+    """(tx_position, frequency_hz), as for a `predictor`, -> all outputs by name."""
 
     def __call__(self, tx_position: Any, frequency_hz: Any) -> Float[Array, "*b 90 360"]:
         return self.predict(tx_position, frequency_hz)
@@ -64,9 +121,10 @@ def export_field(
     if not platforms or set(platforms) - set(PLATFORMS):
         raise UserError(f"cannot export for {', '.join(platforms) or 'no platform'}; choose from: {', '.join(PLATFORMS)}")
     dataset = trained.dataset() if dataset is None else dataset
+    outputs, program = _serialize(trained, dataset, platforms)
     content = {
-        METADATA: json.dumps(_metadata(trained, dataset, platforms), indent=2).encode(),
-        FIELD: _serialize(trained, dataset.receiver(), platforms),
+        METADATA: json.dumps(_metadata(trained, dataset, platforms) | {"outputs": outputs}, indent=2).encode(),
+        FIELD: program,
     }
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in content.items():
@@ -85,25 +143,25 @@ def _metadata(trained: TrainedField, dataset: Dataset, platforms: Sequence[str])
         "frequency_range_hz": list(trained_band(dataset)),
         "scene_box": DatasetScene(dataset).box.tolist(),
         "inputs": {"tx_position": ["n", 3], "frequency_hz": ["n"]},
-        "output": {"pas": ["n", 90, 360]},
         "platforms": list(platforms),
         "versions": {"wbgs_jax": wbgs_jax.__version__, "jax": jax.__version__},
     }
 
 
-def _serialize(trained: TrainedField, receiver: Receiver, platforms: Sequence[str]) -> bytes:
-    """Returns the field with its parameters and plan as constants, for any number of queries."""
-    plan = trained.field.portable(trained.field.plan(trained.params, receiver))
-    neighbours = for_receiver(trained.neighbours, receiver)
+def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]) -> tuple[list[str], bytes]:
+    """Returns the names of the outputs, and the field with its parameters and plan as constants, for any number of queries."""
+    frozen, names = freeze(trained, dataset.receiver()), frozen_outputs(trained, dataset)
+    frozen = frozen._replace(plan=trained.field.portable(frozen.plan))
 
-    def predict(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> Float[Array, "n 90 360"]:
-        query = Query(tx_position, frequency_hz)
-        return correct(neighbours, trained.field.render(trained.params, plan, query).pas, query)
+    def answer(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> dict[str, Array]:
+        return answer_all(frozen, Query(tx_position, frequency_hz), names)
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
     with _no_source_locations():
-        return bytes(jax.export.export(jax.jit(predict), platforms=platforms)(*shapes).serialize(vjp_order=1))
+        exported = jax.export.export(jax.jit(answer), platforms=platforms)(*shapes)
+        outputs = jax.tree.unflatten(exported.out_tree, exported.out_avals)
+        return list(outputs), bytes(exported.serialize(vjp_order=1))
 
 
 @contextlib.contextmanager
@@ -133,8 +191,17 @@ def load_exported(path: Path | str) -> ExportedField:
         raise UserError(
             f"{path} was exported by jax {made} and jax {jax.__version__} cannot read it ({reason}); export it again"
         ) from error
-    call = jax.jit(exported.call)
-    return ExportedField(metadata, OnAnyShape(lambda query: call(query.tx_position, query.frequency_hz)))
+
+    @jax.jit
+    def observe(query: Query) -> dict[str, Array]:
+        found = exported.call(query.tx_position, query.frequency_hz)
+        return found if isinstance(found, dict) else {"pas": found}
+
+    @jax.jit
+    def predict(query: Query) -> Float[Array, "n 90 360"]:
+        return observe(query)["pas"]  # nothing else is computed then
+
+    return ExportedField(metadata, OnAnyShape(predict), OnAnyShape(observe))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -147,6 +214,8 @@ def _read(path: Path) -> tuple[dict[str, Any], bytes]:
     except (ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is damaged or no exported field ({error}); copy it or export it again") from error
     found = metadata.get("format") if isinstance(metadata, dict) else None
-    if found != FORMAT:
-        raise UserError(f"{path} has export format {found}, this version reads {FORMAT}; export it again or update wbgs-jax")
+    if found not in (1, FORMAT):
+        raise UserError(
+            f"{path} has export format {found}, this version reads 1 and {FORMAT}; export it again or update wbgs-jax"
+        )
     return metadata, data

@@ -10,7 +10,7 @@ hybrid field's shares, a few numbers, were learned on the same transmitters, for
 """
 
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wbgs_jax._util.arrays import read_tree, write_tree
+from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
@@ -191,13 +192,14 @@ def expect_many(
     power_db: Float[np.ndarray, " n"] | None = None,
 ) -> Expected:
     """Returns what is expected of any number of answers, in blocks of one shape."""
-    parts = []
-    for start in range(0, len(pas), AT_ONCE):
-        chosen = np.minimum(np.arange(start, start + AT_ONCE), len(pas) - 1)
-        query = Query(jnp.asarray(tx_position[chosen], jnp.float32), jnp.asarray(frequency_hz[chosen], jnp.float32))
-        power = None if power_db is None else jnp.asarray(power_db[chosen], jnp.float32)
-        parts.append(jax.tree.map(np.asarray, _expected(confidence, jnp.asarray(pas[chosen]), query, power)))
-    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[: len(pas)], *parts)
+
+    def of_block(block: Any) -> Expected:
+        spectra, tx, hertz, power = jax.tree.map(jnp.asarray, block)
+        return _expected(confidence, spectra, Query(tx, hertz), power)
+
+    rows = (pas, tx_position, frequency_hz, power_db)
+    found: Expected = map_blocks(of_block, jax.tree.map(lambda values: np.asarray(values, np.float32), rows), AT_ONCE)
+    return found
 
 
 _expected = jax.jit(expected_ssim)

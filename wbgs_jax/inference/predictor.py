@@ -54,7 +54,7 @@ def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> 
     dataset = trained.dataset()
     check_power(trained.field, dataset)
     plan = trained.field.plan(trained.params, dataset.receiver() if receiver is None else receiver)
-    return OnAnyShape(_Shared("power_db", (trained.field, trained.params, plan)), ())
+    return OnAnyShape(_Shared("power_db", (trained.field, trained.params, plan)))
 
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
@@ -142,13 +142,12 @@ def _observe(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OnAnyShape:
-    """Lets a function of a flat batch of queries, with an answer of known shape to each, take positions (*b, 3) and frequencies
-    (*b,) whose leading axes broadcast."""
+    """Lets a function of a flat batch of queries, to a tree of arrays with a leading axis for them, take positions (*b, 3) and
+    frequencies (*b,) whose leading axes broadcast."""
 
     render: Callable[[Query], Any]
-    answer: tuple[int, ...] = PAS_SHAPE
 
-    def __call__(self, tx_position: Any, frequency_hz: Any) -> Float[Array, "..."]:
+    def __call__(self, tx_position: Any, frequency_hz: Any) -> Any:
         position, frequency = jnp.asarray(tx_position, jnp.float32), jnp.asarray(frequency_hz, jnp.float32)
         if position.shape[-1:] != (3,):
             raise ValueError(f"tx_position has shape {position.shape}; expected (3,) or (..., 3)")
@@ -157,8 +156,9 @@ class OnAnyShape:
         query = Query(position.reshape(-1, 3), frequency.reshape(-1))
         check_query(query)
         if 0 in shape:
-            return jnp.zeros((*shape, *self.answer), jnp.float32)
-        return self.render(query).reshape(*shape, *self.answer)
+            one = Query(jnp.zeros((1, 3)), jnp.ones(1))
+            return jax.tree.map(lambda leaf: jnp.zeros((*shape, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.render, one))
+        return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 
 
 def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:

@@ -9,12 +9,9 @@ import trimesh
 from jaxtyping import Float
 
 from wbgs_jax.data.dataset import Dataset
-from wbgs_jax.inference.predictor import observe_queries
-from wbgs_jax.inference.quantities import ask_channel, check_known
-from wbgs_jax.inference.trained_field import TrainedField
-from wbgs_jax.radio.array import best_beams, codebook, pas_directions
+from wbgs_jax.inference.evaluate_quantities import LoadedField
+from wbgs_jax.radio.array import codebook, pas_directions
 from wbgs_jax.radio.geometry import direction_to_angles
-from wbgs_jax.types import Receiver, make_query
 
 BEST_BEAM = "best-beam"
 AT_ONCE = 512
@@ -42,11 +39,9 @@ def plane_over(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], height
     return Plane(xs, ys, height)
 
 
-def ask_plane(
+def evaluate_plane(
     what: str,
-    trained: TrainedField,
-    dataset: Dataset,
-    receiver: Receiver,
+    field: LoadedField,
     plane: Plane,
     frequencies_hz: Float[np.ndarray, " freq"],
     advance: Callable[[], None] = lambda: None,
@@ -54,25 +49,18 @@ def ask_plane(
     """Returns {name with unit: values (freq, ny, nx)} of transmitters all over a plane, and `xs`, `ys`, `frequencies_hz`.
 
     Args:
-        what: `BEST_BEAM`, the number of the beam of `radio.array` that hears most, or what `quantities.ask_channel` answers.
-        trained: the field, and the data it was trained on: `dataset`.
-        receiver: at which it is asked.
+        what: a name of `quantities.QUANTITIES`, of which `wbgs-jax map` makes maps.
+        field: at the receiver.
         plane: of the transmitters.
         frequencies_hz: of the carrier.
         advance: called `pieces(plane, frequencies)` times, as the work goes on.
 
     Raises:
-        UserError: the field knows nothing of it.
+        UserError: the field has no such quantity.
     """
-    if what == BEST_BEAM:
-        check_known("spectra", trained, dataset)
-    places, parts = plane.positions(), []
-    for some in np.array_split(places, pieces(plane, frequencies_hz)):
-        if what == BEST_BEAM:
-            parts.append(_best_beams(trained, receiver, some, frequencies_hz))
-        else:
-            found = ask_channel(what, trained, dataset, receiver, some, frequencies_hz)
-            parts.append({name: values for name, values in found.items() if name not in ("tx_positions", "frequencies_hz")})
+    parts = []
+    for some in np.array_split(plane.positions(), pieces(plane, frequencies_hz)):
+        parts.append(field.evaluate(what, some, frequencies_hz))
         advance()
     shape = len(plane.ys), len(plane.xs)
     maps = {}
@@ -87,14 +75,6 @@ def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:
     """Returns how many pieces the work is done in."""
     places = len(plane.xs) * len(plane.ys)
     return -(-places // max(AT_ONCE // len(frequencies_hz), 1))
-
-
-def _best_beams(
-    trained: TrainedField, receiver: Receiver, places: Float[np.ndarray, "places 3"], frequencies_hz: Float[np.ndarray, " freq"]
-) -> dict[str, np.ndarray]:
-    query = make_query(np.repeat(places, len(frequencies_hz), 0), np.tile(frequencies_hz, len(places)))
-    spectra = observe_queries(trained, receiver, query, "pas")
-    return {"best_beam": best_beams(spectra).reshape(len(places), len(frequencies_hz))}
 
 
 def beam_angles() -> dict[str, np.ndarray]:

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from wbgs_jax._util.cli import link_words
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, opened_archive, read_json, told, write_csv, write_json
+from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
 
 QUESTION = "question.json"
@@ -164,6 +166,12 @@ def write_archive(
                 np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
 
+def write_arrays(path: Path, arrays: Mapping[str, Any], source: dict[str, Any]) -> None:
+    """Writes arrays as a compressed .npz file, and where they come from as JSON text in `meta`."""
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays, meta=np.array(json.dumps(source)))
+
+
 def _joined(pieces: list[np.ndarray]) -> np.ndarray:
     with told("a block of kept answers", "remove the folder of blocks, and ask again"):
         return np.concatenate(pieces)
@@ -178,7 +186,6 @@ def _difference(before: Any, now: dict[str, Any]) -> str:
     return ", ".join(key for key in now if before.get(key) != json.loads(json.dumps(now[key])))
 
 
-PATHS = "paths"
 TWO = ("azimuth", "zenith")
 """What pairs of numbers are of."""
 DIGITS = ".7g"
@@ -188,12 +195,12 @@ def write(path: Path, what: str, answers: Answers, queries: Queries, source: dic
     """Writes all answers: to a .csv file a row a query, or a path; to an .npz file arrays (tx, freq, ...), or (queries, ...)
     where queries are paired."""
     if path.suffix == ".csv":
-        write_csv(path, table_rows(answers) if what == PATHS else query_rows(answers, queries))
+        write_csv(path, table_rows(answers) if QUANTITIES[what].form == "table" else query_rows(answers, queries))
         return
     known: dict[str, Any] = {}
-    if what != PATHS:
+    if QUANTITIES[what].form != "table":
         known = {"tx_positions": queries.tx_positions, "frequencies_hz": queries.frequencies_hz}
-    write_archive(path, answers, None if what == PATHS else queries.shape, known, source)
+    write_archive(path, answers, None if QUANTITIES[what].form == "table" else queries.shape, known, source)
 
 
 def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
@@ -228,10 +235,8 @@ NO_CONFIDENCE = "no confidence: it lies outside of what was trained, or where no
 
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
     """Returns how good some of the answers are expected to be, where that is known: one line each. `source` holds the level of
-    their intervals (`answers.source_of`)."""
-    from wbgs_jax.inference.answers import link_words
-
-    if what == PATHS or not {"expected", "within_db"} & set(answers.names()):
+    their intervals (`LoadedField.source`)."""
+    if QUANTITIES[what].form == "table" or not {"expected", "within_db"} & set(answers.names()):
         return []
     shown = shown_rows(len(queries))
     positions, frequencies = (part[shown] for part in queries.flat())

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from viser import uplot
 
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.inference.answers import lowest_answered
+from wbgs_jax.inference.evaluate_quantities import lowest_frequency
 from wbgs_jax.types import MAX_FREQUENCY_HZ
 from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.session import Answer, Asker, PathList, Sample
@@ -95,7 +95,7 @@ def make_panel(
     spectrum = gui.add_image(drawing.spectrum_picture(BLACK), label="what the receiver sees", format="jpeg", jpeg_quality=85)
     with gui.add_folder("Transmitter"):
         position = gui.add_vector3("x, y, z [m]", (start[0], start[1], start[2]), step=0.05)
-        low = lowest_answered(asker.trained, asker.dataset)
+        low = lowest_frequency(asker.trained.field, asker.dataset)
         first = float(known[len(known) // 2])
         ends = float(np.log10(low / 1e9)), float(np.log10(MAX_FREQUENCY_HZ / 1e9))
         octave = gui.add_slider("frequency", *ends, step=0.001, initial_value=float(np.log10(first)), marks=marks_at(known))

@@ -11,20 +11,19 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Electrical, Splatted
-from wbgs_jax.inference.answers import bounds_of
-from wbgs_jax.inference.evaluate_quantities import describe_interactions, names_of
+from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.intervals import Expected, expected_ssim
 from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
+from wbgs_jax.inference.path_table import describe_interactions
 from wbgs_jax.inference.predictor import as_observed, check_power
-from wbgs_jax.inference.radio_map import Plane, ask_plane, pieces
+from wbgs_jax.inference.radio_map import Plane, evaluate_plane, pieces
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
-from wbgs_jax.types import Query, Receiver, make_query
+from wbgs_jax.types import Query, make_query
 
 
 @dataclass(frozen=True)
@@ -88,13 +87,12 @@ class Asker:
     Materials and thicknesses may be changed; everything else is as it was trained.
     """
 
-    def __init__(self, trained: TrainedField, dataset: Dataset, receiver: Receiver):
-        self.trained, self.dataset, self.receiver = trained, dataset, receiver
-        self.plan = self._planned = trained.field.plan(trained.params, receiver)
+    def __init__(self, loaded: LoadedField):
+        self.loaded, self.trained, self.dataset, self.receiver = loaded, loaded.trained, loaded.dataset, loaded.receiver
+        self.plan = loaded.plan
         self._neighbours, self._confidence = (
-            for_receiver(learned, receiver) for learned in (trained.neighbours, trained.confidence)
+            for_receiver(learned, self.receiver) for learned in (self.trained.neighbours, self.trained.confidence)
         )
-        self._bounds = bounds_of(self.dataset)
         self._spectra = self._links_with_spectra()
         self._samples: dict[int, Sample] = {}
 
@@ -119,8 +117,8 @@ class Asker:
         found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
         pas, power, expected, paths = jax.tree.map(np.asarray, found)
         place = np.asarray(position, np.float64)[None]
-        unsure = self._bounds.doubts(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
-        expected = None if self._bounds.without_confidence(place)[0] else expected
+        unsure = self.loaded.domain.warnings(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
+        expected = None if self.loaded.domain.outside(place)[0] else expected
         return Answer(
             pas,
             float(power) if power is not None and self.knows_power else None,
@@ -161,14 +159,15 @@ class Asker:
             done += 1
             progress(done / total)
 
-        return ask_plane("power", self.trained, self.dataset, self.receiver, plane, frequencies, advance)["power_db"][0]
+        now = dataclasses.replace(self.loaded, trained=self.trained)
+        return evaluate_plane("power", now, plane, frequencies, advance)["power_db"][0]
 
     def materials(self) -> tuple[tuple[str, ...], Electrical] | None:
         """Returns names and properties of the materials; None of a field that knows of none."""
         found = self.trained.field.electrical(self.trained.params)
         if found is None:
             return None
-        names = names_of(self.dataset) or ("everything",)
+        names = self.loaded.materials or ("everything",)
         return tuple(name or f"material {number}" for number, name in enumerate(names[: len(found.permittivity)])), found
 
     def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
@@ -185,7 +184,7 @@ class Asker:
 
     def restore(self, trained: TrainedField) -> None:
         """Asks a field as it was trained from now on."""
-        self.trained, self.plan = trained, self._planned
+        self.trained, self.plan = trained, self.loaded.plan
         self._samples.clear()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
@@ -210,7 +209,7 @@ class Asker:
         order = np.argsort(-power, kind="stable")
         order = order[np.abs(arrived.amplitude[order]) > 0]
         kinds, materials = np.asarray(arrived.interaction)[order], np.asarray(arrived.material)[order]
-        names = names_of(self.dataset)
+        names = self.loaded.materials
         words = tuple(describe_interactions(*met, names) for met in zip(kinds, materials, strict=True))
         points = np.asarray(arrived.points)[order]
         amplitude, length, direction = (np.asarray(a)[order] for a in (arrived.amplitude, arrived.length, arrived.direction))

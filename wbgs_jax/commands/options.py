@@ -1,0 +1,123 @@
+"""Options that several commands share: words of a command line become receivers, frequencies and trained fields.
+
+Free of JAX until a run is opened: `--help` and mistakes on the command line do not wait for it.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from wbgs_jax._util.cli import say
+from wbgs_jax._util.errors import UserError
+
+if TYPE_CHECKING:
+    from wbgs_jax.data.dataset import Dataset
+    from wbgs_jax.inference.domain import Domain
+    from wbgs_jax.inference.evaluate_quantities import LoadedField
+    from wbgs_jax.inference.quantities import Options
+    from wbgs_jax.types import Receiver
+
+SHORTEST = 1e-3
+"""Quaternions that are shorter, or longer than its inverse, are mistakes."""
+SHOWN = 12
+"""Warnings."""
+
+
+def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:
+    """Raises a `UserError` for a file of a command line whose name ends in none of the suffixes of its option."""
+    for name, allowed in suffixes.items():
+        path = getattr(command, name)
+        if path is not None and path.suffix not in allowed:
+            raise UserError(f"--{name} {path} does not end in {' or '.join(allowed)}; rename it")
+
+
+def parse_frequencies(ghz: Iterable[float], source: str = "--ghz") -> Float[np.ndarray, " freq"]:
+    """Returns hertz; what no field answers is a `UserError` that names where it was read."""
+    from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
+
+    ghz = tuple(ghz)
+    low, high = LOWEST_OF_PATHS_HZ / 1e9, MAX_FREQUENCY_HZ / 1e9
+    if wrong := [f for f in ghz if not low <= f <= high]:
+        raise UserError(f"{source} {wrong[0]:g} is outside the model's {low:g} to {high:g} GHz; give gigahertz in that range")
+    return np.array(ghz) * 1e9
+
+
+def parse_receiver(word: str, dataset: "Dataset") -> "Receiver":
+    """Returns a receiver of the data by its number (none: the first), or another one from "x,y,z" or "x,y,z,w,i,j,k", otherwise
+    like the first; anything else is a `UserError`."""
+    import jax.numpy as jnp
+
+    from wbgs_jax.types import LARGEST_COORDINATE_M
+
+    if not word or (word.isdecimal() and len(word) < 7):
+        return dataset.receiver(int(word or 0))
+    like = dataset.receiver()
+    try:
+        values = np.array([float(part) for part in word.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
+    rotated = SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST
+    if len(values) not in (3, 7) or not (np.abs(values) <= LARGEST_COORDINATE_M).all() or not rotated:
+        raise UserError(f"--rx {word[:60]} is no receiver; give a number, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
+    unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
+    return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
+
+
+def load_field(run: Path, rx: str, lowest_hz: float | None = None, options: "Options | None" = None) -> "LoadedField":
+    """Returns the trained field of a run folder at a receiver.
+
+    Args:
+        run: the folder.
+        rx: the receiver, as on the command line (`parse_receiver`).
+        lowest_hz: the lowest frequency of the queries, if they are known.
+        options: of some quantities.
+
+    Raises:
+        UserError: the run cannot be read, or does not hold at this receiver or frequency.
+    """
+    from wbgs_jax.inference.evaluate_quantities import LoadedField
+    from wbgs_jax.inference.quantities import Options
+    from wbgs_jax.inference.trained_field import at_receiver
+    from wbgs_jax.training.run_folder import open_run
+
+    trained = open_run(run)
+    dataset = trained.dataset()
+    receiver = parse_receiver(rx, dataset)
+    loaded = LoadedField(at_receiver(trained, receiver, dataset), dataset, receiver, options or Options())
+    if lowest_hz is not None:
+        _check_frequency(loaded, lowest_hz)
+    return loaded
+
+
+def _check_frequency(loaded: "LoadedField", lowest_hz: float) -> None:
+    from wbgs_jax.fields import field_names, get_field
+    from wbgs_jax.inference.domain import ROUNDED
+    from wbgs_jax.inference.evaluate_quantities import lowest_frequency
+
+    field = loaded.trained.field
+    if lowest_hz < (lowest := lowest_frequency(field, loaded.dataset)) * (1 - ROUNDED):
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+        raise UserError(
+            f"the {field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at {lowest_hz / 1e9:g} GHz; "
+            f"below, only fields with paths do: train --field {able} on data with a mesh"
+        )
+
+
+def warn(
+    domain: "Domain",
+    rx: Any,
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+    most: int = SHOWN,
+) -> None:
+    """Prints why some answers should not be trusted, at most so many lines."""
+    lines = domain.warnings(np.asarray(rx), tx_positions, frequencies_hz)
+    for line in lines[:most]:
+        say(f"warning: {line}")
+    if len(lines) > most:
+        say(f"warning: and {len(lines) - most} more like these")

@@ -1,0 +1,97 @@
+"""Where a field was trained, and what is doubtful elsewhere."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from wbgs_jax._util.cli import point_words
+from wbgs_jax.inference.quantities import INTERVALS
+from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.types import MIN_FREQUENCY_HZ
+
+NEAR = 1e-3
+"""Metres outside of a box that do not count."""
+ROUNDED = 1e-6
+"""By what share a frequency in gigahertz may miss that of the data."""
+
+
+class Domain(NamedTuple):
+    """The places and frequencies of a training."""
+
+    name: str
+    """Of the data."""
+    box: Float[np.ndarray, "2 3"]
+    """Lowest and highest corner, metres."""
+    band: tuple[float, float]
+    """Hertz."""
+    beyond: float = 0.0
+    """How far (metres) outside of the box prediction intervals hold: nothing where surfaces close it."""
+    bodies: tuple[ClosedBody, ...] = ()
+    """In which no antenna can stand."""
+
+    def as_json(self) -> list[Any]:
+        """Returns what `Domain.from_json` reads."""
+        bodies = [[body.name, np.round(body.triangles, 5).tolist()] for body in self.bodies]
+        return [self.name, np.asarray(self.box).tolist(), list(self.band), self.beyond, bodies]
+
+    @classmethod
+    def from_json(cls, values: list[Any]) -> "Domain":
+        """Returns what `as_json` wrote."""
+        name, box, (low, high), beyond, bodies = values
+        solids = tuple(ClosedBody(own, np.array(triangles)) for own, triangles in bodies)
+        return cls(name, np.array(box), (low, high), beyond, solids)
+
+    def outside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Returns at which places (metres) no prediction interval holds: in a body, or outside of the training."""
+        low, high = self.box
+        away = np.linalg.norm(np.maximum(np.maximum(low - positions, positions - high), 0), axis=-1)
+        result = away > self.beyond + NEAR
+        for body in self.bodies:
+            result |= inside(body, np.asarray(positions, np.float64))
+        return result
+
+    def without_intervals(self, answer: dict[str, np.ndarray], positions: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+        """Returns the answers to n queries, their intervals NaN where none holds."""
+        if not set(INTERVALS) & set(answer):
+            return answer
+        nowhere = self.outside(positions)
+        return {
+            name: np.where(nowhere.reshape(-1, *[1] * (values.ndim - 1)), np.nan, values).astype(values.dtype)
+            if name in INTERVALS
+            else values
+            for name, values in answer.items()
+        }
+
+    def warnings(
+        self, rx: Float[np.ndarray, "3"], tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
+    ) -> list[str]:
+        """Returns why some answers should not be trusted: one line each."""
+        (low, high), band = self.box, self.band
+        box = f"the box of {self.name}, {point_words(low)} to {point_words(high)}"
+        places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
+        lines = [
+            f"{end} {point_words(place)} lies outside {box}; the field was not trained there"
+            for end, place in places
+            if ((place < low) | (place > high)).any()
+        ]
+        points = np.array([place for _, place in places], np.float64)
+        within = [inside(body, points) for body in self.bodies]
+        lines += [
+            f"{end} {point_words(place)} is inside a closed body ({body.name} of {self.name}), where no antenna can stand"
+            for number, (end, place) in enumerate(places)
+            for body, there in zip(self.bodies, within, strict=True)
+            if there[number]
+        ]
+        for f in frequencies_hz:
+            if band[0] * (1 - ROUNDED) <= f <= band[1] * (1 + ROUNDED):
+                continue
+            if f < MIN_FREQUENCY_HZ:
+                lines.append(
+                    f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
+                    "badly what is not many wavelengths large"
+                )
+            else:
+                trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"
+                lines.append(f"{f / 1e9:g} GHz lies outside {trained}; the field was not trained there")
+        return lines

@@ -1,0 +1,94 @@
+"""The paths of links as a table, and in words."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from wbgs_jax.fields import Field
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
+from wbgs_jax.radio.array import SPEED_OF_LIGHT
+from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
+from wbgs_jax.types import Query, make_query
+
+WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
+"""What a wave does: through a wall, off a floor, around a cabinet's edge."""
+SIGHT = "line of sight"
+
+
+def path_table(
+    field: Field,
+    params: Any,
+    plan: Any,
+    tx_positions: Float[np.ndarray, "tx 3"],
+    frequencies_hz: Float[np.ndarray, " freq"],
+    velocities: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    materials: tuple[str, ...],
+) -> dict[str, np.ndarray]:
+    """Returns a table with a row a path, its columns by name: its link, what it meets, length, delay, angles, amplitudes
+     and Doppler shift; of each link the strongest path first.
+
+    Angles of arrival are in the receiver's frame, those of departure in the world's, zenith 0 upwards. Amplitudes are relative
+    to the transmitted one, carrier phase included: at an element of the array, and at isotropic elements that are polarised
+    along theta-hat and phi-hat. They add up to the snapshot where waves are plane.
+
+    Args:
+        field: it must output paths.
+        params: its parameters.
+        plan: of the receiver.
+        tx_positions: world frame, metres.
+        frequencies_hz: of the carrier.
+        velocities: of transmitter and receiver, metres a second, world frame.
+        materials: names by number; others are numbered.
+    """
+    moving, tables = [jnp.asarray(velocity, jnp.float32) for velocity in velocities], []
+    for number, position in enumerate(tx_positions):
+        for frequency in frequencies_hz:
+            found, shift = _link(field, params, plan, make_query(position[None], frequency[None]), *moving)
+            link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
+            tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, materials))
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+@jax.jit
+def _link(
+    field: Field, params: Any, plan: Any, query: Query, tx_velocity: Array, rx_velocity: Array
+) -> tuple[Arrivals, Float[Array, " k"]]:
+    """Returns the paths of one query, and their Doppler shifts."""
+    found: Any = jax.tree.map(lambda leaf: leaf[0], field.arrivals(params, plan, query))
+    return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)
+
+
+def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], materials: tuple[str, ...]) -> dict[str, np.ndarray]:
+    power = np.asarray(decibels(jnp.asarray(np.abs(found.amplitude) ** 2)))
+    order = np.argsort(-power, kind="stable")
+    order = order[(np.abs(found.polarised[order]) > 0).any(-1)]
+    columns: dict[str, np.ndarray] = {name: np.full(len(order), value) for name, value in link.items()}
+    columns["interactions"] = np.array(
+        [describe_interactions(found.interaction[i], found.material[i], materials) for i in order], dtype=np.str_
+    )
+    columns["length_m"] = found.length[order]
+    columns["delay_ns"] = found.length[order] / SPEED_OF_LIGHT * 1e9
+    for end, direction in (("arrival", found.direction), ("departure", found.departure)):
+        zenith = np.degrees(np.arccos(np.clip(direction[order, 2], -1, 1)))
+        azimuth = np.degrees(np.arctan2(direction[order, 1], direction[order, 0]))
+        columns |= {f"{end}_zenith_deg": zenith, f"{end}_azimuth_deg": azimuth}
+    columns["power_db"] = power[order]
+    parts = {"element": found.amplitude, "theta": found.polarised[:, 0], "phi": found.polarised[:, 1]}
+    for name, amplitude in parts.items():
+        columns |= {f"{name}_re": amplitude[order].real, f"{name}_im": amplitude[order].imag}
+    return columns | {"doppler_hz": shift[order]}
+
+
+def describe_interactions(
+    kinds: Int[np.ndarray, " steps"], materials: Int[np.ndarray, " steps"], names: tuple[str, ...]
+) -> str:
+    """Returns what a path meets: "off concrete, through glass"."""
+    met = [
+        f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"
+        for kind, material in zip(kinds, materials, strict=True)
+        if int(kind) in WORDS
+    ]
+    return ", ".join(met) or SIGHT
