@@ -82,6 +82,7 @@ def test_the_answers_are_those_of_the_predictor(exported, predict):
         exported(TX, 28.0)
 
 
+@pytest.mark.heavy
 def test_all_outputs_and_their_intervals(tmp_path):
     """Of a field that outputs power and snapshots, with intervals of its spectra."""
     dataset = hold_out_validation(tiny_dataset(30))
