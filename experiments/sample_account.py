@@ -110,7 +110,7 @@ def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tu
 def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
     """Returns the score of every spectrum."""
     found = []
-    plan = field.plan(params, dataset.receiver(), cache=prepared)
+    plan = field.plan(params, dataset.receiver(), prepared=prepared)
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
         seen = observe(field, params, plan, prepared, dataset.links(index))

@@ -37,8 +37,8 @@ def test_a_field_has_its_own_settings_and_those_of_the_controls_that_it_asks_for
         own = (
             {"wave": settings.field.wave, "wideband": settings.field.wideband} if field == "hybrid" else {field: settings.field}
         )
-        controls = {name.rpartition(".")[2] for name in get_field(field).controls}
-        assert parts.keys() == {*own, "optim", "loop", *controls}
+        hooks = {name.rpartition(".")[2] for name in get_field(field).hooks}
+        assert parts.keys() == {*own, "optim", "loop", *hooks}
         assert all(parts[name] is section for name, section in own.items())
         assert from_sections(parts, settings, field) == settings
 

@@ -49,17 +49,17 @@ class ToyField(wb.Field):
 
     name: ClassVar[str] = "toy"
     presets: ClassVar = with_field(PRESETS, dict.fromkeys(PRESETS, ToyConfig()))
-    gives: ClassVar = ("pas", "power")
+    outputs: ClassVar = ("pas", "power")
 
     @classmethod
-    def make(cls, config, scene, seed):
+    def build(cls, config, scene, seed):
         return cls(scene.receivers.position, config)
 
     def init(self, key):
         n = len(self.positions)
         return {"image": self.config.brightness + 0.01 * jax.random.normal(key, (n, 90, 360)), "power_db": jnp.zeros(n)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         nearest = jnp.argmin(jnp.sum((self.positions - receiver.position) ** 2, -1))
         return jax.tree.map(lambda leaf: leaf[nearest], params)
 
@@ -286,7 +286,7 @@ def test_what_it_does_not_know_is_an_error_for_people(tmp_path):
     @wb.pytree
     class Blind(ToyField):
         name: ClassVar[str] = "blind"
-        gives: ClassVar = ("pas",)
+        outputs: ClassVar = ("pas",)
 
         def render(self, params, plan, query):
             return wb.Observation(super().render(params, plan, query).pas)

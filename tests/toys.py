@@ -42,7 +42,7 @@ class RippleField(Field):
     def init(self, key):
         return {"level": 0.1 * jax.random.normal(key, (4,)), "tilt": jnp.zeros(3)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         return receiver.position
 
     def render(self, params, plan, query):
@@ -68,7 +68,7 @@ class NoisyField(RippleField):
 
 @dataclass(frozen=True)
 class Room:
-    """Limits of `SwellingField`."""
+    """Capacity of `SwellingField`."""
 
     size: int
 
@@ -83,16 +83,16 @@ class SwellingField(RippleField):
     def required(params):
         return jnp.ceil(20 * jnp.max(jnp.abs(params["level"]))).astype(jnp.int32)[None]
 
-    def limits(self, params, receivers):
+    def capacity(self, params, receivers):
         return Room(int(self.required(params)[0]))
 
-    def grow(self, limits, required):
-        return Room(max(limits.size, int(required[0])) + 10)
+    def grow(self, capacity, required):
+        return Room(max(capacity.size, int(required[0])) + 10)
 
-    def loss(self, params, cache, batch, limits=None, probe=()):
-        loss, aux = super().loss(params, cache, batch, limits, probe)
+    def loss(self, params, prepared, batch, capacity=None, probe=()):
+        loss, aux = super().loss(params, prepared, batch, capacity, probe)
         required = self.required(params)
-        return loss, aux._replace(required=required, overflow=required[0] > limits.size)
+        return loss, aux._replace(required=required, overflow=required[0] > capacity.size)
 
 
 @pytree
@@ -119,7 +119,7 @@ def registered(*fields: type[Field]) -> Iterator[None]:
 
 
 def toy_settings(**changes: Any) -> Settings:
-    """As `synthetic.tiny_settings`, of a toy field without host controls."""
+    """As `synthetic.tiny_settings`, of a toy field without hooks."""
     loop = LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2)
     return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0), loop), changes)
 

@@ -24,15 +24,15 @@ class MirrorsField(Field):
     images: int = static(default=5)
 
     name: ClassVar[str] = "mirrors"
-    gives: ClassVar = ("pas", "snapshots", "power", "paths")
+    outputs: ClassVar = ("pas", "snapshots", "power", "paths")
 
     def init(self, key):
         return {"loss": jnp.float32(0.5)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         return receiver
 
-    def anywhere(self, params):
+    def receiver_independent(self, params):
         return self, params
 
     def waves(self, params, plan, query):
@@ -85,4 +85,4 @@ def trained(images=5) -> Trained:
 class Blind(MirrorsField):
     """One that knows no paths."""
 
-    gives: ClassVar = ("pas", "snapshots", "power")
+    outputs: ClassVar = ("pas", "snapshots", "power")

@@ -12,6 +12,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.fields import get_field, hybrid
 from wbgs_jax.fields import mixture as noise
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed, _Seen
 from wbgs_jax.fields.mixture import FEATURES, Opinions, Shares, constant, reported, with_floor, without_floor
 from wbgs_jax.inference.predictor import observe_links
@@ -79,7 +80,7 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     truth = share * wave.pas + (1 - share) * own.pas
     power = share * wave.power_db + (1 - share) * informed.power_db
     batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
-    found, report = run.field.calibrate(params, run.cache, [batch])
+    found, report = run.field.calibrate(params, run.prepared, [batch])
     spectra, powers = found.trust.spectra, found.trust.power
     assert not any(np.any(one.weights) for one in (spectra.coherent, spectra.uninformed, powers.coherent))  # few transmitters
     assert float(jax.nn.sigmoid(spectra.coherent.bias)) == pytest.approx(share, abs=0.05)
@@ -118,14 +119,14 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
 
     monkeypatch.setattr(hybrid, "_opinions", opinions_without_floor)
     monkeypatch.setattr(noise, "FEWEST_TX", 5)
-    found, report = run.field.calibrate(params, run.cache, [batch])
+    found, report = run.field.calibrate(params, run.prepared, [batch])
     assert report["noise_floor"] == pytest.approx(float(found.trust.floor))
     assert found.trust.floor > 1e-3
     assert float(run.field.as_observed(found, jnp.zeros((1, 90, 360))).min()) > 0.03
-    again, _ = run.field.calibrate(found, run.cache, [batch])
+    again, _ = run.field.calibrate(found, run.prepared, [batch])
     assert float(again.trust.floor) == float(found.trust.floor)
     monkeypatch.setattr(hybrid, "floor_of", lambda *_: 0.0)
-    without, _ = run.field.calibrate(params, run.cache, [batch])
+    without, _ = run.field.calibrate(params, run.prepared, [batch])
     trusted, less = (report_of(p, said.told)["coherent"] for p in (found, without))
     assert trusted > less + 0.1  # the splatting one is as right here, but for the noise
 
@@ -151,10 +152,10 @@ def test_its_answers_are_without_the_floor(run):
 def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
     batch = run.data.batch(jnp.asarray(run.dataset.validation), run.key)
     image = dataclasses.replace(batch, snapshots=None, power_db=None)
-    trust = run.field.calibrate(run.state.params, run.cache, [image])[0].trust
+    trust = run.field.calibrate(run.state.params, run.prepared, [image])[0].trust
     power = dataclasses.replace(batch, snapshots=None, pas=None, power_db=jnp.full(len(run.dataset.validation), -60.0))
     silent = dataclasses.replace(image, power_db=jnp.full(len(run.dataset.validation), -400.0))
-    others = [run.field.calibrate(run.state.params, run.cache, [one])[0].trust for one in (power, silent)]
+    others = [run.field.calibrate(run.state.params, run.prepared, [one])[0].trust for one in (power, silent)]
     for shares in (trust.power, others[0].spectra, others[1].power):
         assert min(float(jax.nn.sigmoid(one.bias)) for one in (shares.coherent, shares.uninformed)) > 0.99
 
@@ -183,11 +184,11 @@ def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     given = jnp.where(_informed(batch), jnp.asarray(seen), 0)
 
     def both(params):
-        return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0]
+        return field.loss(params, run.prepared, batch, run.capacity, field.probe(params))[0]
 
     def one_by_one(params):
-        coherent, _ = field.wave.loss(params.wave, run.cache, batch)
-        return coherent + field.wideband.loss(params.wideband, None, batch, run.limits, field.probe(params), given)[0]
+        coherent, _ = field.wave.loss(params.wave, run.prepared, batch)
+        return coherent + field.wideband.loss(params.wideband, None, batch, run.capacity, field.probe(params), given)[0]
 
     (loss, gradient), (expected, other) = (jax.jit(jax.value_and_grad(f))(params) for f in (both, one_by_one))
     assert float(loss) == pytest.approx(float(expected), rel=1e-5)
@@ -218,7 +219,7 @@ def test_the_splatting_field_answers_to_the_coherent_one(run):
 
 
 def test_elsewhere_it_is_the_coherent_field(run):
-    field, params = run.field.anywhere(run.state.params)
+    field, params = run.field.receiver_independent(run.state.params)
     assert field.name == "wave" and params is run.state.params.wave
 
 
@@ -228,7 +229,7 @@ def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     dataset = dataclasses.replace(tiny_dataset(12), faces=nothing, materials=None, face_part=None)
     with pytest.warns(UserWarning, match="is its wideband half alone: box has no mesh"):
         result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
-    assert result.field.wave is None and set(result.field.known()) == {"pas", "power"}
+    assert result.field.wave is None and set(outputs_of(result.field)) == {"pas", "power"}
     seen = observe_links(result.field, result.params, dataset, dataset.test)
     alone = observe_links(result.field.wideband, result.params.wideband, dataset, dataset.test)
     np.testing.assert_allclose(seen.pas, alone.pas, atol=1e-6)
@@ -236,12 +237,12 @@ def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     with pytest.raises(UserError, match="no paths"):
         result.field.arrivals(result.params, plan, dataset.query(dataset.test))
     with pytest.raises(UserError, match="no receivers but those"):
-        result.field.anywhere(result.params)
+        result.field.receiver_independent(result.params)
 
 
 @pytest.mark.heavy
 def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
-    """Its host controls act on their parts, and a run that stopped half way ends where one goes that did not."""
+    """Its hooks act on their parts, and a run that stopped half way ends where one goes that did not."""
     config = RunConfig("box", "hybrid", "smoke", 0, None, SETTINGS)
     prepare_folder(tmp_path / "run", config, resume=False)
     result = train(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")

@@ -55,7 +55,7 @@ def test_no_configuration_lets_the_frequency_in(dataset, trained):
     assert aware.attenuation_frequency and aware.radiance_frequency
 
     def shapes(kind, config):
-        return jax.eval_shape(kind.make(config, scene, 0).init, jax.random.key(0))
+        return jax.eval_shape(kind.build(config, scene, 0).init, jax.random.key(0))
 
     blind = shapes(WrfgsField, aware)
     assert jax.tree.structure(blind) == jax.tree.structure(shapes(WrfgsField, without_frequency(aware)))

@@ -220,7 +220,7 @@ def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
     blurred = make_trained(tmp_path).field.config
     config = coherent if name == "wave" else HybridConfig(coherent, blurred)
     dataset = tiny_dataset(unit=unit)
-    field = get_field(name).make(config, DatasetScene(dataset), 0)
+    field = get_field(name).build(config, DatasetScene(dataset), 0)
     whole = dataclasses.replace(make_trained(tmp_path), field=field, params=field.init(jax.random.key(1)))
     export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
     exported, predict = load_exported(tmp_path / "field.zip"), predictor(whole, dataset.receiver())

@@ -139,11 +139,11 @@ def test_what_does_not_depend_on_the_query_is_planned(name):
     """With a plan, all matrix products are of queries: encodings of the Gaussians and the layers behind them are not
     computed again. Without it they are."""
     queries = 7  # nothing else comes in sevens
-    field = get_field(name).make(tiny_settings(name).field, DatasetScene(tiny_dataset()), 0)
+    field = get_field(name).build(tiny_settings(name).field, DatasetScene(tiny_dataset()), 0)
     params = jax.eval_shape(field.init, jax.random.key(0))
-    limits = TileLimits(entries=4096, jobs=1024)
+    capacity = TileLimits(entries=4096, jobs=1024)
     receiver = tiny_dataset().receiver()
-    plan = jax.eval_shape(lambda params: field.plan(params, receiver, limits), params)
+    plan = jax.eval_shape(lambda params: field.plan(params, receiver, None, capacity), params)
     query = make_query(np.ones((queries, 3)), 28e9)
     planned = operations(field.render, params, plan, query)
     again = operations(field.render, params, field.portable(plan), query)

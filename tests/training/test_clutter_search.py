@@ -50,7 +50,7 @@ def heard_behind_a_hedge(folder, rng):
 
 def told_of(parts, truth, folder, n_tx=N_TX):
     run = run_in(parts, SETTINGS, folder, PLACES[:n_tx], FREQUENCIES, truth[:n_tx])
-    return of_concrete(run), Told(run.field, run.cache, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+    return of_concrete(run), Told(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
 
 
 @pytest.mark.heavy

@@ -54,7 +54,7 @@ def heard_by(run, field, params):
 
 def searched(run, heard, folder, rng):
     own = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES, heard)
-    told = Told(own.field, own.cache, own.data, rng.permutation(own.dataset.train))
+    told = Told(own.field, own.prepared, own.data, rng.permutation(own.dataset.train))
     return own.field, *search_tuning(run.state.params, told, 200)
 
 

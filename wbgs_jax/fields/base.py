@@ -24,7 +24,7 @@ from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene
 
-Quantity = Literal["pas", "snapshots", "power", "paths"]
+Output = Literal["pas", "snapshots", "power", "paths"]
 """What a field may know of a link."""
 
 
@@ -69,9 +69,9 @@ class Aux(NamedTuple):
     metrics: dict[str, Float[Array, ""]]
     """Figures for the curves; NaN where a figure means nothing."""
     required: Int[Array, " k"] | None = None
-    """What the limits should have been; None for a field without limits."""
+    """What the capacity should have been; None for a field that needs none."""
     overflow: Bool[Array, ""] | None = None
-    """The limits were too small: the step must not be used."""
+    """The capacity was too small: the step must not be used."""
 
 
 Optimizer = Literal["adam", "muon"]
@@ -96,10 +96,13 @@ class Field(ABC):
     """What command lines and files call it."""
     presets: ClassVar[Mapping[str, Settings]] = PRESETS
     """Settings by preset; `Settings.field` has the type of `config`."""
-    gives: ClassVar[tuple[Quantity, ...]] = ("pas",)
-    """What it knows of a link."""
-    controls: ClassVar[tuple[str, ...]] = ()
-    """Host controls between epochs that it asks for: names in `training.loop.CONTROLS`, "part.name" for one of a part alone."""
+    outputs: ClassVar[tuple[Output, ...]] = ("pas",)
+    """What it knows of a link; `outputs_of` says what a field of this class knows whose scene lacks a component."""
+    components: ClassVar[Mapping[str, type["Field"]]] = {}
+    """Of a field that is made of others: their classes by name. Field, settings and parameters then have an attribute of that
+    name for each; those of field and parameters are None where the scene does not allow the component."""
+    hooks: ClassVar[tuple[str, ...]] = ()
+    """Hooks between epochs that it asks for: names in `training.loop.HOOKS`, "part.name" for one of a part alone."""
     seconds: ClassVar[Mapping[str, float]] = {}
     """How long trainings take on two cores of an AMD EPYC, by preset, search and compilation included (scenes 1 to 6)."""
     config: Any
@@ -110,7 +113,7 @@ class Field(ABC):
         return
 
     @classmethod
-    def make(cls, config: Any, scene: Scene, seed: int) -> "Field":
+    def build(cls, config: Any, scene: Scene, seed: int) -> "Field":
         """Returns the field of a scene (host)."""
         return cls(config)  # type: ignore[call-arg]
 
@@ -124,12 +127,12 @@ class Field(ABC):
         """Returns initial parameters: only what is trained, all floats."""
 
     @abstractmethod
-    def plan(self, params: Any, receiver: Receiver, limits: Any = None, cache: Any = None) -> Any:
+    def plan(self, params: Any, receiver: Receiver, prepared: Any = None, capacity: Any = None) -> Any:
         """Returns what is independent of the query.
 
         A plan that is made outside of a differentiated function is a constant to its gradient: parameters that it holds get
-        none, or a part. `pas` plans inside. Under jit a field with `limits` needs them, and one that plans on the host the
-        `cache` of its links.
+        none, or a part. `pas` plans inside. Under jit a field with a `capacity` needs it, and one that plans on the host what
+        is `prepared` of its links.
         """
 
     @abstractmethod
@@ -140,33 +143,35 @@ class Field(ABC):
         """Returns what can be known of links before training (host); `receivers` has a leading axis."""
         return None
 
-    def cache_of(self, cache: Any, links: Links) -> Any:
+    def prepared_of(self, prepared: Any, links: Links) -> Any:
         """Returns what `prepare` found for B of its links alone, in a shape that depends on B and not on how many others
         there are."""
-        return cache
+        return prepared
 
-    def render_links(self, params: Any, plan: Any, cache: Any, links: Links) -> Observation:
+    def render_links(self, params: Any, plan: Any, prepared: Any, links: Links) -> Observation:
         """Returns what `render` does, for links that `prepare` has seen."""
         return self.render(params, plan, links.query)
 
     def probe(self, params: Any) -> Any:
-        """Returns zeros that `loss` adds where a host control wants to know the gradient; nothing by default."""
+        """Returns zeros that `loss` adds where a hook wants to know the gradient; nothing by default."""
         return ()
 
-    def loss(self, params: Any, cache: Any, batch: Batch, limits: Any = None, probe: Any = ()) -> tuple[Float[Array, ""], Aux]:
+    def loss(
+        self, params: Any, prepared: Any, batch: Batch, capacity: Any = None, probe: Any = ()
+    ) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of a batch. By default it compares spectra, and power where the data have nothing else."""
-        plan = self.plan(params, batch.receiver, limits, cache)
-        seen = self.render_links(params, plan, cache, batch.links)
+        plan = self.plan(params, batch.receiver, prepared, capacity)
+        seen = self.render_links(params, plan, prepared, batch.links)
         return compare(seen, batch)
 
-    def limits(self, params: Any, receivers: Receiver) -> Any:
+    def capacity(self, params: Any, receivers: Receiver) -> Any:
         """Returns the static sizes that planning needs under jit, with room to grow (host): a frozen dataclass of numbers, kept
-        in checkpoints, with a method `scaled(factor)` if host controls add to the field; None if it needs none."""
+        in checkpoints, with a method `scaled(factor)` if hooks add to the field; None if it needs none."""
         return None
 
-    def grow(self, limits: Any, required: Int[np.ndarray, " k"]) -> Any:
-        """Returns limits that hold what an overflowed step required (host)."""
-        raise NotImplementedError("a field without limits does not overflow")
+    def grow(self, capacity: Any, required: Int[np.ndarray, " k"]) -> Any:
+        """Returns a capacity that holds what an overflowed step required (host)."""
+        raise NotImplementedError("a field without a capacity does not overflow")
 
     def arrivals(self, params: Any, plan: Any, query: Query) -> Arrivals:
         """Returns what arrives over every path, of a field whose `gives` names "paths"."""
@@ -188,7 +193,7 @@ class Field(ABC):
         """Returns the field and a plan in which all walls of one material are this thick, whatever data say (host)."""
         raise NotImplementedError("a field without `electrical` has no materials")
 
-    def blurred(self, params: Any, metres: Float[Array, ""] | float) -> Any:
+    def smoothed(self, params: Any, metres: Float[Array, ""] | float) -> Any:
         """Returns parameters whose spectra and powers are means over transmitters that stand about so many metres (standard
         deviation along each axis) from where they are asked for: without the fringes of interference that change over less.
         By default, of a field that has none, the parameters as they are."""
@@ -198,7 +203,7 @@ class Field(ABC):
         """Returns the plan without what is cheaply computed again from the parameters: what a file holds of it."""
         return plan
 
-    def calibrate(self, params: Any, cache: Any, batches: Sequence[Batch]) -> tuple[Any, dict[str, Any]]:
+    def calibrate(self, params: Any, prepared: Any, batches: Sequence[Batch]) -> tuple[Any, dict[str, Any]]:
         """Returns parameters with what only links outside the training part can say, and figures for the curves (host, after
         the last step). By default nothing changes."""
         return params, {}
@@ -207,11 +212,7 @@ class Field(ABC):
         """Returns its answers as they would appear in the data that it was trained on; by default as they are."""
         return pas
 
-    def known(self) -> tuple[Quantity, ...]:
-        """Returns what it knows of a link: what its class `gives`, unless the scene lacks what that takes."""
-        return self.gives
-
-    def anywhere(self, params: Any) -> tuple["Field", Any]:
+    def receiver_independent(self, params: Any) -> tuple["Field", Any]:
         """Returns the part of a trained field that holds for receivers that it was not trained for, and its parameters.
 
         Raises:
@@ -240,6 +241,21 @@ class Field(ABC):
     def labels(cls, params: Any) -> Any:
         """Returns the group of every parameter: a tree of names, or a prefix of one."""
         return jax.tree.map(lambda _: "all", params)
+
+
+def components_of(field: Field) -> dict[str, Field]:
+    """Returns the components that a field of a scene has, by name."""
+    found = {name: getattr(field, name) for name in field.components}
+    return {name: component for name, component in found.items() if component is not None}
+
+
+def outputs_of(field: Field) -> tuple[Output, ...]:
+    """Returns what a field knows of a link: the `outputs` of its class, of which a missing component may leave fewer."""
+    found = components_of(field)
+    if len(found) == len(field.components):
+        return field.outputs
+    known = {output for component in found.values() for output in outputs_of(component)}
+    return tuple(output for output in field.outputs if output in known)
 
 
 def heard_alone(batch: Batch, seen: Observation) -> Batch:
@@ -271,16 +287,16 @@ def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
     return over_all_links(error) / jnp.maximum(over_all_links(count), 1)
 
 
-def pas(field: Field, params: Any, receiver: Receiver, query: Query, limits: Any = None) -> Float[Array, "b 90 360"]:
+def pas(field: Field, params: Any, receiver: Receiver, query: Query, capacity: Any = None) -> Float[Array, "b 90 360"]:
     """Returns the power angular spectra of B queries: the differentiable function from parameters, receiver and query.
 
-    Nothing is frozen: the plan is made inside. Under `jit` or `grad` a field with limits needs them given
-    (`field.limits(params, receiver)`, on the host); too small ones give NaN, never a wrong spectrum. Reverse mode only.
+    Nothing is frozen: the plan is made inside. Under `jit` or `grad` a field with a capacity needs it given
+    (`field.capacity(params, receiver)`, on the host); too small a one gives NaN, never a wrong spectrum. Reverse mode only.
 
     The wave field finds mirror images on the host: neither it nor the receiver's position can be traced, and spectra have no
     gradient with respect to that position.
     """
-    return field.render(params, field.plan(params, receiver, limits), query).pas
+    return field.render(params, field.plan(params, receiver, None, capacity), query).pas
 
 
 _FIELDS: dict[str, type[Field]] = {}

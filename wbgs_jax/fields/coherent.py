@@ -103,8 +103,8 @@ class WaveField(Field):
 
     name: ClassVar[str] = "wave"
     presets: ClassVar = PRESETS
-    gives: ClassVar = ("pas", "snapshots", "power", "paths")
-    controls: ClassVar = ("search",)
+    outputs: ClassVar = ("pas", "snapshots", "power", "paths")
+    hooks: ClassVar = ("search",)
     seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
 
     @classmethod
@@ -116,7 +116,7 @@ class WaveField(Field):
             raise UserError(f"--{cls.name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 does without")
 
     @classmethod
-    def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
+    def build(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
         """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
         cls.check(config)
         return make_field(scene.mesh(), config, scene.receivers.position)
@@ -126,11 +126,13 @@ class WaveField(Field):
         facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
         return first_params(self.config, facets, materials, self.first_placement, self.first_clutter)
 
-    def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
+    def plan(self, params: Any, receiver: Receiver, prepared: PreparedPaths | None = None, capacity: None = None) -> WavePlan:
         """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
         check_receiver(receiver)
         receiver, tuning = self._as_found(receiver)
-        surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
+        surfaces, beams = (
+            (self._search(receiver), _beams(receiver)) if prepared is None else (prepared.surfaces, prepared.beams)
+        )
         return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
@@ -174,27 +176,27 @@ class WaveField(Field):
         """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
         return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
-    def cache_of(self, cache: PreparedPaths, links: Links) -> PreparedPaths:
+    def prepared_of(self, prepared: PreparedPaths, links: Links) -> PreparedPaths:
         """Returns the paths of some links."""
-        return cache.only(links)
+        return prepared.only(links)
 
     def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
         """Returns spectra, snapshots and received power of B queries."""
         check_query(query)
         return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
 
-    def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
+    def render_links(self, params: WaveParams, plan: WavePlan, prepared: PreparedPaths, links: Links) -> Observation:
         """Returns the same of links of one receiver whose paths are prepared."""
-        return observe(params, plan, cache.of(links), links.query.frequency_hz)
+        return observe(params, plan, prepared.of(links), links.query.frequency_hz)
 
     def loss(
-        self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
+        self, params: WaveParams, prepared: PreparedPaths, batch: Batch, capacity: None = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
         facet corrections and clutter. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum
         of 1."""
-        plan = self.plan(params, batch.receiver, cache=cache)
-        return self.compared(params, self.render_links(params, plan, cache, batch.links), batch)
+        plan = self.plan(params, batch.receiver, prepared=prepared)
+        return self.compared(params, self.render_links(params, plan, prepared, batch.links), batch)
 
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of what it says of a batch."""
@@ -258,12 +260,12 @@ class WaveField(Field):
         known = self.known_thickness.at[material].set(metres)
         return tuple(dataclasses.replace(one, known_thickness=known) for one in (self, plan))  # type: ignore[return-value]
 
-    def blurred(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
+    def smoothed(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
         """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
         variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2
         return dataclasses.replace(params, placement=params.placement.at[-1].set(0.5 * jnp.log(variance)))
 
-    def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
+    def receiver_independent(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
         """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""
         return self, params
 

@@ -331,7 +331,7 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     """Returns the paths of B transmitters; independent of frequency and materials."""
     config, search = plan.config, plan.surfaces
     if not isinstance(search, Search):
-        raise TypeError("a plan that was made with prepared paths traces no others; plan without `cache`")
+        raise TypeError("a plan that was made with prepared paths traces no others; plan without them")
     sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
     return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
 

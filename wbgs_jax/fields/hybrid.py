@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, pytree, static, with_leaves
 from wbgs_jax.config import Settings
-from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Quantity, Splatted, register
+from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, Splatted, register
 from wbgs_jax.fields.coherent import WaveConfig, WaveField
 from wbgs_jax.fields.coherent_model import PreparedPaths
 from wbgs_jax.fields.mixture import (
@@ -102,8 +102,9 @@ class HybridField(Field):
 
     name: ClassVar[str] = "hybrid"
     presets: ClassVar = {name: _preset(name) for name in WaveField.presets}
-    gives: ClassVar = WaveField.gives
-    controls: ClassVar = ("wideband.density", "wave.search")
+    outputs: ClassVar = WaveField.outputs
+    components: ClassVar = {"wave": WaveField, "wideband": WidebandField}
+    hooks: ClassVar = ("wideband.density", "wave.search")
     seconds: ClassVar = {"cpu": 700.0, "smoke": 60.0}
 
     @classmethod
@@ -115,10 +116,10 @@ class HybridField(Field):
             raise UserError("--wave.no-coherent leaves nothing to mix; train --field wideband")
 
     @classmethod
-    def make(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":
+    def build(cls, config: HybridConfig, scene: Scene, seed: int) -> "HybridField":
         """Returns the field of a scene."""
         cls.check(config)
-        return cls(_coherent(config.wave, scene, seed), WidebandField.make(config.wideband, scene, seed), config)
+        return cls(_coherent(config.wave, scene, seed), WidebandField.build(config.wideband, scene, seed), config)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any], config: HybridConfig) -> "HybridField":
@@ -126,10 +127,6 @@ class HybridField(Field):
         has_wave = any(key.startswith(".wave.") for key in arrays)
         wave = from_leaves(WaveField, arrays, {"config": config.wave}, ".wave") if has_wave else None
         return cls(wave, from_leaves(WidebandField, arrays, {"config": config.wideband}, ".wideband"), config)
-
-    def known(self) -> tuple[Quantity, ...]:
-        """Returns what it knows of a link: without a coherent field no snapshots and no paths."""
-        return self.wideband.gives if self.wave is None else self.gives
 
     def init(self, key: Key[Array, ""]) -> HybridParams:
         """Returns initial parameters, both fields trusted alike."""
@@ -141,25 +138,25 @@ class HybridField(Field):
         """Returns the paths of all transmitters of some links (host)."""
         return None if self.wave is None else self.wave.prepare(links, receivers)
 
-    def cache_of(self, cache: Any, links: Links) -> PreparedPaths | None:
+    def prepared_of(self, prepared: Any, links: Links) -> PreparedPaths | None:
         """Returns the paths of some links."""
-        return None if self.wave is None else self.wave.cache_of(cache, links)
+        return None if self.wave is None else self.wave.prepared_of(prepared, links)
 
     def plan(
-        self, params: HybridParams, receiver: Receiver, limits: Any = None, cache: PreparedPaths | None = None
+        self, params: HybridParams, receiver: Receiver, prepared: PreparedPaths | None = None, capacity: Any = None
     ) -> HybridPlan:
         """Returns a receiver's mirror images (host, unless they are prepared) and the projected Gaussians."""
-        wave = None if self.wave is None else self.wave.plan(params.wave, receiver, None, cache)
-        return HybridPlan(wave, self.wideband.plan(params.wideband, receiver, limits))
+        wave = None if self.wave is None else self.wave.plan(params.wave, receiver, prepared)
+        return HybridPlan(wave, self.wideband.plan(params.wideband, receiver, None, capacity))
 
     def render(self, params: HybridParams, plan: HybridPlan, query: Query) -> Observation:
         """Returns spectra and received power of B queries, and the coherent field's snapshots."""
         coherent = None if self.wave is None else self.wave.render(params.wave, plan.wave, query)
         return self._mixed(params, plan, query, coherent)
 
-    def render_links(self, params: HybridParams, plan: HybridPlan, cache: PreparedPaths | None, links: Links) -> Observation:
+    def render_links(self, params: HybridParams, plan: HybridPlan, prepared: PreparedPaths | None, links: Links) -> Observation:
         """Returns the same of links whose transmitters' paths are prepared."""
-        coherent = None if self.wave is None else self.wave.render_links(params.wave, plan.wave, cache, links)
+        coherent = None if self.wave is None else self.wave.render_links(params.wave, plan.wave, prepared, links)
         return self._mixed(params, plan, links.query, coherent)
 
     def _mixed(self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation | None) -> Observation:
@@ -198,27 +195,29 @@ class HybridField(Field):
         return self.wideband.probe(params.wideband)
 
     def loss(
-        self, params: HybridParams, cache: PreparedPaths | None, batch: Batch, limits: Any = None, probe: Any = ()
+        self, params: HybridParams, prepared: PreparedPaths | None, batch: Batch, capacity: Any = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the sum of both losses. What the splatting field makes of the coherent one is no reason to change that."""
         if self.wave is None:
-            return self.wideband.loss(params.wideband, None, batch, limits, probe)
-        seen = self.wave.render_links(params.wave, self.wave.plan(params.wave, batch.receiver, None, cache), cache, batch.links)
+            return self.wideband.loss(params.wideband, None, batch, capacity, probe)
+        seen = self.wave.render_links(params.wave, self.wave.plan(params.wave, batch.receiver, prepared), prepared, batch.links)
         coherent, other = self.wave.compared(params.wave, seen, batch)
         given = jnp.where(_informed(batch), jax.lax.stop_gradient(seen.pas), 0)
-        loss, aux = self.wideband.loss(params.wideband, None, batch, limits, probe, given)
+        loss, aux = self.wideband.loss(params.wideband, None, batch, capacity, probe, given)
         figures = {f"{name}_wave": value for name, value in other.metrics.items()} | aux.metrics
         return loss + coherent, aux._replace(metrics=figures)
 
-    def calibrate(self, params: HybridParams, cache: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
+    def calibrate(self, params: HybridParams, prepared: Any, batches: Sequence[Batch]) -> tuple[HybridParams, dict[str, Any]]:
         """Returns the parameters with the shares that explain best what neither field was trained on; of what was not observed,
         spectra or powers, the coherent field's are taken. With them, the floor under noisy spectra is found (mixture.py)."""
         if self.wave is None or not batches:
             return params, {}
         raw = dataclasses.replace(params, trust=dataclasses.replace(params.trust, floor=jnp.zeros(())))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
-        plans = {number: self.plan(raw, receiver, None, cache) for number, receiver in receivers.items()}
-        seen = [jax.tree.map(np.asarray, _opinions(self, raw, plans[_receiver_of(batch)], cache, batch)) for batch in batches]
+        plans = {number: self.plan(raw, receiver, prepared) for number, receiver in receivers.items()}
+        seen = [
+            jax.tree.map(np.asarray, _opinions(self, raw, plans[_receiver_of(batch)], prepared, batch)) for batch in batches
+        ]
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
         floor, spectra = 0.0, coherent_alone()
@@ -237,13 +236,13 @@ class HybridField(Field):
             raise UserError("this run knows no paths: its data had no mesh")
         return self.wave.arrivals(params.wave, plan.wave, query)
 
-    def limits(self, params: HybridParams, receivers: Receiver) -> Any:
-        """Returns those of the splatting field."""
-        return self.wideband.limits(params.wideband, receivers)
+    def capacity(self, params: HybridParams, receivers: Receiver) -> Any:
+        """Returns that of the splatting field."""
+        return self.wideband.capacity(params.wideband, receivers)
 
-    def grow(self, limits: Any, required: Int[np.ndarray, " k"]) -> Any:
-        """Returns larger limits of the splatting field."""
-        return self.wideband.grow(limits, required)
+    def grow(self, capacity: Any, required: Int[np.ndarray, " k"]) -> Any:
+        """Returns a larger capacity of the splatting field."""
+        return self.wideband.grow(capacity, required)
 
     def splatted(self, params: HybridParams, plan: HybridPlan, query: Query) -> Splatted:
         """Returns the Gaussians of the splatting field, informed of the coherent one, with their attenuation and signal."""
@@ -269,15 +268,15 @@ class HybridField(Field):
         """Returns the plan without what is cheaply computed again."""
         return dataclasses.replace(plan, wideband=self.wideband.portable(plan.wideband))
 
-    def blurred(self, params: HybridParams, metres: Float[Array, ""] | float) -> HybridParams:
+    def smoothed(self, params: HybridParams, metres: Float[Array, ""] | float) -> HybridParams:
         """Returns parameters whose coherent part is a mean over transmitters nearby; the splatting one has no fringes."""
         if self.wave is None:
             return params
-        return dataclasses.replace(params, wave=self.wave.blurred(params.wave, metres))
+        return dataclasses.replace(params, wave=self.wave.smoothed(params.wave, metres))
 
-    def anywhere(self, params: HybridParams) -> tuple[Field, Any]:
+    def receiver_independent(self, params: HybridParams) -> tuple[Field, Any]:
         """Returns the coherent field: what the splatting one has learned is what its receiver sees."""
-        return super().anywhere(params) if self.wave is None else self.wave.anywhere(params.wave)
+        return super().receiver_independent(params) if self.wave is None else self.wave.receiver_independent(params.wave)
 
     def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns those of the coherent field."""
@@ -307,7 +306,7 @@ class HybridField(Field):
 def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
     """Returns the coherent field of a scene; None, and a warning, where there is no mesh that it could use."""
     try:
-        return WaveField.make(config, scene, seed)
+        return WaveField.build(config, scene, seed)
     except UserError as why:
         reason = str(why).split(";")[0]  # what to do about it is for those who asked for a coherent field
         warnings.warn(f"the hybrid field is its wideband half alone: {reason}", stacklevel=1)  # of this line: it is said once
@@ -341,7 +340,7 @@ class _Seen(NamedTuple):
 
 
 @jax.jit
-def _opinions(hybrid: HybridField, params: HybridParams, plan: HybridPlan, cache: Any, batch: Batch) -> _Seen:
+def _opinions(hybrid: HybridField, params: HybridParams, plan: HybridPlan, prepared: Any, batch: Batch) -> _Seen:
     """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
-    coherent = hybrid.wave.render_links(params.wave, plan.wave, cache, batch.links)
+    coherent = hybrid.wave.render_links(params.wave, plan.wave, prepared, batch.links)
     return _Seen(*hybrid._said(params, plan, batch.links.query, coherent), batch.pas, batch.received_db)

@@ -127,7 +127,7 @@ class Nerf2Field(Field):
         check_octaves(cls.name, config, ("point", "direction", "tx", "frequency"))
 
     @classmethod
-    def make(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
+    def build(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
         """Returns the field that fills the box of a scene."""
         return cls(jnp.asarray(scene.box, jnp.float32), config)
 
@@ -135,7 +135,7 @@ class Nerf2Field(Field):
         """Returns networks of random weights."""
         return _init(self, key)
 
-    def plan(self, params: Weights, receiver: Receiver, limits: None = None, cache: None = None) -> Nerf2Plan:
+    def plan(self, params: Weights, receiver: Receiver, prepared: None = None, capacity: None = None) -> Nerf2Plan:
         """Returns the rays of all pixels."""
         check_receiver(receiver)
         local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)
@@ -150,7 +150,7 @@ class Nerf2Field(Field):
         return Observation(render(params, plan, query))
 
     def loss(
-        self, params: Weights, cache: None, batch: Batch, limits: None = None, probe: Any = ()
+        self, params: Weights, prepared: None, batch: Batch, capacity: None = None, probe: Any = ()
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of some pixels of a batch, drawn with the step's key, the same ones in all of its spectra."""
         assert batch.pas is not None, "spectra are what it is trained on"

@@ -86,8 +86,8 @@ class WidebandField(Field):
 
     name: ClassVar[str] = "wideband"
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
-    gives: ClassVar = ("pas", "power")
-    controls: ClassVar = ("density",)
+    outputs: ClassVar = ("pas", "power")
+    hooks: ClassVar = ("density",)
     seconds: ClassVar = {"cpu": 180.0, "smoke": 30.0}
 
     @classmethod
@@ -107,7 +107,7 @@ class WidebandField(Field):
             raise UserError(f"--{name}.frequency-degree must be at least 1, --{name}.frequency-heads at least 0")
 
     @classmethod
-    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+    def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field whose Gaussians start on the surfaces of a scene."""
         count = min(config.gaussians, max(FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM * scene.spectra))
         return make_field(scene.surface(count, seed, config.sampling), config, cls)
@@ -119,24 +119,24 @@ class WidebandField(Field):
         return _init(self, key, given)
 
     def plan(
-        self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None
+        self, params: WidebandParams, receiver: Receiver, prepared: None = None, capacity: TileLimits | None = None
     ) -> WidebandPlan:
         """Returns the projected and sorted Gaussians, and what the networks make of them alone.
 
-        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
-        are needed under jit (`splat.geometry_plan`).
+        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. A `capacity`
+        is needed under jit (`splat.geometry_plan`).
         """
-        return self._plan(params, receiver, limits, None)
+        return self._plan(params, receiver, capacity, None)
 
     def _plan(
         self,
         params: WidebandParams,
         receiver: Receiver,
-        limits: TileLimits | None,
+        capacity: TileLimits | None,
         offset: Float[Array, "n 2"] | None,
     ) -> WidebandPlan:
         check_receiver(receiver)
-        geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
+        geometry = geometry_plan(params.gaussians, receiver, capacity, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
         features = gaussian_features(params.gaussians, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
@@ -171,14 +171,14 @@ class WidebandField(Field):
     def loss(
         self,
         params: WidebandParams,
-        cache: None,
+        prepared: None,
         batch: Batch,
-        limits: TileLimits | None = None,
+        capacity: TileLimits | None = None,
         probe: Any = None,
         given: Float[Array, "b 90 360"] | None = None,
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
-        planned = self._plan(params, batch.receiver, limits, probe)
+        planned = self._plan(params, batch.receiver, capacity, probe)
         seen = self._render(params, planned, batch.links.query, given, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
@@ -187,7 +187,7 @@ class WidebandField(Field):
         required = jnp.stack([jobs.required_entries, jobs.required_jobs])
         return loss, aux._replace(required=required, overflow=jobs.overflow)
 
-    def limits(self, params: WidebandParams, receivers: Receiver) -> TileLimits:
+    def capacity(self, params: WidebandParams, receivers: Receiver) -> TileLimits:
         """Returns tile limits that all of the receivers' plans keep, with room for footprints that grow."""
         required = np.zeros(2, int)
         for i in range(receivers.position.shape[0]):
@@ -196,9 +196,9 @@ class WidebandField(Field):
             required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
         return fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
 
-    def grow(self, limits: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
+    def grow(self, capacity: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
         """Returns limits that hold the required entries and jobs, and no less than before."""
-        return limits.grown_to(fit_limits(int(required[0]), int(required[1]), TILE_SLACK, limits.tiling))
+        return capacity.grown_to(fit_limits(int(required[0]), int(required[1]), TILE_SLACK, capacity.tiling))
 
     def splatted(
         self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None

@@ -40,6 +40,6 @@ class WrfgsField(WidebandField):
             raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
 
     @classmethod
-    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+    def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field of a scene; its networks never see a frequency."""
-        return super().make(without_frequency(config), scene, seed)
+        return super().build(without_frequency(config), scene, seed)

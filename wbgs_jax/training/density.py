@@ -57,7 +57,7 @@ class DensityReport:
 
 @dataclass(frozen=True)
 class DensityControl:
-    """The host control of fields whose parameters hold `gaussians` and whose probe is the offset (n, 2), in pixels, of their
+    """The hook of fields whose parameters hold `gaussians` and whose probe is the offset (n, 2), in pixels, of their
     projected centres."""
 
     config: DensityConfig

@@ -1,6 +1,6 @@
-"""Host controls: what is done to a field between jitted epochs. All are alike to the loop.
+"""Hooks: what is done to a field between jitted epochs. All are alike to the loop.
 
-A field asks for controls by name (`Field.controls`); the settings section of that name switches one on. A control may watch
+A field asks for hooks by name (`Field.hooks`); the settings section of that name switches one on. A hook may watch
 every step (`statistics` and `accumulate` are pure and run inside the epoch) and change parameters between epochs (`apply` runs
 on the host). It says how whatever is stored beside the parameters, such as optimiser moments, follows.
 
@@ -28,28 +28,28 @@ def silent(stage: str) -> None:
 
 
 class Edit(NamedTuple):
-    """What a control did."""
+    """What a hook did."""
 
     params: Any
     statistics: Any
-    """What the control has watched, from here on."""
+    """What the hook has watched, from here on."""
     moments: Callable[[Any], Any] | None
     """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
     report: dict[str, Any]
     """For metrics.jsonl; nothing is written if it is empty."""
     field: Field | None = None
     """The field where it is another one now, ..."""
-    cache: Any = None
+    prepared: Any = None
     """... and what it knows of the links."""
     growth: float = 1.0
     """How much more room the field needs than before."""
 
 
 class Context(NamedTuple):
-    """What a control may look at."""
+    """What a hook may look at."""
 
     data: TrainingData
-    cache: Any
+    prepared: Any
     """Of the field's `prepare`."""
     train: np.ndarray
     """Indices of the training links."""
@@ -57,8 +57,8 @@ class Context(NamedTuple):
 
 
 @runtime_checkable
-class Control(Protocol):
-    """A host control: a frozen, hashable object."""
+class Hook(Protocol):
+    """A hook: a frozen, hashable object."""
 
     @property
     def stream(self) -> int:
@@ -82,17 +82,17 @@ class Control(Protocol):
         ...
 
     def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns parameters of the shapes that the control may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
+        """Returns parameters of the shapes that the hook may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
         None where nothing is near after this step of so many."""
         ...
 
 
 @dataclass(frozen=True)
 class OfPart:
-    """A control of one part of a field that is made of parts: of its field and parameters of that name."""
+    """A hook of one part of a field that is made of parts: of its field and parameters of that name."""
 
     part: str
-    inner: Control
+    inner: Hook
 
     @property
     def stream(self) -> int:
@@ -129,7 +129,7 @@ class OfPart:
         return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
 
     def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns the shapes of all parameters that the control may soon change to, and that growth."""
+        """Returns the shapes of all parameters that the hook may soon change to, and that growth."""
         own = getattr(params, self.part)
         found = None if own is None else self.inner.next_size(own, step, steps)
         if found is None:

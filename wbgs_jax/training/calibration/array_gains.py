@@ -89,16 +89,16 @@ def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]
 def _snapshots(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the snapshots (n, elements) that a field says of some links, and those that were heard."""
     padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeats itself: one shape
-    said = _said(field, params, told.cache, told.data, jnp.asarray(padded, jnp.int32))
+    said = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
     assert told.data.snapshots is not None, "tuning is found from snapshots"
     return np.asarray(said)[: len(spectra)], np.asarray(told.data.snapshots)[spectra]
 
 
 @jax.jit
-def _said(field: Any, params: Any, cache: Any, data: Any, spectra: Int[Array, " n"]) -> Complex[Array, "n elements"]:
+def _said(field: Any, params: Any, prepared: Any, data: Any, spectra: Int[Array, " n"]) -> Complex[Array, "n elements"]:
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
         batch = data.batch(link[None], jax.random.key(0))
-        seen = field.render_links(params, field.plan(params, batch.receiver, cache=cache), cache, batch.links)
+        seen = field.render_links(params, field.plan(params, batch.receiver, prepared=prepared), prepared, batch.links)
         return seen.snapshots[0]
 
     found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)

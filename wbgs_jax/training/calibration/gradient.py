@@ -37,7 +37,7 @@ SEARCHED = ("transmitter", "element", "placement", "thick", "curved")
 def descend(
     field: Any,
     params: Any,
-    cache: Any,
+    prepared: Any,
     motion: Motion,
     widths: Motion,
     data: TrainingData,
@@ -49,7 +49,7 @@ def descend(
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
-        cache: paths of the links of the pool.
+        prepared: paths of the links of the pool.
         motion: the one to start with, of all receivers.
         widths: standard deviations of the prior of the whole motion, that of the field included.
         data: with spectra.
@@ -63,7 +63,7 @@ def descend(
     # The curvature of the normal prior, beside a loss that is a mean over so many numbers.
     numbers = len(pool) * data.receivers.element_positions.shape[-2]
     prior = jax.tree.map(lambda far: 1 / (far**2 * numbers), widths)
-    return _steps(field, params, motion, cache, data, batches, rate, unseen, prior)
+    return _steps(field, params, motion, prepared, data, batches, rate, unseen, prior)
 
 
 @jax.jit
@@ -71,7 +71,7 @@ def _steps(
     field: Any,
     params: Any,
     motion: Motion,
-    cache: Any,
+    prepared: Any,
     data: TrainingData,
     batches: Int[Array, "k b"],
     rate: Any,
@@ -88,8 +88,8 @@ def _steps(
         batch = data.batch(index, jax.random.key(0))
         motion = _by(metres, reach)
         seen_from = motion.of_receiver(batch.links.receiver_index[0])
-        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), seen_from)
-        seen = field.render_links(params, plan, cache, batch.links)
+        plan = field.displaced(field.plan(params, batch.receiver, prepared=prepared), seen_from)
+        seen = field.render_links(params, plan, prepared, batch.links)
         loss, _ = compare(seen, heard_alone(batch, seen))
         total = jax.tree.map(jnp.add, field.motion, motion)
         pulled = jax.tree.map(lambda stiffness, far: 0.5 * jnp.sum(stiffness * far**2), prior, total)

@@ -46,7 +46,7 @@ class Scores(Protocol):
 
 
 def make_scores(
-    field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+    field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
 ) -> Scores:
     """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
@@ -55,7 +55,7 @@ def make_scores(
     def block(start: int) -> tuple[Any, Batch]:
         """Returns what is looked at of so many spectra; the last block repeats its last."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
-        return _looked_at(field, cache, data, own)
+        return _looked_at(field, prepared, data, own)
 
     def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
         room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
@@ -79,7 +79,7 @@ class Told:
     """Some training spectra, and what they say of a field with the paths of their transmitters."""
 
     field: Any
-    cache: Any
+    prepared: Any
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
     """In the order in which they are looked at."""
@@ -87,7 +87,7 @@ class Told:
     def scores(self, count: int | None = None, compared: Compared = "snapshots", highest_hz: float = np.inf) -> Scores:
         """Returns the function that scores candidates on the first of those up to a frequency."""
         own = self.spectra[self.frequency_hz() <= highest_hz * (1 + 1e-6)][:count]
-        return make_scores(self.field, self.cache, self.data, jnp.asarray(own, jnp.int32), compared)
+        return make_scores(self.field, self.prepared, self.data, jnp.asarray(own, jnp.int32), compared)
 
     def frequency_hz(self) -> Float[np.ndarray, " n"]:
         """Returns their frequencies."""
@@ -113,10 +113,10 @@ def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> t
 
 
 @jax.jit
-def _looked_at(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
+def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
     """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
-    return field.cache_of(cache, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
+    return field.prepared_of(prepared, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
 @functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
@@ -125,7 +125,7 @@ def _score(
     structure: Any,
     differ: tuple[bool, ...],
     leaves: tuple[Array, ...],
-    cache: Any,
+    prepared: Any,
     batches: Batch,
     compared: Compared,
 ) -> Float[Array, "k m"]:
@@ -133,7 +133,7 @@ def _score(
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
-        seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
+        seen = field.render_links(params, field.plan(params, batch.receiver, prepared), prepared, batch.links)
         elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
         several = batch.snapshots if elements > 1 else None  # that of a single element tells its power only
         if several is not None and compared == "snapshots" and seen.snapshots is not None:

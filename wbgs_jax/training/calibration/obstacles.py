@@ -82,7 +82,7 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
         if not len(movers):
             break
         field = told.field.without(movers)
-        fewer = dataclasses.replace(told, field=field, cache=field.prepare(told.data.links, told.data.receivers))
+        fewer = dataclasses.replace(told, field=field, prepared=field.prepare(told.data.links, told.data.receivers))
         others, _ = search_materials(_carried(params, field), fewer, config.spectra, once)
         after = _explained(others, dataclasses.replace(fewer, spectra=judged.spectra), config)
         if not surely_better(now - after, tx, SURE):
@@ -137,10 +137,10 @@ def _each_by_itself(params: Any, told: Told) -> tuple[Told, Any]:
     own: Any = jax.tree.map(lambda leaf: leaf[source], params.materials)
     own = dataclasses.replace(own, log_thickness=thickness)
     field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
-    surfaces = told.cache.surfaces
+    surfaces = told.prepared.surfaces
     surfaces = replaced(surfaces, facets=replaced(surfaces.facets, material=facets.mover))
-    cache = replaced(told.cache, surfaces=surfaces)
-    return dataclasses.replace(told, field=field, cache=cache), replaced(params, materials=own)
+    prepared = replaced(told.prepared, surfaces=surfaces)
+    return dataclasses.replace(told, field=field, prepared=prepared), replaced(params, materials=own)
 
 
 def _of_air(params: Any, mover: int) -> Any:
@@ -195,7 +195,7 @@ def search_clutter(
     judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.clutter_spectra])
     batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.clutter_steps, BATCH, rng)
     field = told.field.cluttered()
-    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.cache, told.data, batches)
+    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.prepared, told.data, batches)
     others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)
     before, after = _errors(judged, params), _errors(dataclasses.replace(judged, field=field), others)
     gains = before - after
@@ -211,12 +211,14 @@ def _errors(told: Told, params: Any) -> Float[np.ndarray, " n"]:
 
 
 @jax.jit
-def _fitted(field: Any, params: Any, cache: Any, data: TrainingData, batches: Int[Array, "k b"]) -> Float[Array, "x y z 2"]:
+def _fitted(field: Any, params: Any, prepared: Any, data: TrainingData, batches: Int[Array, "k b"]) -> Float[Array, "x y z 2"]:
     """Returns the clutter after a step on every batch."""
     optimizer = optax.adam(optax.cosine_decay_schedule(field.config.clutter_lr, len(batches)))
 
     def loss(clutter: Float[Array, "x y z 2"], index: Int[Array, " b"]) -> Float[Array, ""]:
-        found: Float[Array, ""] = field.loss(replaced(params, clutter=clutter), cache, data.batch(index, jax.random.key(0)))[0]
+        found: Float[Array, ""] = field.loss(replaced(params, clutter=clutter), prepared, data.batch(index, jax.random.key(0)))[
+            0
+        ]
         return found
 
     def step(carry: Any, index: Int[Array, " b"]) -> tuple[Any, None]:

@@ -63,7 +63,7 @@ def unusual_level(told: Told) -> float:
 
 @dataclass(frozen=True)
 class Search:
-    """The host control of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
+    """The hook of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
 
     config: SearchConfig
     stream: int = 6
@@ -88,10 +88,10 @@ class Search:
     ) -> Edit:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
         bodies that are not there and with its surfaces moved if the mesh is doubtful."""
-        config, data, cache, say = self.config, context.data, context.cache, context.say
+        config, data, prepared, say = self.config, context.data, context.prepared, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
-        told = Told(field, cache, data, spectra)
+        told = Told(field, prepared, data, spectra)
         if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
             say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
@@ -99,7 +99,7 @@ class Search:
                 params, named = search_materials(params, told, config.spectra, config, usual=True)
                 params, gain = search_gain(params, told.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
-            return Edit(params, (), None, report | {"gain_db": gain}, field, cache)
+            return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
         if config.antenna_rounds:
             say("search: antennas")
             params, _ = self._antennas(params, told, report)
@@ -111,7 +111,7 @@ class Search:
                 params, told, absent = search_absent(params, told, config, say)
                 report["absent"] = dataclasses.asdict(absent)
                 if absent.centres:
-                    field, cache = told.field, told.cache
+                    field, prepared = told.field, told.prepared
                     params, named, _ = search_slabs(params, told, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
             say("search: idealisations")
@@ -127,14 +127,14 @@ class Search:
             field = self._tuning(params, told, report)
             told = dataclasses.replace(told, field=field)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
-                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
+                place, moved = learn_geometry(Place(field, params, prepared), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
                 if "antennas" in report:  # what is in it may have been dropped since
                     found = report["antennas"]["taken"].items()
                     kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
                     report["antennas"]["taken"] = kept
-                params, field, cache = place.params, place.field, place.cache
-                told = Told(field, cache, data, spectra)
+                params, field, prepared = place.params, place.field, place.prepared
+                told = Told(field, prepared, data, spectra)
                 field = self._tuning(params, told, report)
                 told = dataclasses.replace(told, field=field)
             params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
@@ -145,7 +145,7 @@ class Search:
         if data.snapshots is not None and (level := unusual_level(told)):
             told = dataclasses.replace(told, field=field)  # which may know of clutter since
             params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
-        return Edit(params, (), None, report, field, cache)
+        return Edit(params, (), None, report, field, prepared)
 
     def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
         """Returns parameters with the antennas that are found, and whether there are any."""
