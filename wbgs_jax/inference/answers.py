@@ -21,6 +21,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import field_names, get_field
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.predictor import Trained, trained_band
 from wbgs_jax.inference.queries import Product, Queries
 from wbgs_jax.inference.ready import MOST, QUANTITIES, Ready, load_ready, make_ready
@@ -147,7 +148,7 @@ def receiver_at(word: str, dataset: Dataset) -> Receiver:
 def lowest_answered(trained: Trained, dataset: Dataset) -> float:
     """Returns the lowest frequency (hertz) at which a field can be asked: that of the model's band, or of its training; paths
     hold below, too."""
-    if "paths" in trained.field.known():
+    if "paths" in outputs_of(trained.field):
         return LOWEST_OF_PATHS_HZ
     return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
 
@@ -155,7 +156,7 @@ def lowest_answered(trained: Trained, dataset: Dataset) -> float:
 def check_frequencies(trained: Trained, dataset: Dataset, lowest_hz: float) -> None:
     """Raises a `UserError` where a field is asked below what it answers."""
     if lowest_hz < (lowest := lowest_answered(trained, dataset)) * (1 - ROUNDED):
-        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).outputs)
         raise UserError(
             f"the {trained.field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at "
             f"{lowest_hz / 1e9:g} GHz; below, only fields with paths do: train --field {able} on data with a mesh"

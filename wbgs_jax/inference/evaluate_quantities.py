@@ -16,6 +16,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.answers import Options
 from wbgs_jax.inference.intervals import expect_many
 from wbgs_jax.inference.kriging import for_receiver
@@ -36,8 +37,8 @@ SIGHT = "line of sight"
 
 def check_paths(trained: Trained) -> None:
     """Raises a `UserError` where a field knows no paths."""
-    if "paths" not in trained.field.known():
-        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+    if "paths" not in outputs_of(trained.field):
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).outputs)
         raise UserError(f"the {trained.field.name} field of this run knows no paths; train --field {able} on data with a mesh")
 
 

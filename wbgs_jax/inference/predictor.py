@@ -16,6 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence
 from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside, correct, for_receiver
 from wbgs_jax.radio.array import PAS_SHAPE
@@ -84,7 +85,7 @@ def at_receiver(trained: T, receiver: Receiver, dataset: Dataset | None = None) 
     dataset = trained.dataset() if dataset is None else dataset
     if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
         return trained
-    field, params = trained.field.anywhere(trained.params)
+    field, params = trained.field.receiver_independent(trained.params)
     nothing = dict.fromkeys(("neighbours", "confidence", "power_confidence"))
     return dataclasses.replace(trained, field=field, params=params, **nothing)  # type: ignore[type-var]
 
@@ -133,7 +134,7 @@ def power_predictor(trained: Trained, receiver: Receiver | None = None) -> Predi
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field learned nothing of spectra."""
-    if dataset.kind == "power" and "paths" not in field.known():
+    if dataset.kind == "power" and "paths" not in outputs_of(field):
         raise UserError(
             f"{dataset.name} holds received powers, from which the {field.name} field learned no spectra; ask for --what power"
         )
@@ -141,9 +142,9 @@ def check_spectra(field: Field, dataset: Dataset) -> None:
 
 def check_power(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field cannot say what power a receiver gets."""
-    if "power" not in field.known():
+    if "power" not in outputs_of(field):
         raise UserError(f"the {field.name} field has no power, only spectra; train another field")
-    if dataset.kind == "pas" and "paths" not in field.known():
+    if dataset.kind == "pas" and "paths" not in outputs_of(field):
         raise UserError(
             f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
         )
@@ -246,7 +247,7 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
 
     def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Observation]]:
         for number in np.unique(dataset.receiver_index[index]):
-            plan = field.plan(params, dataset.receiver(int(number)), None, cache)
+            plan = field.plan(params, dataset.receiver(int(number)), cache)
             of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
             known = devices.replicated((field, params, plan, cache))
             for block, filled in _blocks(of_receiver, BLOCK * devices.count):
@@ -272,7 +273,7 @@ def observe_queries(trained: Trained, receiver: Receiver, query: Query, quantity
         for start in range(0, count, PREPARED):
             some = np.arange(start, min(start + PREPARED, count))
             cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
-            plan = field.plan(params, receiver, None, cache)
+            plan = field.plan(params, receiver, cache)
             known = devices.replicated((field, params, plan, cache, neighbours))
             for block, filled in _blocks(some, min(BLOCK, count) * devices.count):
                 yield block, _observe(*known, _taken(links, filled), quantity, devices.mesh)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.fields.base import Quantity
+from wbgs_jax.fields.base import Output, outputs_of
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power
 from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, check_spectra, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
@@ -65,8 +65,8 @@ def check_known(what: str, trained: Trained, dataset: Dataset) -> None:
     if what not in CHANNEL:
         return
     enough = {"paths", OBSERVED.get(what, "paths")}
-    if not enough & set(trained.field.known()):
-        able = " or ".join(name for name in field_names() if enough & set(get_field(name).gives))
+    if not enough & set(outputs_of(trained.field)):
+        able = " or ".join(name for name in field_names() if enough & set(get_field(name).outputs))
         raise UserError(f"the {trained.field.name} field has no {what}, only spectra; train --field {able}")
     if what == "power":
         check_power(trained.field, dataset)
@@ -133,5 +133,5 @@ CHANNEL: dict[str, tuple[str, OfArrivals | None]] = {
     "delay-spread": ("delay_spread_s", lambda arrivals, *_: channel.delay_spread_s(arrivals)),
 }
 """Name in the file, and how it follows from what arrives; None: the field says it itself, under that name (`Observation`)."""
-OBSERVED: dict[str, Quantity] = {"snapshot": "snapshots", "power": "power"}
+OBSERVED: dict[str, Output] = {"snapshot": "snapshots", "power": "power"}
 """What a field that knows of no paths may know nevertheless."""

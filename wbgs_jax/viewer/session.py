@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Electrical, Splatted
+from wbgs_jax.fields.base import Electrical, Splatted, outputs_of
 from wbgs_jax.inference.answers import bounds_of
 from wbgs_jax.inference.evaluate_quantities import describe_interactions, names_of
 from wbgs_jax.inference.intervals import Expected, expected_ssim
@@ -100,7 +100,7 @@ class Asker:
     @property
     def knows_paths(self) -> bool:
         """Whether the field knows paths."""
-        return "paths" in self.trained.field.known()
+        return "paths" in outputs_of(self.trained.field)
 
     @property
     def knows_power(self) -> bool:
