@@ -25,7 +25,7 @@ from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.training import loop
-from wbgs_jax.training.hooks import Context
+from wbgs_jax.training.hooks import Context, probe_of
 from wbgs_jax.training.step import loss_and_gradients
 
 STEPS, EVERY, BATCH, TRANSMITTERS = 40, 5, 8, 24
@@ -71,11 +71,12 @@ def exchanged(run: loop.Run) -> dict[str, Any]:
     """Returns the collectives of a step's compiled gradients and its operations a device: with links divided by `shard_map`, as
     the library does, with `jit` left to divide them, and on one device."""
     assert run.devices.mesh is not None
+    probe = probe_of(run.hooks, run.state.params)
     by_links = NamedSharding(run.devices.mesh, PartitionSpec(AXIS))
 
     def step(mesh: Any, divide: Callable[[Any], Any]) -> Callable[..., Any]:
         def gradients(field, params, prepared, data, index, key):
-            return loss_and_gradients(field, params, prepared, data, divide(index), run.capacity, key, mesh)
+            return loss_and_gradients(field, params, prepared, data, divide(index), run.capacity, key, mesh, probe)
 
         return gradients
 
@@ -123,7 +124,7 @@ def parts(field: str, folder: Path) -> dict[str, Any]:
         run = make_run(field, folder, batch)
         step[str(batch)] = seconds(_gradients(run))
     slope, shared = np.polyfit(BATCHES, list(step.values()), 1)
-    trained = [*jax.tree.leaves(run.state.params), *jax.tree.leaves(run.field.probe(run.state.params))]
+    trained = [*jax.tree.leaves(run.state.params), *jax.tree.leaves(probe_of(run.hooks, run.state.params))]
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(run.state))
     return {
         "step_s": step,
@@ -140,11 +141,11 @@ def parts(field: str, folder: Path) -> dict[str, Any]:
 
 def _gradients(run: loop.Run) -> Callable[[], Any]:
     """Returns a call that computes the gradients of a batch."""
-    given, capacity = arguments_of(run), run.capacity
+    given, capacity, probe = arguments_of(run), run.capacity, probe_of(run.hooks, run.state.params)
 
     @jax.jit
     def gradients(field, params, prepared, data, index, key):
-        return loss_and_gradients(field, params, prepared, data, index, capacity, key)
+        return loss_and_gradients(field, params, prepared, data, index, capacity, key, None, probe)
 
     return lambda: jax.block_until_ready(gradients(*given))
 

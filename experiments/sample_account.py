@@ -93,9 +93,9 @@ def keep(prepared: wave.PreparedPaths, mask: np.ndarray) -> wave.PreparedPaths:
 
 
 @jax.jit
-def observe(field: Field, params: Any, plan: Any, prepared: wave.PreparedPaths, links: Links) -> Observation:
+def observe(field: Field, params: Any, plan: Any, links: Links) -> Observation:
     """Returns what the field says of links whose paths are given."""
-    return field.render_links(params, plan, prepared, links)
+    return field.render(params, plan, links)._replace(paths=None)
 
 
 def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tuple[AntennaReport, Any]:
@@ -110,10 +110,10 @@ def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tu
 def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
     """Returns the score of every spectrum."""
     found = []
-    plan = field.plan(params, dataset.receiver(), prepared=prepared)
+    plan = field.plan(params, dataset.receiver(), prepared)
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
-        seen = observe(field, params, plan, prepared, dataset.links(index))
+        seen = observe(field, params, plan, dataset.links(index))
         found.append(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index))))
     return np.concatenate(found)
 

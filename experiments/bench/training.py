@@ -25,6 +25,7 @@ from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.training.batches import limited
+from wbgs_jax.training.hooks import probe_of
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients
 
@@ -76,7 +77,9 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         return loss(wideband.render(params, field.plan(params, receiver, None, run.capacity), query), data)
 
     def gradient(params, data):
-        return loss_and_gradients(field, params, run.prepared, data, index, run.capacity, run.key)
+        return loss_and_gradients(
+            field, params, run.prepared, data, index, run.capacity, run.key, None, probe_of(run.hooks, params)
+        )
 
     def optimiser(gradients, state):
         updates, moments = run.optimizer.update(gradients, state.optimizer, state.params)

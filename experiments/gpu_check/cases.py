@@ -25,6 +25,8 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.intervals import FEATURES, POWER_FEATURES, Confidence, PowerConfidence
 from wbgs_jax.training.batches import TrainingData, training_data
+from wbgs_jax.training.hooks import probe_of
+from wbgs_jax.training.loop import make_hook
 from wbgs_jax.training.run_folder import RunConfig, TrainedField
 
 ON_THE_HOST = frozenset(
@@ -207,6 +209,12 @@ class Known:
         """Of these links."""
         return self.dataset.query(np.asarray(self.index))
 
+    @property
+    def probe(self) -> Any:
+        """Of its hooks."""
+        hooks = (make_hook(name, self.settings) for name in self.field.hooks)
+        return probe_of([hook for hook in hooks if hook is not None], self.params)
+
 
 @functools.cache
 def _scene() -> tuple[Dataset, TrainingData]:
@@ -249,7 +257,7 @@ def of_field(name: str) -> list[Case]:
 
     return [
         Case(f"{name}:init", init, (jnp.asarray(SEED),), ()),
-        Case(f"{name}:loss", loss, (of.params, of.field.probe(of.params))),
+        Case(f"{name}:loss", loss, (of.params, of.probe)),
         *([Case(f"pas:{name}", _pas(of), (of.params, query.tx_position), (0, 1))] if name not in COHERENT else []),
         *(
             [Case(f"{name}:render", _render(of), (of.params, query.tx_position), (0, 1), costly=True)]

@@ -26,6 +26,10 @@ class MirrorsField(Field):
     name: ClassVar[str] = "mirrors"
     outputs: ClassVar = ("pas", "snapshots", "power", "paths")
 
+    @classmethod
+    def build(cls, config, scene, seed):
+        return cls(config)
+
     def init(self, key):
         return {"loss": jnp.float32(0.5)}
 
@@ -51,14 +55,11 @@ class MirrorsField(Field):
         weighted = waves * (power / power.sum(-1, keepdims=True))[..., None] / 16
         covariance = jnp.einsum("bke,bkf->bef", weighted, waves.conj())
         pas = covariance_to_pas(covariance, BEAMS)
-        return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance)
-
-    def arrivals(self, params, plan, query):
-        away, power = self.waves(params, plan, query)
-        distance, amplitude = jnp.linalg.norm(away, axis=-1), jnp.sqrt(power).astype(jnp.complex64)
+        amplitude = jnp.sqrt(power).astype(jnp.complex64)
         polarised = jnp.stack([amplitude, 0 * amplitude], -1)
         met = jnp.zeros((*distance.shape, 5), jnp.int32).at[:, 1:, 0].set(REFLECTED)
-        return Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
+        paths = Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
+        return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance, paths)
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def test_training_finds_the_materials_and_moves_nothing_else(trained):
 @pytest.mark.heavy
 def test_the_commands_answer(folder, trained, tmp_path):
     """Spectra, and quantities of the channel: traced anew, those of links whose paths are prepared."""
-    assert trained.field.sizes(trained.params)["facets"] == 12
+    assert trained.field.inspect(trained.params).sizes["facets"] == 12
     dataset = trained.dataset()
     seen, index = observe(trained.field, trained.params, dataset), 7 * len(FREQUENCIES) + np.array([1, 3])
     tx = dataset.tx_positions[index[0]]
@@ -180,9 +180,7 @@ def test_prepared_links_are_rendered_as_others_are(rng):
     receivers = jax.tree.map(lambda leaf: leaf[None], plan.receiver)
     prepared = field.prepare(links, receivers)
     np.testing.assert_array_equal(prepared.tx_index, [3, 7])
-    prepared = jax.jit(WaveField.render_links)(
-        field, params, field.plan(params, plan.receiver, prepared=prepared), prepared, links
-    )
+    prepared = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, prepared), links)
     others = jax.jit(WaveField.render)(field, params, plan, query)
     powers = [seen._replace(pas=seen.pas**2) for seen in (prepared, others)]  # near zero roots are of rounding
     for a, b in zip(*powers, strict=True):
@@ -287,7 +285,7 @@ def test_an_array_in_metres_is_that_of_its_wavelengths_at_one_frequency(rng):
 
 def test_more_facets_than_can_be_numbered_are_refused():
     with pytest.raises(UserError, match="max-facets is 100001; the most is 100000"):
-        WaveField.check(WaveConfig(max_facets=100_001))
+        WaveConfig(max_facets=100_001).check("wave")
 
 
 @pytest.mark.heavy
@@ -327,7 +325,7 @@ def test_a_link_without_any_path_has_gradients(coherent):
     for paths in (prepared, nothing):
         loss, gradient = found(params, paths)
         assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-    seen = jax.jit(WaveField.render_links)(field, params, field.plan(params, plan.receiver, prepared=prepared), nothing, links)
+    seen = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, nothing), links)
     assert not np.any(seen.pas)
     if coherent:
         assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB

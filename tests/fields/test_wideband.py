@@ -74,7 +74,7 @@ def test_starts_with_gaussians_on_the_surface_of_even_attenuation(points, query)
     np.testing.assert_allclose(attenuation[:N], INITIAL_ATTENUATION, rtol=1e-5)
     np.testing.assert_array_equal(attenuation[N:], 0)  # empty slots take nothing away
     assert bool((signal > 0).all())
-    assert field.sizes(params) == {"gaussians": N}
+    assert field.inspect(params).sizes == {"gaussians": N}
 
 
 def test_only_what_is_trained_is_a_parameter(points):
@@ -82,9 +82,9 @@ def test_only_what_is_trained_is_a_parameter(points):
     field = start(points)
     params = field.init(jax.random.key(0))
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(params))
-    labels = field.labels(params)
+    groups, labels = field.param_groups(CONFIG, params)
     assert jax.tree.structure(labels) == jax.tree.structure(params)
-    assert set(jax.tree.leaves(labels)) == set(field.groups(CONFIG))
+    assert set(jax.tree.leaves(labels)) == set(groups)
 
 
 @pytest.mark.parametrize(("attenuation", "radiance"), [(True, True), (True, False), (False, True), (False, False)])
@@ -176,7 +176,7 @@ def test_a_plan_for_a_file_renders_the_same(rng, points, query):
     field = start(points)
     params = trained(rng, field)
     plan = plan_of(field, params)
-    portable = field.portable(plan)
+    portable = plan.portable()
     assert portable.features is None and plan.features is not None
     np.testing.assert_allclose(render(params, portable, query), render(params, plan, query), atol=1e-6)
 
@@ -188,7 +188,7 @@ def test_limits_hold_all_receivers_and_grow(rng, points):
     capacity = field.capacity(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers))
     for receiver in receivers:
         assert not plan_within(field, params, receiver, capacity=capacity).geometry.jobs.overflow
-    grown = field.grow(capacity, np.array([capacity.entries + 1, 3]))
+    grown = capacity.grown_to(field.capacity(params, None, np.array([capacity.entries + 1, 3])))
     assert grown.entries > capacity.entries and grown.jobs == capacity.jobs
 
 

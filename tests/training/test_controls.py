@@ -39,24 +39,17 @@ class LayeredField(RippleField):
     def render(self, params, plan, query):
         return super().render({"level": params["layers"].sum(0), "tilt": params["tilt"]}, plan, query)
 
-    def probe(self, params):
-        return jnp.zeros(4)
-
-    def loss(self, params, prepared, batch, capacity=None, probe=()):
-        moved = params | {"layers": params["layers"].at[0].add(probe)}
+    def loss(self, params, prepared, batch, capacity=None, probe=None):
+        moved = params if probe is None else params | {"layers": params["layers"].at[0].add(probe)}
         return super().loss(moved, prepared, batch, capacity)
 
     @classmethod
-    def groups(cls, config):
-        return {"layers": Group(config.learning_rate), "tilt": Group(0.01)}
-
-    @classmethod
-    def labels(cls, params):
-        return {"layers": "layers", "tilt": "tilt"}
+    def param_groups(cls, config, params=None):
+        return {"layers": Group(config.learning_rate), "tilt": Group(0.01)}, {"layers": "layers", "tilt": "tilt"}
 
 
 @dataclass(frozen=True)
-class Watching:
+class Watching(Hook):
     """Sums what it is shown; asks for nothing."""
 
     config: Any
@@ -65,15 +58,15 @@ class Watching:
     def statistics(self, params):
         return {"gradients": jax.tree.map(jnp.zeros_like, params), "probe": jnp.zeros(4), "steps": jnp.zeros(())}
 
+    def probe(self, params):
+        return jnp.zeros(4)
+
     def accumulate(self, statistics, gradients, probe):
         seen = {"gradients": gradients, "probe": probe, "steps": jnp.ones(())}
         return jax.tree.map(jnp.add, statistics, seen)
 
     def due(self, step, steps):
         return False
-
-    def next_size(self, params, step, steps):
-        return None
 
     def apply(self, field, params, statistics, context, step, rng):
         raise AssertionError("it is never due")
@@ -147,7 +140,7 @@ def host(tree):
 
 def test_controls_are_what_their_protocol_says():
     for made in (
-        *(make(config) for make, config in zip(loop.HOOKS.values(), (DENSITY, SEARCH), strict=True)),
+        *(make(config) for make, config in zip(loop.HOOKS.values(), (DENSITY, SEARCH, None), strict=True)),
         Growing(DENSITY),
     ):
         assert isinstance(made, Hook)
@@ -163,7 +156,7 @@ def test_a_control_is_shown_the_gradients_of_every_step(dataset, tmp_path, monke
     run, expected = Run(dataset, "layered", SETTINGS, SEED, tmp_path), []
     for step, index in enumerate(jnp.asarray(run.batches(0, 2))):
         key = jax.random.fold_in(run.key, step)
-        _, both = _gradients(run.field, run.state.params, run.prepared, run.data, index, None, key)
+        _, both = _gradients(run.field, run.state.params, run.prepared, run.data, index, None, key, None, jnp.zeros(4))
         expected.append(host(both))
         run.state, report = run_epoch(
             run.state,

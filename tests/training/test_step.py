@@ -17,6 +17,7 @@ from wbgs_jax.splat import TileLimits, project
 from wbgs_jax.splat.tiles import build_tile_jobs
 from wbgs_jax.training.batches import training_data
 from wbgs_jax.training.density import DensityControl
+from wbgs_jax.training.hooks import probe_of
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
 from wbgs_jax.types import Gaussians
@@ -155,8 +156,10 @@ def test_the_statistics_are_sums_of_the_positional_gradients(tmp_path, dataset):
     so for a toy field, quicker.)"""
     run = new_run(dataset, tmp_path, "wideband", GROWING)
     index = jnp.asarray(run.batches(0, 1)[0])
-    gradients = jax.jit(loss_and_gradients, static_argnames="capacity")
-    _, (d_params, d_means2d) = gradients(run.field, run.state.params, run.prepared, run.data, index, run.capacity, run.key)
+    gradients, probe = jax.jit(loss_and_gradients, static_argnames="capacity"), probe_of(run.hooks, run.state.params)
+    _, (d_params, d_means2d) = gradients(
+        run.field, run.state.params, run.prepared, run.data, index, run.capacity, run.key, None, probe
+    )
     state, _ = epoch(run, run.state, jnp.tile(index, (2, 1)), 1)
     expected = np.hypot(d_means2d[:, 0] * 180, d_means2d[:, 1] * 45)
     (seen,) = state.statistics

@@ -19,7 +19,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks, shrinking
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Observation, outputs_of
+from wbgs_jax.fields.base import Observation, as_observed, outputs_of
 from wbgs_jax.inference.predictor import Trained, check_power
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.channel import NOT_HEARD_DB
@@ -115,7 +115,7 @@ class Locator:
             query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
             seen = self.field.render(params, plan, query)
             if self.what == "spectra":  # an observation has the noise that the data had
-                seen = seen._replace(pas=self.field.as_observed(params, seen.pas))
+                seen = seen._replace(pas=as_observed(self.field, params, seen.pas))
             return _compared(self.what, seen)
 
         # Under `vmap` over frequencies what depends on places alone, such as paths, is computed once.

@@ -36,14 +36,17 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, get_field
+from wbgs_jax.fields.base import field_from_arrays
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
 from wbgs_jax.training.calibration.pipeline import Search
 from wbgs_jax.training.density import DensityControl
+from wbgs_jax.training.expert_weights import ExpertWeights
 from wbgs_jax.training.hooks import Context, Edit, Hook, OfPart, Say, map_moments, silent
 from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.progress import Interrupted, TrainingProgress, deferred_interrupt
 from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
+from wbgs_jax.types import Batch
 
 
 class Precompilation:
@@ -74,16 +77,20 @@ class Precompilation:
         self._ready.add(key)
 
 
-HOOKS: dict[str, Callable[[Any], Hook]] = {"density": DensityControl, "search": Search}
-"""Hooks by the names that fields and settings give them."""
-CALIBRATED, BLOCK = 720, 16
-"""Validation links that a field is calibrated by, at most, and how many at a time."""
+HOOKS: dict[str, Callable[[Any], Hook]] = {
+    "density": DensityControl,
+    "search": Search,
+    "expert_weights": lambda _: ExpertWeights(),
+}
+"""What makes a hook from its section of the settings, by the names that fields and settings give them."""
+VALIDATION_LINKS, BLOCK = 720, 16
+"""Validation links that hooks are shown, at most, and how many at a time."""
 
 
 def make_hook(name: str, settings: Settings) -> Hook | None:
-    """Returns the hook that a field asks for by this name; None where the settings switch it off."""
+    """Returns the hook that a field asks for by this name; None where the settings have such a section, and switch it off."""
     part, _, kind = name.rpartition(".")
-    config = getattr(settings, kind)
+    config = getattr(settings, kind, True)
     if not config:
         return None
     hook = HOOKS[kind](config)
@@ -146,7 +153,7 @@ class Run:
     @cached_property
     def sizes(self) -> dict[str, int]:
         """How large the field is: hooks alone change that."""
-        return self.field.sizes(self.state.params)
+        return self.field.inspect(self.state.params).sizes
 
     def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
         """Returns the batches of an epoch, each of one receiver: a function of seed and epoch alone, so that a resumed run sees
@@ -266,7 +273,8 @@ class Run:
     def _recover(self, report: EpochReport, batch: Int[np.ndarray, " b"]) -> None:
         """Grows the capacity after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
         if report.overflow:
-            self.capacity = self.field.grow(self.capacity, np.asarray(report.required))
+            needed = self.field.capacity(self.state.params, self.dataset.receivers, np.asarray(report.required))
+            self.capacity = self.capacity.grown_to(needed)
             self.compilations += 1
             return
         saved = checkpoint.checkpoint_steps(self.checkpoints)
@@ -284,7 +292,7 @@ class Run:
             if hook.due(self.step, self.settings.optim.steps):
                 begin, step = time.perf_counter(), self.step
                 rng = np.random.default_rng([self.seed, hook.stream, step])
-                context = Context(self.data, self.prepared, self.dataset.train, say)
+                context = Context(self.data, self.prepared, self.dataset.train, say, self.validation_batches)
                 edit = hook.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
                 check_alike(self.state, f"what the {type(hook).__name__} made of the parameters")
@@ -323,9 +331,9 @@ class Run:
         if edit.field is not None:
             self.field, self.prepared = edit.field, edit.prepared
 
-    def calibrate(self) -> None:
-        """Lets the field learn what only the validation part can say."""
-        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:CALIBRATED]
+    def validation_batches(self) -> list[Batch]:
+        """Returns batches of links of the validation part, each of one receiver."""
+        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:VALIDATION_LINKS]
         receiver = self.dataset.receiver_index[chosen]
         blocks = [
             own[i : i + BLOCK]
@@ -333,11 +341,7 @@ class Run:
             for own in [chosen[receiver == number]]
             for i in range(0, len(own), BLOCK)
         ]
-        batches = [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
-        params, report = self.field.calibrate(self.state.params, self.prepared, batches)
-        self.state = dataclasses.replace(self.state, params=params)
-        if report:
-            self.log({"step": self.step} | report)
+        return [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
 
     def evaluate(self) -> dict[str, float]:
         """Returns figures of the watched validation spectra."""
@@ -367,7 +371,7 @@ class Run:
         saved = checkpoint.read(self.checkpoints, steps[-1])
         if saved.metadata.get("data", self.checksum) != self.checksum:
             raise UserError(f"the data of {self.folder} are not those that it was trained on; put them back, or train again")
-        self.field = type(self.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), self.settings.field)
+        self.field = field_from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
         self.state = checkpoint.fill_like(saved, like)
@@ -408,7 +412,7 @@ class TrainResult:
     @property
     def sizes(self) -> dict[str, int]:
         """How large the trained field is."""
-        return self.field.sizes(self.params)
+        return self.field.inspect(self.params).sizes
 
 
 def train(
@@ -469,8 +473,6 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
     figures = run.epoch(go_on=not (stopping or run.due(after)))
     interrupted = any_process(interrupt["set"]) and not run.launched
     run.run_hooks()
-    if run.step == total:
-        run.calibrate()
     entry: dict[str, Any] = {"step": after} | {name: None if np.isnan(v) else v for name, v in figures.items()}
     entry |= run.sizes | {"seconds": run.seconds}
     if len(run.watched) and (crosses(before, after, loop.evaluate_every) or after == total):

@@ -18,7 +18,7 @@ from wbgs_jax._util.devices import averaged
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields import Aux, Field
 from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.training.hooks import Hook
+from wbgs_jax.training.hooks import Hook, probe_of
 
 
 @pytree
@@ -65,6 +65,7 @@ def loss_and_gradients(
     capacity: Any,
     key: Key[Array, ""],
     mesh: Mesh | None = None,
+    probe: Any = None,
 ) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
     """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch. The devices of a mesh divide
     the links evenly; the loss is the mean of theirs."""
@@ -77,7 +78,7 @@ def loss_and_gradients(
     def objective(params, probe):
         return shared(index, params, probe, field, prepared, data, key)
 
-    return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, field.probe(params))
+    return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, probe)
 
 
 def _all_finite(tree: Any) -> Bool[Array, ""]:
@@ -115,7 +116,15 @@ def run_epoch(
 
     def run(state: TrainState, index: Int[Array, " b"]):
         (loss, aux), (gradients, probe) = loss_and_gradients(
-            field, state.params, prepared, data, index, capacity, jax.random.fold_in(key, state.step), mesh
+            field,
+            state.params,
+            prepared,
+            data,
+            index,
+            capacity,
+            jax.random.fold_in(key, state.step),
+            mesh,
+            probe_of(hooks, state.params),
         )
         overflow = jnp.zeros((), bool) if aux.overflow is None else aux.overflow
         ok = _all_finite((loss, gradients)) & ~overflow

@@ -51,14 +51,14 @@ def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningRepor
     """Returns the field with its arrays tuned as training snapshots say, where that is surely better; as it is otherwise.
 
     Args:
-        params: of a field that can be `tuned`.
+        params: of a field whose arrays can be given gains.
         told: training spectra, with snapshots, and the field.
         count: how many of them are looked at: one half says the gains, the other whether they are right.
     """
     field, links = told.field, told.data.links
     chosen = told.spectra[:count]
     half = np.unique(np.asarray(links.tx_index)[chosen], return_inverse=True)[1] % 2 == 0
-    tuned = field.tuned(gains_of(field, params, told, chosen[half]))
+    tuned = field.with_gains(gains_of(field, params, told, chosen[half]))
     judge = dataclasses.replace(told, spectra=chosen[~half])
     before, after = (dataclasses.replace(judge, field=one).scores(compared="spectra")([params])[0] for one in (field, tuned))
     kept = surely_better(before - after, judge.tx_index(), SURE)
@@ -98,7 +98,7 @@ def _snapshots(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n
 def _said(field: Any, params: Any, prepared: Any, data: Any, spectra: Int[Array, " n"]) -> Complex[Array, "n elements"]:
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
         batch = data.batch(link[None], jax.random.key(0))
-        seen = field.render_links(params, field.plan(params, batch.receiver, prepared=prepared), prepared, batch.links)
+        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
         return seen.snapshots[0]
 
     found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)

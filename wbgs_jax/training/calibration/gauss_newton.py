@@ -183,7 +183,7 @@ def normal_equations(
         batch = data.batch(link[None], jax.random.key(0))
         assert batch.snapshots is not None, "phases are what it looks at"
         asked: Any = jax.tree.map(lambda leaf: leaf[0], batch.links)
-        plan = field.displaced(field.plan(params, batch.receiver, prepared=prepared), motion.of_receiver(asked.receiver_index))
+        plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(asked.receiver_index))
         paths, frequency = prepared.of(asked), asked.query.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
         arrived: Arrivals = arrivals_at(params, plan, paths, frequency)

@@ -116,7 +116,7 @@ def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> t
 def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
     """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
-    return field.prepared_of(prepared, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
+    return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
 @functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
@@ -133,7 +133,7 @@ def _score(
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
-        seen = field.render_links(params, field.plan(params, batch.receiver, prepared), prepared, batch.links)
+        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
         elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
         several = batch.snapshots if elements > 1 else None  # that of a single element tells its power only
         if several is not None and compared == "snapshots" and seen.snapshots is not None:

@@ -133,7 +133,7 @@ def _each_by_itself(params: Any, told: Told) -> tuple[Told, Any]:
     facets = told.field.facets
     source = np.zeros(len(told.field.motion.shift), int)  # of a large mesh, some have lost all of their facets
     source[np.asarray(facets.mover)] = np.asarray(facets.material)
-    thickness = jnp.log(told.field.electrical(params).thickness[source])
+    thickness = jnp.log(told.field.material_properties(params).thickness[source])
     own: Any = jax.tree.map(lambda leaf: leaf[source], params.materials)
     own = dataclasses.replace(own, log_thickness=thickness)
     field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
@@ -194,7 +194,7 @@ def search_clutter(
     judge = np.isin(tx, judges)
     judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.clutter_spectra])
     batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.clutter_steps, BATCH, rng)
-    field = told.field.cluttered()
+    field = told.field.with_absorption()
     clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.prepared, told.data, batches)
     others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)
     before, after = _errors(judged, params), _errors(dataclasses.replace(judged, field=field), others)

@@ -27,7 +27,7 @@ from wbgs_jax.training.calibration.obstacles import search_absent, search_clutte
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
 from wbgs_jax.training.calibration.uncertainty import search_placement
-from wbgs_jax.training.hooks import Context, Edit, Say
+from wbgs_jax.training.hooks import Context, Edit, Hook, Say
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
 """How far a gain may be from the one before, and the steps in which it is tried."""
@@ -62,26 +62,15 @@ def unusual_level(told: Told) -> float:
 
 
 @dataclass(frozen=True)
-class Search:
+class Search(Hook):
     """The hook of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
 
     config: SearchConfig
     stream: int = 6
 
-    def statistics(self, params: Any) -> tuple[()]:
-        """Returns nothing: it watches no step."""
-        return ()
-
-    def accumulate(self, statistics: tuple[()], gradients: Any, probe: Any) -> tuple[()]:
-        """Returns nothing."""
-        return ()
-
     def due(self, step: int, steps: int) -> bool:
         """Returns whether it is before the first step."""
         return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
-
-    def next_size(self, params: Any, step: int, steps: int) -> None:
-        """Returns None: the search is over before an epoch is compiled."""
 
     def apply(
         self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
