@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
         folder = command.run / f"{with_part('pictures', command.part)}{beside}"
         for path in plotting.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
-        if (displaced := trained.field.displaced_surfaces()) is not None:
+        if (displaced := trained.field.inspect(trained.params).displaced_surfaces) is not None:
             console.print(f"picture: {plotting.draw_motion(folder, *displaced)}")
     if command.json:
         print(json.dumps(report, allow_nan=False))

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.fields.base import outputs_of
+from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.inference.answers import Options
 from wbgs_jax.inference.intervals import expect_many
 from wbgs_jax.inference.kriging import for_receiver
@@ -100,7 +100,7 @@ def arrivals_of(trained: Trained, receiver: Receiver, tx_positions: Float[np.nda
 
 @jax.jit
 def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> Arrivals:
-    return field.arrivals(params, plan, query)
+    return paths_of(field, params, plan, query)
 
 
 @jax.jit
@@ -108,7 +108,7 @@ def _link(
     field: Field, params: Any, plan: Any, query: Query, tx_velocity: Any, rx_velocity: Any
 ) -> tuple[Arrivals, Float[jax.Array, " k"]]:
     """Returns the paths of one query, and their Doppler shifts."""
-    found: Any = jax.tree.map(lambda leaf: leaf[0], field.arrivals(params, plan, query))
+    found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))
     return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)
 
 
@@ -204,7 +204,7 @@ def ask_mimo(
 
 @jax.jit
 def _matrix(field: Field, params: Any, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
-    found: Any = jax.tree.map(lambda leaf: leaf[0], field.arrivals(params, plan, query))
+    found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))
     return mimo_matrix(found, receiver, query.frequency_hz[0], elements)
 
 

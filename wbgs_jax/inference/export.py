@@ -27,6 +27,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
+from wbgs_jax.fields.base import portable
 from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, Trained, trained_band
 from wbgs_jax.types import Query, Receiver
@@ -92,7 +93,7 @@ def _metadata(trained: Trained, dataset: Dataset, platforms: Sequence[str]) -> d
 
 def _serialize(trained: Trained, receiver: Receiver, platforms: Sequence[str]) -> bytes:
     """Returns the field with its parameters and plan as constants, for any number of queries."""
-    plan = trained.field.portable(trained.field.plan(trained.params, receiver))
+    plan = portable(trained.field.plan(trained.params, receiver))
     neighbours = for_receiver(trained.neighbours, receiver)
 
     def predict(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> Float[Array, "n 90 360"]:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.fields.base import Output, outputs_of
+from wbgs_jax.fields.base import Output, outputs_of, paths_of
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power
 from wbgs_jax.inference.predictor import BLOCK, Trained, check_power, check_spectra, observe_queries
 from wbgs_jax.propagation.transport import snapshots_from_paths
@@ -96,7 +96,7 @@ def _measured(trained: Trained, plan: Any, query: Query, receiver: Receiver, fun
 
 @partial(jax.jit, static_argnames=("function",))
 def _of_arrivals(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfArrivals) -> Any:
-    arrivals = field.arrivals(params, plan, query)
+    arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
 
 
