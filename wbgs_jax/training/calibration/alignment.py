@@ -14,7 +14,6 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from dataclasses import field as having
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,8 @@ from jaxtyping import Float, Int
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData
@@ -91,10 +92,10 @@ class GeometryReport:
 class Place:
     """A field in which things stand somewhere, with the paths of some transmitters there."""
 
-    field: Any
+    field: Calibratable
     """A field that can be `moved`."""
-    params: Any
-    prepared: Any
+    params: WaveParams
+    prepared: PreparedPaths
     known: Float[np.ndarray, "m 3 3"] | None = None
     """Covariances of where the movers stand (square metres); None where they are not known."""
     likely: Likely | None = None
@@ -318,7 +319,7 @@ def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[di
     return [dict(zip(names, row, strict=True)) for row in rows]
 
 
-def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
+def _retraced(now: Place, params: WaveParams, links: Links, data: TrainingData) -> Place:
     return dataclasses.replace(now, params=params, prepared=now.field.prepare(links, data.receivers))
 
 
@@ -329,7 +330,7 @@ def _doubted(now: Place, spread: float) -> Place:
     return dataclasses.replace(now, params=dataclasses.replace(now.params, placement=spreads))
 
 
-def _fresh(learned: Any, initial: Any) -> Any:
+def _fresh(learned: WaveParams, initial: WaveParams) -> WaveParams:
     """Returns parameters as they were before, but for materials, antennas and how far places are believed."""
     known = {name: getattr(learned, name) for name in ("materials", "placement", *ENDS)}
     return dataclasses.replace(initial, **known)

@@ -11,14 +11,16 @@ spectra that are looked at, and believed where it explains the other half surely
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.fields.losses import GOOD_MATCH
+from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.training.calibration.objective import Told, surely_better
 
 ROUNDS = 20
@@ -47,7 +49,7 @@ class TuningReport:
     """... and of their amplitudes."""
 
 
-def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningReport]:
+def search_tuning(params: WaveParams, told: Told, count: int) -> tuple[Calibratable, TuningReport]:
     """Returns the field with its arrays tuned as training snapshots say, where that is surely better; as it is otherwise.
 
     Args:
@@ -67,13 +69,15 @@ def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningRepor
     return tuned if kept else field, report
 
 
-def _parts(tuned: Any) -> tuple[np.ndarray, np.ndarray]:
+def _parts(tuned: Calibratable) -> tuple[np.ndarray, np.ndarray]:
     """Returns phases (radians) and amplitudes (dB) of all elements."""
     tuning = np.asarray(tuned.tuning, np.float64)
     return tuning[..., 1], 20 / np.log(10) * tuning[..., 0]
 
 
-def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> Complex[np.ndarray, "r elements"]:
+def gains_of(
+    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+) -> Complex[np.ndarray, "r elements"]:
     """Returns the gains of all receivers' elements, 1 where too few snapshots were heard; their mean phase is 0 and their root
     mean square 1, since a common factor says nothing."""
     receiver = np.asarray(told.data.links.receiver_index)[spectra]
@@ -86,7 +90,9 @@ def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]
     return gains
 
 
-def _snapshots(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+def _snapshots(
+    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the snapshots (n, elements) that a field says of some links, and those that were heard."""
     padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeats itself: one shape
     said = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
@@ -95,10 +101,13 @@ def _snapshots(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n
 
 
 @jax.jit
-def _said(field: Any, params: Any, prepared: Any, data: Any, spectra: Int[Array, " n"]) -> Complex[Array, "n elements"]:
+def _said(
+    field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " n"]
+) -> Complex[Array, "n elements"]:
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
         batch = data.batch(link[None], jax.random.key(0))
         seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
+        assert seen.snapshots is not None, "it is coherent"
         return seen.snapshots[0]
 
     found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)

@@ -19,15 +19,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
-from wbgs_jax.fields.coherent_model import arrivals_at, element_gains
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, arrivals_at, element_gains
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.propagation.displacement import Motion, length_terms
+from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import FAINTEST, Arrivals
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.types import Receiver
+from wbgs_jax.types import Links, Receiver
 
 ROUNDS = 3
 """Steps at every frequency."""
@@ -46,9 +48,9 @@ ARM = 3.0
 
 
 def adjust(
-    field: Any,
-    params: Any,
-    prepared: Any,
+    field: Calibratable,
+    params: WaveParams,
+    prepared: PreparedPaths,
     motion: Motion,
     covariance: Float[np.ndarray, "q q"],
     widths: Motion,
@@ -93,7 +95,7 @@ def adjust(
     return back(jnp.asarray(moves, jnp.float32)), np.linalg.inv(precision)
 
 
-def adjusted_numbers(prepared: Any, motion: Motion) -> Int[np.ndarray, " q"]:
+def adjusted_numbers(prepared: PreparedPaths, motion: Motion) -> Int[np.ndarray, " q"]:
     """Returns which numbers of a motion are adjusted, as `ravel_pytree` orders them: those of all receivers, and those of the
     movers that change the lengths of paths most, at most `MOST` of these."""
     movers, size = len(motion.shift), ravel_pytree(motion)[0].size
@@ -117,7 +119,7 @@ def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
 
 
 @partial(jax.jit, static_argnames=("movers", "size"))
-def _felt(prepared: Any, movers: int, size: int) -> Float[Array, " p"]:
+def _felt(prepared: PreparedPaths, movers: int, size: int) -> Float[Array, " p"]:
     """Returns how strongly the lengths of all paths together depend on every number of a motion."""
 
     def add(total: Float[Array, " p"], pair: Any) -> tuple[Float[Array, " p"], None]:
@@ -131,7 +133,7 @@ def _felt(prepared: Any, movers: int, size: int) -> Float[Array, " p"]:
 
 @partial(jax.jit, static_argnames="movers")
 def length_variances(
-    prepared: Any, covariance: Float[Array, "q q"], others: Float[Array, " p"], numbers: Int[Array, " q"], movers: int
+    prepared: PreparedPaths, covariance: Float[Array, "q q"], others: Float[Array, " p"], numbers: Int[Array, " q"], movers: int
 ) -> Float[Array, "pairs k"]:
     """Returns the variances (square metres) of the lengths of all paths.
 
@@ -155,7 +157,9 @@ def length_variances(
     return variances
 
 
-def _terms(prepared: Any, paths: Any, receiver: Int[Array, ""], movers: int) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
+def _terms(
+    prepared: PreparedPaths, paths: TracedPaths, receiver: Int[Array, ""], movers: int
+) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
     """Returns the numbers of a motion of all receivers that all paths to one of them depend on, and the derivatives."""
     terms = [length_terms(some, prepared.surfaces, movers) for some in (paths.specular, paths.diffracted)]
     number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
@@ -164,10 +168,10 @@ def _terms(prepared: Any, paths: Any, receiver: Int[Array, ""], movers: int) -> 
 
 @jax.jit
 def normal_equations(
-    field: Any,
-    params: Any,
+    field: Calibratable,
+    params: WaveParams,
     motion: Motion,
-    prepared: Any,
+    prepared: PreparedPaths,
     data: TrainingData,
     index: Int[Array, "blocks b"],
     variance: Float[Array, "pairs k"],
@@ -182,7 +186,7 @@ def normal_equations(
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))
         assert batch.snapshots is not None, "phases are what it looks at"
-        asked: Any = jax.tree.map(lambda leaf: leaf[0], batch.links)
+        asked: Links = jax.tree.map(lambda leaf: leaf[0], batch.links)
         plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(asked.receiver_index))
         paths, frequency = prepared.of(asked), asked.query.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT

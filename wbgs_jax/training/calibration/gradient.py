@@ -14,6 +14,8 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax.fields.base import compare, heard_alone
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import centres
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
@@ -35,16 +37,16 @@ SEARCHED = ("transmitter", "element", "placement", "thick", "curved")
 
 
 def descend(
-    field: Any,
-    params: Any,
-    prepared: Any,
+    field: Calibratable,
+    params: WaveParams,
+    prepared: PreparedPaths,
     motion: Motion,
     widths: Motion,
     data: TrainingData,
     pool: Int[np.ndarray, " n"],
     count: int,
     rng: np.random.Generator,
-) -> tuple[Any, Motion]:
+) -> tuple[WaveParams, Motion]:
     """Returns parameters and a motion after some steps on spectra up to some frequency.
 
     Args:
@@ -68,22 +70,22 @@ def descend(
 
 @jax.jit
 def _steps(
-    field: Any,
-    params: Any,
+    field: Calibratable,
+    params: WaveParams,
     motion: Motion,
-    prepared: Any,
+    prepared: PreparedPaths,
     data: TrainingData,
     batches: Int[Array, "k b"],
-    rate: Any,
-    unseen: Any,
+    rate: float | Float[Array, ""],
+    unseen: float | Float[Array, ""],
     prior: Motion,
-) -> tuple[Any, Motion]:
+) -> tuple[WaveParams, Motion]:
     """Learns a motion, with materials and corrections beside it, on some batches."""
     others, reach = optax.adam(RATE), _reach(field)
     # Steps of motions shrink to a tenth over the batches.
     shifts = optax.adam(optax.cosine_decay_schedule(1.0, batches.shape[0], 0.1), eps=unseen)
 
-    def objective(learned: Any, index: Int[Array, " b"]) -> Float[Array, ""]:
+    def objective(learned: tuple[WaveParams, Motion], index: Int[Array, " b"]) -> Float[Array, ""]:
         params, metres = learned
         batch = data.batch(index, jax.random.key(0))
         motion = _by(metres, reach)
@@ -110,7 +112,7 @@ def _steps(
     return params, _by(metres, reach)
 
 
-def _reach(field: Any) -> Motion:
+def _reach(field: Calibratable) -> Motion:
     """Returns how far (metres) a motion of 1 metre or radian moves what it moves; the receiver's turn moves no more than phases
     along its array, and counts like metres."""
     facets, movers = field.facets, len(field.motion.shift)

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
 from wbgs_jax._util.statistics import by_transmitter, standard_error
-from wbgs_jax.fields import Field
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch, Links
@@ -40,24 +41,28 @@ dB), as always where they are all that is known. A link on which nothing was hea
 class Scores(Protocol):
     """How badly candidates for all parameters explain some spectra."""
 
-    def __call__(self, candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+    def __call__(self, candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
         """Returns the scores of K candidates on all of the spectra, or on the first so many."""
         ...
 
 
 def make_scores(
-    field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+    field: Calibratable,
+    prepared: PreparedPaths,
+    data: TrainingData,
+    spectra: Int[Array, " n"],
+    compared: Compared = "snapshots",
 ) -> Scores:
     """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
 
     @functools.cache
-    def block(start: int) -> tuple[Any, Batch]:
+    def block(start: int) -> tuple[PreparedPaths, Batch]:
         """Returns what is looked at of so many spectra; the last block repeats its last."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
         return _looked_at(field, prepared, data, own)
 
-    def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+    def score(candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
         room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
         if len(candidates) > room:
             return np.concatenate([score(candidates[:room], first), score(candidates[room:], first)])
@@ -78,8 +83,8 @@ def make_scores(
 class Told:
     """Some training spectra, and what they say of a field with the paths of their transmitters."""
 
-    field: Any
-    prepared: Any
+    field: Calibratable
+    prepared: PreparedPaths
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
     """In the order in which they are looked at."""
@@ -113,7 +118,9 @@ def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> t
 
 
 @jax.jit
-def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
+def _looked_at(
+    field: Calibratable, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " m"]
+) -> tuple[PreparedPaths, Batch]:
     """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
     return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
@@ -121,11 +128,11 @@ def _looked_at(field: Field, prepared: Any, data: TrainingData, spectra: Int[Arr
 
 @functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
 def _score(
-    field: Field,
-    structure: Any,
+    field: Calibratable,
+    structure: jax.tree_util.PyTreeDef,
     differ: tuple[bool, ...],
     leaves: tuple[Array, ...],
-    prepared: Any,
+    prepared: PreparedPaths,
     batches: Batch,
     compared: Compared,
 ) -> Float[Array, "k m"]:

@@ -16,7 +16,8 @@ import numpy as np
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.fields import Field
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas
@@ -38,7 +39,7 @@ SWEEPS = 2
 """Times that antennas are searched anew after materials are named, at most."""
 
 
-def search_gain(params: Any, score: Scores, gain: float = 0.0) -> tuple[Any, float]:
+def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[WaveParams, float]:
     """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB), near one
     that is given: nobody may have said what was transmitted."""
     for reach, step in GAINS_DB:
@@ -73,7 +74,13 @@ class Search(Hook):
         return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
 
     def apply(
-        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+        self,
+        field: Calibratable,
+        params: WaveParams,
+        statistics: tuple[()],
+        context: Context,
+        step: int,
+        rng: np.random.Generator,
     ) -> Edit:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
         bodies that are not there and with its surfaces moved if the mesh is doubtful."""
@@ -136,7 +143,7 @@ class Search(Hook):
             params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
         return Edit(params, (), None, report, field, prepared)
 
-    def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
+    def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
         """Returns parameters with the antennas that are found, and whether there are any."""
         count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
         params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
@@ -144,7 +151,7 @@ class Search(Hook):
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
         return params, bool(found.taken)
 
-    def _tuning(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+    def _tuning(self, params: WaveParams, told: Told, report: dict[str, Any]) -> Calibratable:
         """Returns the field with arrays that are out of tune as spectra say, which takes two transmitters."""
         count = self.config.tuning_spectra
         if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
@@ -153,7 +160,9 @@ class Search(Hook):
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
 
-    def _clutter(self, params: Any, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say) -> tuple[Any, Any]:
+    def _clutter(
+        self, params: WaveParams, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say
+    ) -> tuple[WaveParams, Calibratable]:
         """Returns parameters and field with what stands in the way and is not in the mesh."""
         if not self.config.clutter_spectra:
             return params, told.field
@@ -163,7 +172,7 @@ class Search(Hook):
             report["clutter"] = dataclasses.asdict(found)
         return params, told.field
 
-    def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+    def _idealisations(self, params: WaveParams, told: Told, report: dict[str, Any]) -> WaveParams:
         """Returns parameters without the idealisations that spectra contradict."""
         params, found = search_idealisations(params, told, self.config)
         named = {name: dataclasses.asdict(one) for name, one in found.items()}
