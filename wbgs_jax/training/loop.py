@@ -9,7 +9,7 @@ it is there, or waited for.
 
 One training run: its state, its epochs, and what is done to the field between them.
 
-What a field is made of is the field's business; a run knows the seam alone (`fields.base.Field`).
+What a field is made of is the field's business; a run knows the interface alone (`fields.base.Field`).
 """
 
 import dataclasses
