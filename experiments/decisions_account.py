@@ -30,7 +30,7 @@ from wbgs_jax.training import fit_kriging
 from wbgs_jax.training.calibration import alignment, array_gains, obstacles, propagation_options, thickness
 from wbgs_jax.training.calibration.objective import surely_better
 from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, choose_share
-from wbgs_jax.training.loop import CALIBRATED
+from wbgs_jax.training.loop import VALIDATION_LINKS
 
 COUNTS = (3, 10, 30, 100)
 """Transmitters that decide."""
@@ -69,7 +69,7 @@ def decisions() -> tuple[Decision, ...]:
         Decision("geometry", search.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
         Decision("clutter", search.clutter_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
         Decision("noise floor", mixture.COMPARED, "validation", mixture.SURE, "none"),
-        Decision("shares of the two fields by query", CALIBRATED, "validation", 1.0, "one share for all"),
+        Decision("shares of the two fields by query", VALIDATION_LINKS, "validation", 1.0, "one share for all"),
         Decision("residuals of neighbours", fit_kriging.SCORED, "validation", fit_kriging.SURE, "not used; never below 20"),
         Decision("share of a field beside simple methods", 10_000, "validation", ERRORS, "the simple methods"),
         Decision("... of a field that follows paths", 10_000, "validation", ERRORS_WITH_PATHS, "the simple methods"),

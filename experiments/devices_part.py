@@ -25,7 +25,7 @@ from wbgs_jax.data.load import load_dataset
 from wbgs_jax.data.splits import fewer_transmitters, hold_out_validation
 from wbgs_jax.fields import get_field
 from wbgs_jax.training import loop
-from wbgs_jax.training.hooks import Context
+from wbgs_jax.training.hooks import Context, probe_of
 from wbgs_jax.training.step import loss_and_gradients
 
 STEPS, EVERY, BATCH, TRANSMITTERS = 40, 5, 8, 24
@@ -39,7 +39,7 @@ COLLECTIVES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "
 
 def settings_of(field: str, batch: int = BATCH) -> Settings:
     """Returns those of the `cpu` preset, with few steps, one density control and no search, whose time is not the devices'."""
-    density = {"density": {"every": 20, "start": 20}} if any("density" in name for name in get_field(field).controls) else {}
+    density = {"density": {"every": 20, "start": 20}} if any("density" in name for name in get_field(field).hooks) else {}
     preset = changed(get_field(field).presets["cpu"], density | {"optim": {"steps": STEPS, "batch": batch, "min_steps": STEPS}})
     return changed(preset, {"loop": {"epoch_steps": EVERY, "evaluate_every": STEPS, "checkpoint_every": STEPS}})
 
@@ -64,18 +64,19 @@ def make_run(field: str, folder: Path, batch: int = BATCH) -> loop.Run:
 def arguments_of(run: loop.Run) -> tuple[Any, ...]:
     """Returns what a step's gradients are made of."""
     index = jnp.asarray(run.batches(0, 1)[0])
-    return run.devices.replicated((run.field, run.state.params, run.cache, run.data, index, run.key))
+    return run.devices.replicated((run.field, run.state.params, run.prepared, run.data, index, run.key))
 
 
 def exchanged(run: loop.Run) -> dict[str, Any]:
     """Returns the collectives of a step's compiled gradients and its operations a device: with links divided by `shard_map`, as
     the library does, with `jit` left to divide them, and on one device."""
     assert run.devices.mesh is not None
+    probe = probe_of(run.hooks, run.state.params)
     by_links = NamedSharding(run.devices.mesh, PartitionSpec(AXIS))
 
     def step(mesh: Any, divide: Callable[[Any], Any]) -> Callable[..., Any]:
-        def gradients(field, params, cache, data, index, key):
-            return loss_and_gradients(field, params, cache, data, divide(index), run.limits, key, mesh)
+        def gradients(field, params, prepared, data, index, key):
+            return loss_and_gradients(field, params, prepared, data, divide(index), run.capacity, key, mesh, probe)
 
         return gradients
 
@@ -123,7 +124,7 @@ def parts(field: str, folder: Path) -> dict[str, Any]:
         run = make_run(field, folder, batch)
         step[str(batch)] = seconds(_gradients(run))
     slope, shared = np.polyfit(BATCHES, list(step.values()), 1)
-    trained = [*jax.tree.leaves(run.state.params), *jax.tree.leaves(run.field.probe(run.state.params))]
+    trained = [*jax.tree.leaves(run.state.params), *jax.tree.leaves(probe_of(run.hooks, run.state.params))]
     state = sum(leaf.nbytes for leaf in jax.tree.leaves(run.state))
     return {
         "step_s": step,
@@ -131,7 +132,7 @@ def parts(field: str, folder: Path) -> dict[str, Any]:
         "shared_s": max(float(shared), 0.0),
         "gradient_bytes": sum(leaf.nbytes for leaf in trained),
         "state_bytes": int(state),
-        "data_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves((run.cache, run.data.links, run.data.snapshots))),
+        "data_bytes": sum(leaf.nbytes for leaf in jax.tree.leaves((run.prepared, run.data.links, run.data.snapshots))),
         "checkpoint_s": seconds(run.save),
         "evaluation_s": seconds(run.evaluate),
         "control_s": seconds(lambda: _control(run)),
@@ -140,19 +141,19 @@ def parts(field: str, folder: Path) -> dict[str, Any]:
 
 def _gradients(run: loop.Run) -> Callable[[], Any]:
     """Returns a call that computes the gradients of a batch."""
-    given, limits = arguments_of(run), run.limits
+    given, capacity, probe = arguments_of(run), run.capacity, probe_of(run.hooks, run.state.params)
 
     @jax.jit
-    def gradients(field, params, cache, data, index, key):
-        return loss_and_gradients(field, params, cache, data, index, limits, key)
+    def gradients(field, params, prepared, data, index, key):
+        return loss_and_gradients(field, params, prepared, data, index, capacity, key, None, probe)
 
     return lambda: jax.block_until_ready(gradients(*given))
 
 
 def _control(run: loop.Run) -> None:
-    for number, control in enumerate(run.controls):
-        context = Context(run.data, run.cache, run.dataset.train)
-        control.apply(run.field, run.state.params, run.state.statistics[number], context, 20, np.random.default_rng(0))
+    for number, hook in enumerate(run.hooks):
+        context = Context(run.data, run.prepared, run.dataset.train)
+        hook.apply(run.field, run.state.params, run.state.statistics[number], context, 20, np.random.default_rng(0))
 
 
 def reverse_batches() -> None:

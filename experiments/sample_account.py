@@ -25,7 +25,8 @@ from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.scene import in_sight
 from wbgs_jax.evaluation.report import environment
-from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields import Observation
+from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.training.batches import training_data
@@ -93,12 +94,12 @@ def keep(prepared: wave.PreparedPaths, mask: np.ndarray) -> wave.PreparedPaths:
 
 
 @jax.jit
-def observe(field: Field, params: Any, plan: Any, prepared: wave.PreparedPaths, links: Links) -> Observation:
+def observe(field: Calibratable, params: Any, plan: Any, links: Links) -> Observation:
     """Returns what the field says of links whose paths are given."""
-    return field.render_links(params, plan, prepared, links)
+    return field.render(params, plan, links)._replace(paths=None)
 
 
-def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tuple[AntennaReport, Any]:
+def antennas(dataset: Dataset, field: Calibratable, prepared: wave.PreparedPaths) -> tuple[AntennaReport, Any]:
     """Returns the antennas that explain the training spectra best, and parameters that hold them."""
     data, params = training_data(dataset), field.init(jax.random.key(0))
     some = np.random.default_rng(0).permutation(dataset.train)[:SEARCHED]
@@ -107,13 +108,13 @@ def antennas(dataset: Dataset, field: Field, prepared: wave.PreparedPaths) -> tu
     return report, params
 
 
-def ssim(dataset: Dataset, field: Field, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
+def ssim(dataset: Dataset, field: Calibratable, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
     """Returns the score of every spectrum."""
     found = []
-    plan = field.plan(params, dataset.receiver(), cache=prepared)
+    plan = field.plan(params, dataset.receiver(), prepared)
     for start in range(0, len(dataset), AT_ONCE):
         index = np.arange(start, min(start + AT_ONCE, len(dataset)))
-        seen = observe(field, params, plan, prepared, dataset.links(index))
+        seen = observe(field, params, plan, dataset.links(index))
         found.append(metrics.ssim(np.asarray(seen.pas), np.asarray(dataset.pas(index))))
     return np.concatenate(found)
 

@@ -99,14 +99,14 @@ FIELDS["hybrid"] = HybridConfig(FIELDS["wave"], FIELDS["wideband"])
 
 def tiny_settings(field_name: str = "wideband", **changes) -> Settings:
     """Settings that train within seconds; keywords replace values of a section: `field={"width": 4}`."""
-    controls = [name.rpartition(".")[2] for name in get_field(field_name).controls]
+    hooks = [name.rpartition(".")[2] for name in get_field(field_name).hooks]
     settings = Settings(
         field=FIELDS[field_name],
         optim=OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0),
         loop=LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2),
-        density=DensityConfig(every=0, reset_every=0) if "density" in controls else None,
+        density=DensityConfig(every=0, reset_every=0) if "density" in hooks else None,
         search=SearchConfig(rounds=0, antenna_rounds=0, absent_spectra=0, geometry=False, clutter_spectra=0)
-        if "search" in controls
+        if "search" in hooks
         else None,
     )
     return changed(settings, changes)

@@ -49,27 +49,27 @@ class ToyField(wb.Field):
 
     name: ClassVar[str] = "toy"
     presets: ClassVar = with_field(PRESETS, dict.fromkeys(PRESETS, ToyConfig()))
-    gives: ClassVar = ("pas", "power")
+    outputs: ClassVar = ("pas", "power")
 
     @classmethod
-    def make(cls, config, scene, seed):
+    def build(cls, config, scene, seed):
         return cls(scene.receivers.position, config)
 
     def init(self, key):
         n = len(self.positions)
         return {"image": self.config.brightness + 0.01 * jax.random.normal(key, (n, 90, 360)), "power_db": jnp.zeros(n)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         nearest = jnp.argmin(jnp.sum((self.positions - receiver.position) ** 2, -1))
         return jax.tree.map(lambda leaf: leaf[nearest], params)
 
-    def render(self, params, plan, query):
-        n = query.frequency_hz.shape[0]
+    def render(self, params, plan, links):
+        n = links.frequency_hz.shape[0]
         return wb.Observation(jnp.tile(plan["image"], (n, 1, 1)), power_db=jnp.tile(plan["power_db"], n))
 
     @classmethod
-    def groups(cls, config):
-        return {"all": Group(config.learning_rate)}
+    def param_groups(cls, config, params=None):
+        return {"all": Group(config.learning_rate)}, super().param_groups(config, params)[1]
 
 
 STEPS, STOP = 8, 4
@@ -286,10 +286,10 @@ def test_what_it_does_not_know_is_an_error_for_people(tmp_path):
     @wb.pytree
     class Blind(ToyField):
         name: ClassVar[str] = "blind"
-        gives: ClassVar = ("pas",)
+        outputs: ClassVar = ("pas",)
 
-        def render(self, params, plan, query):
-            return wb.Observation(super().render(params, plan, query).pas)
+        def render(self, params, plan, links):
+            return wb.Observation(super().render(params, plan, links).pas)
 
     save_scene(tmp_path / "power.npz", tiny_scene(kind="power"))
     wb.register(Blind)

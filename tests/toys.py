@@ -39,21 +39,25 @@ class RippleField(Field):
     name: ClassVar[str] = "ripple"
     presets: ClassVar = with_field(PRESETS, dict.fromkeys(PRESETS, RippleConfig()))
 
+    @classmethod
+    def build(cls, config, scene, seed):
+        return cls(config)
+
     def init(self, key):
         return {"level": 0.1 * jax.random.normal(key, (4,)), "tilt": jnp.zeros(3)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         return receiver.position
 
-    def render(self, params, plan, query):
+    def render(self, params, plan, links):
         ripples = jnp.cos(jnp.arange(4)[:, None] * jnp.linspace(-jnp.pi, jnp.pi, 360))
-        brightness = (query.tx_position - plan) @ params["tilt"]
+        brightness = (links.tx_position - plan) @ params["tilt"]
         rows = jax.nn.sigmoid(params["level"] @ ripples + brightness[:, None])
         return Observation(jnp.broadcast_to(rows[:, None], (len(rows), 90, 360)))
 
     @classmethod
-    def groups(cls, config):
-        return {"all": Group(config.learning_rate)}
+    def param_groups(cls, config, params=None):
+        return {"all": Group(config.learning_rate)}, super().param_groups(config, params)[1]
 
 
 @pytree
@@ -68,9 +72,12 @@ class NoisyField(RippleField):
 
 @dataclass(frozen=True)
 class Room:
-    """Limits of `SwellingField`."""
+    """Capacity of `SwellingField`."""
 
     size: int
+
+    def grown_to(self, others):
+        return Room(max(self.size, others.size) + 10)
 
 
 @pytree
@@ -83,16 +90,13 @@ class SwellingField(RippleField):
     def required(params):
         return jnp.ceil(20 * jnp.max(jnp.abs(params["level"]))).astype(jnp.int32)[None]
 
-    def limits(self, params, receivers):
-        return Room(int(self.required(params)[0]))
+    def capacity(self, params, receivers, required=None):
+        return Room(int((self.required(params) if required is None else required)[0]))
 
-    def grow(self, limits, required):
-        return Room(max(limits.size, int(required[0])) + 10)
-
-    def loss(self, params, cache, batch, limits=None, probe=()):
-        loss, aux = super().loss(params, cache, batch, limits, probe)
+    def loss(self, params, prepared, batch, capacity=None, probe=None):
+        loss, aux = super().loss(params, prepared, batch, capacity, probe)
         required = self.required(params)
-        return loss, aux._replace(required=required, overflow=required[0] > limits.size)
+        return loss, aux._replace(required=required, overflow=required[0] > capacity.size)
 
 
 @pytree
@@ -101,9 +105,9 @@ class CuspField(RippleField):
 
     name: ClassVar[str] = "cusp"
 
-    def render(self, params, plan, query):
+    def render(self, params, plan, links):
         flat = jnp.sqrt(0 * params["level"][0])
-        return Observation(jnp.full((query.frequency_hz.shape[0], 90, 360), 0.5) + flat)
+        return Observation(jnp.full((links.frequency_hz.shape[0], 90, 360), 0.5) + flat)
 
 
 @contextlib.contextmanager
@@ -119,7 +123,7 @@ def registered(*fields: type[Field]) -> Iterator[None]:
 
 
 def toy_settings(**changes: Any) -> Settings:
-    """As `synthetic.tiny_settings`, of a toy field without host controls."""
+    """As `synthetic.tiny_settings`, of a toy field without hooks."""
     loop = LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2)
     return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0), loop), changes)
 

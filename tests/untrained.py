@@ -32,7 +32,7 @@ class State:
 
 def make_field() -> Field:
     """60 Gaussians in the room of `tiny_scene`."""
-    return WidebandField.make(SETTINGS.field, DatasetScene(tiny_dataset()), 0)
+    return WidebandField.build(SETTINGS.field, DatasetScene(tiny_dataset()), 0)
 
 
 def make_params() -> WidebandParams:
@@ -60,7 +60,7 @@ def make_coherent_run(folder: Path, source: str = "") -> Path:
     settings = tiny_settings("wave", field={"specular_kept": 16, "diffracted_tried": 32, "diffracted_kept": 8})
     config = RunConfig(str(scene), "wave", "smoke", 0, None, settings)
     write_config(folder, config)
-    field = WaveField.make(settings.field, DatasetScene(config.dataset()), 0)
+    field = WaveField.build(settings.field, DatasetScene(config.dataset()), 0)
     state = State(field.init(jax.random.key(0)))
     checkpoint.save(folder / "checkpoints", STEP, state, field, {"limits": None, "seconds": 1.0}, keep=1)
     return folder

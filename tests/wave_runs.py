@@ -61,6 +61,6 @@ def heard_in(run, params, tx_positions, frequencies_hz):
 
 
 @jax.jit
-def snapshots(params, plan, cache, links):
+def snapshots(params, plan, prepared, links):
     """What the coherent field says of links of one receiver whose paths are prepared."""
-    return coherent.path_snapshots(params, plan, cache.of(links), links.query.frequency_hz)
+    return coherent.path_snapshots(params, plan, prepared.of(links), links.query.frequency_hz)

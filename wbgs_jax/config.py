@@ -1,7 +1,7 @@
 """Settings of a training that every field shares; what belongs to one field stands in its own file under `fields/`.
 
-A run's settings are those of its field, of the optimiser, of the host loop, and of the host controls that the field asks
-for. All can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. The paper's own
+A run's settings are those of its field, of the optimiser, of the host loop, and of the hooks that the field asks for. All
+can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. The paper's own
 values are the wideband field's preset `paper`; docs/history.md says what was measured.
 """
 

@@ -84,6 +84,11 @@ class Query:
     """World frame, metres."""
     frequency_hz: Float[Array, "*b"]
 
+    @property
+    def query(self) -> "Query":
+        """Itself: what is asked of links of which nothing else is known."""
+        return self
+
 
 @pytree
 class Links:
@@ -94,6 +99,16 @@ class Links:
     """Which of the dataset's receivers."""
     tx_index: Int[Array, "*b"]
     """Which of the dataset's transmitters: links of one position share it."""
+
+    @property
+    def tx_position(self) -> Float[Array, "*b 3"]:
+        """World frame, metres."""
+        return self.query.tx_position
+
+    @property
+    def frequency_hz(self) -> Float[Array, "*b"]:
+        """Hertz."""
+        return self.query.frequency_hz
 
 
 @pytree

@@ -71,7 +71,7 @@ def train(effort: Effort, folder: Path) -> Curve:
         begin = time.perf_counter()
         with compilations(curve.compiled):
             run.epoch()
-            run.control()
+            run.run_hooks()
         spent += time.perf_counter() - begin
         curve.seconds.append(spent)
         curve.ssim.append(run.evaluate()["held_out_ssim"])

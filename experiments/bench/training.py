@@ -25,6 +25,7 @@ from wbgs_jax.fields import get_field, wideband
 from wbgs_jax.fields.losses import image_loss
 from wbgs_jax.splat import GeometryPlan, geometry_plan, render_splats
 from wbgs_jax.training.batches import limited
+from wbgs_jax.training.hooks import probe_of
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients
 
@@ -61,7 +62,7 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
     index = jnp.asarray(run.batches(0, 1)[0])
 
     def plan(params):
-        return geometry_plan(params.gaussians, receiver, run.limits, run.settings.field.projection)
+        return geometry_plan(params.gaussians, receiver, run.capacity, run.settings.field.projection)
 
     def networks(params, query, planned):
         return wideband.em_features(params, planned, query)
@@ -73,10 +74,12 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         return image_loss(image, data.pas(index), weight)[0]
 
     def forward(params, query, data):
-        return loss(wideband.render(params, field.plan(params, receiver, run.limits), query), data)
+        return loss(wideband.render(params, field.plan(params, receiver, None, run.capacity), query), data)
 
     def gradient(params, data):
-        return loss_and_gradients(field, params, run.cache, data, index, run.limits, run.key)
+        return loss_and_gradients(
+            field, params, run.prepared, data, index, run.capacity, run.key, None, probe_of(run.hooks, params)
+        )
 
     def optimiser(gradients, state):
         updates, moments = run.optimizer.update(gradients, state.optimizer, state.params)

@@ -26,6 +26,8 @@ from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.inference.intervals import FEATURES, POWER_FEATURES, Confidence, PowerConfidence
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training.batches import TrainingData, training_data
+from wbgs_jax.training.hooks import probe_of
+from wbgs_jax.training.loop import make_hook
 
 ON_THE_HOST = frozenset(
     """
@@ -198,7 +200,7 @@ class Known:
     data: TrainingData
     field: Any
     params: Any
-    limits: Any
+    capacity: Any
     index: Any
     """Some training links."""
 
@@ -206,6 +208,12 @@ class Known:
     def query(self) -> Any:
         """Of these links."""
         return self.dataset.query(np.asarray(self.index))
+
+    @property
+    def probe(self) -> Any:
+        """Of its hooks."""
+        hooks = (make_hook(name, self.settings) for name in self.field.hooks)
+        return probe_of([hook for hook in hooks if hook is not None], self.params)
 
 
 @functools.cache
@@ -221,11 +229,11 @@ def known(name: str) -> Known:
     both = {"wave": TINY_WAVE, "wideband": TINY}
     settings = get_field(name).presets["smoke"]
     settings = _both(settings, both) if name == "hybrid" else changed(settings, {"field": TINY_FIELDS.get(name, {})})
-    field = get_field(name).make(settings.field, DatasetScene(dataset), SEED)
+    field = get_field(name).build(settings.field, DatasetScene(dataset), SEED)
     rng = np.random.default_rng(SEED)
     params = jax.tree.map(lambda a: a + jnp.asarray(rng.normal(0, 0.02, a.shape), a.dtype), field.init(jax.random.key(SEED)))
     return Known(
-        settings, dataset, data, field, params, field.limits(params, dataset.receivers), jnp.asarray(dataset.train[:B])
+        settings, dataset, data, field, params, field.capacity(params, dataset.receivers), jnp.asarray(dataset.train[:B])
     )
 
 
@@ -239,17 +247,17 @@ def of_field(name: str) -> list[Case]:
     """Returns the cases of a field: its initial parameters, the loss of a batch, and spectra."""
     of, query = known(name), known(name).query
     batch = of.data.batch(of.index, jax.random.key(SEED))
-    cache = of.field.prepare(batch.links, of.data.receivers)
+    prepared = of.field.prepare(batch.links, of.data.receivers)
 
     def loss(params: Any, probe: Any) -> Any:
-        return of.field.loss(params, cache, batch, of.limits, probe)[0]
+        return of.field.loss(params, prepared, batch, of.capacity, probe)[0]
 
     def init(seed: Any) -> Any:
         return of.field.init(jax.random.key(seed))
 
     return [
         Case(f"{name}:init", init, (jnp.asarray(SEED),), ()),
-        Case(f"{name}:loss", loss, (of.params, of.field.probe(of.params))),
+        Case(f"{name}:loss", loss, (of.params, of.probe)),
         *([Case(f"pas:{name}", _pas(of), (of.params, query.tx_position), (0, 1))] if name not in COHERENT else []),
         *(
             [Case(f"{name}:render", _render(of), (of.params, query.tx_position), (0, 1), costly=True)]
@@ -262,7 +270,7 @@ def of_field(name: str) -> list[Case]:
 
 def _pas(of: Known) -> Callable[..., Any]:
     receiver = of.dataset.receiver()
-    return lambda params, place: wb.pas(of.field, params, receiver, wb.make_query(place, of.query.frequency_hz), of.limits)
+    return lambda params, place: wb.pas(of.field, params, receiver, wb.make_query(place, of.query.frequency_hz), of.capacity)
 
 
 def _render(of: Known) -> Callable[..., Any]:

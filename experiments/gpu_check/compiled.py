@@ -105,11 +105,11 @@ def epoch(place: Any, slots: int, changes: dict[str, Any]) -> dict[str, float]:
     params = run.state.params
     gaussians = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((slots, *leaf.shape[1:]), leaf.dtype), params.gaussians)
     params = dataclasses.replace(jax.eval_shape(lambda tree: tree, params), gaussians=gaussians)
-    state = jax.eval_shape(lambda params: init_state(params, run.optimizer, run.controls), params)
-    limits = TileLimits(8192, 1024, GPU_TILING.height, GPU_TILING.width).scaled(slots / 1024)
+    state = jax.eval_shape(lambda params: init_state(params, run.optimizer, run.hooks), params)
+    capacity = TileLimits(8192, 1024, GPU_TILING.height, GPU_TILING.width).scaled(slots / 1024)
     batches = jnp.asarray(run.batches(0, settings.loop.epoch_steps))
-    given = state, run.field, run.cache, run.data, batches, jnp.zeros((), jnp.int32), run.key
-    static = {"optimizer": run.optimizer, "controls": run.controls, "limits": limits, "branches": False}
+    given = state, run.field, run.prepared, run.data, batches, jnp.zeros((), jnp.int32), run.key
+    static = {"optimizer": run.optimizer, "hooks": run.hooks, "capacity": capacity, "branches": False}
     stopped = shapes_on(place, jnp.zeros((), bool))
     return compiled(run_epoch.trace(*shapes_on(place, given), **static, stopped=stopped))
 

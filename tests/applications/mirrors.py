@@ -24,15 +24,19 @@ class MirrorsField(Field):
     images: int = static(default=5)
 
     name: ClassVar[str] = "mirrors"
-    gives: ClassVar = ("pas", "snapshots", "power", "paths")
+    outputs: ClassVar = ("pas", "snapshots", "power", "paths")
+
+    @classmethod
+    def build(cls, config, scene, seed):
+        return cls(config)
 
     def init(self, key):
         return {"loss": jnp.float32(0.5)}
 
-    def plan(self, params, receiver, limits=None, cache=None):
+    def plan(self, params, receiver, prepared=None, capacity=None):
         return receiver
 
-    def anywhere(self, params):
+    def receiver_independent(self, params):
         return self, params
 
     def waves(self, params, plan, query):
@@ -51,14 +55,11 @@ class MirrorsField(Field):
         weighted = waves * (power / power.sum(-1, keepdims=True))[..., None] / 16
         covariance = jnp.einsum("bke,bkf->bef", weighted, waves.conj())
         pas = covariance_to_pas(covariance, BEAMS)
-        return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance)
-
-    def arrivals(self, params, plan, query):
-        away, power = self.waves(params, plan, query)
-        distance, amplitude = jnp.linalg.norm(away, axis=-1), jnp.sqrt(power).astype(jnp.complex64)
+        amplitude = jnp.sqrt(power).astype(jnp.complex64)
         polarised = jnp.stack([amplitude, 0 * amplitude], -1)
         met = jnp.zeros((*distance.shape, 5), jnp.int32).at[:, 1:, 0].set(REFLECTED)
-        return Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
+        paths = Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
+        return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance, paths)
 
 
 @dataclass(frozen=True)
@@ -85,4 +86,4 @@ def trained(images=5) -> Trained:
 class Blind(MirrorsField):
     """One that knows no paths."""
 
-    gives: ClassVar = ("pas", "snapshots", "power")
+    outputs: ClassVar = ("pas", "snapshots", "power")

@@ -154,7 +154,7 @@ def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_r
 class Silent(MirrorsField):
     """Spectra alone."""
 
-    gives: ClassVar = ("pas",)
+    outputs: ClassVar = ("pas",)
 
 
 def test_the_descent_finds_the_least_squares_of_a_line_and_stays_in_its_box(rng):

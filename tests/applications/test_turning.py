@@ -69,7 +69,7 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     orientation = boresight_quaternion(jnp.asarray(angles, jnp.float32))
     plan = field.plan(params, make_receiver(RX, orientation, np.zeros((1, 3)), pattern=pattern))
     query = Query(jnp.asarray(tx, jnp.float32), jnp.full(2, HZ, jnp.float32))
-    said = jax.jit(field.render)(field.blurred(params, 0.5), plan, query).power_db
+    said = jax.jit(field.render)(field.smoothed(params, 0.5), plan, query).power_db
     np.testing.assert_allclose(turned[0], said, atol=0.05)
 
 

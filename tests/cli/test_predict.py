@@ -119,7 +119,7 @@ class HearingField(RippleField):
     """Knows powers and snapshots, and no paths."""
 
     name: ClassVar[str] = "hearing"
-    gives: ClassVar = ("pas", "power", "snapshots")
+    outputs: ClassVar = ("pas", "power", "snapshots")
 
     def render(self, params, plan, query):
         power_db = -60 + query.tx_position[:, 0] + query.frequency_hz / 1e9

@@ -15,7 +15,7 @@ from experiments.settings import settings
 from experiments.tables import figure8, table1, table2
 from wbgs_jax.config import check
 from wbgs_jax.data.scene_file import save_scene
-from wbgs_jax.fields import get_field
+from wbgs_jax.fields.base import check_config
 
 JOBS = unique_jobs()
 TRAINED = [job for job in JOBS if job.field != BASELINES]
@@ -127,7 +127,7 @@ def test_all_settings_can_work_and_have_the_steps_of_the_profile(profile):
     for job in {(job.field, job.variant, job.scene): job.sized(profile) for job in TRAINED}.values():
         chosen = settings(job)
         check(chosen)
-        get_field(job.field).check(chosen.field)
+        check_config(job.field, chosen.field)
         assert chosen.optim.min_steps == chosen.optim.steps  # no data set cuts them
         if job.field in ONE_FREQUENCY:
             block, share = chosen.loop.epoch_steps, size.steps * job.budget / len(job.test_ghz)

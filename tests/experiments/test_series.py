@@ -14,7 +14,7 @@ from experiments.settings import settings
 from experiments.tables import faults
 from experiments.variants import OPTIMIZERS, VARIANTS
 from wbgs_jax.config import check
-from wbgs_jax.fields import get_field
+from wbgs_jax.fields.base import check_config
 
 JOBS = unique_jobs(tuple(SERIES))
 KINDS = {(job.field, job.variant, job.profile): job for job in JOBS if job.field != BASELINES}
@@ -24,7 +24,7 @@ KINDS = {(job.field, job.variant, job.profile): job for job in JOBS if job.field
 def test_a_change_is_one_and_can_work(job):
     variant, chosen, usual = VARIANTS[job.variant], settings(job), settings(dataclasses.replace(job, variant=""))
     check(chosen)
-    get_field(job.field).check(chosen.field)
+    check_config(job.field, chosen.field)
     assert chosen.optim.steps == (variant.steps or variant.budget * usual.optim.steps) == chosen.optim.min_steps
     for section, values in variant.changes.items():
         assert values.items() <= vars(getattr(chosen, section)).items()

@@ -87,13 +87,13 @@ def field_of(name):
 def total_of(name, field=None):
     """The weighted sum of all pixels as a function, and the spectra."""
     field, position = field or field_of(name), jnp.asarray(np.array(RX))
-    limits = LIMITS if name in ("wideband", "wrfgs") else None
+    capacity = LIMITS if name in ("wideband", "wrfgs") else None
 
     def total(arguments, weights):
         params, receiver, query = arguments
         if name.startswith("wave"):  # found on the host: neither field nor position can be traced
             receiver = dataclasses.replace(receiver, position=position)
-        spectra = fields.pas(field, params, receiver, query, limits)
+        spectra = fields.pas(field, params, receiver, query, capacity)
         return jnp.sum(spectra * weights), spectra
 
     return total
@@ -256,7 +256,7 @@ def test_a_plan_from_outside_has_the_wrong_gradient(rng, x64):
     arguments, weights = random_arguments(rng, "wideband"), rng.normal(size=(2, 90, 360))
     field, (params, receiver, query) = field_of("wideband"), jax.tree.map(jnp.asarray, arguments)
     _, (right, _, _) = differentiated("wideband")(arguments, weights)
-    plan = jax.jit(lambda params: field.plan(params, receiver, LIMITS))(params)
+    plan = jax.jit(lambda params: field.plan(params, receiver, capacity=LIMITS))(params)
 
     @jax.jit
     @jax.grad

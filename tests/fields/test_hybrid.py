@@ -10,13 +10,17 @@ from synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation
-from wbgs_jax.fields import get_field, hybrid
+from wbgs_jax.fields import get_field
 from wbgs_jax.fields import mixture as noise
-from wbgs_jax.fields.hybrid import HybridField, Trust, _informed, _Seen
+from wbgs_jax.fields.base import outputs_of, paths_of
+from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
 from wbgs_jax.fields.mixture import FEATURES, Opinions, Shares, constant, reported, with_floor, without_floor
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.radio.array import snapshot_to_pas
+from wbgs_jax.training import expert_weights
+from wbgs_jax.training.expert_weights import ExpertWeights, Seen
+from wbgs_jax.training.hooks import Context, probe_of
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.run_folder import load_trained, prepare_folder
 
@@ -40,6 +44,13 @@ def trusting(params, spectra, power):
     """Each given as the share of the coherent field over the splatting one's own opinion, and of both over the informed one."""
     trust = Trust(*(Shares(*map(constant, pair)) for pair in (spectra, power)), jnp.zeros(()))
     return dataclasses.replace(params, trust=trust)
+
+
+def weighted(run, params, batches):
+    """Parameters with the shares that some batches tell, and the report."""
+    context = Context(run.data, run.prepared, run.dataset.train, validation=lambda: batches)
+    edit = ExpertWeights().apply(run.field, params, (), context, 4, None)
+    return edit.params, edit.report
 
 
 def opinions(run, params, index):
@@ -80,7 +91,7 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     truth = share * wave.pas + (1 - share) * own.pas
     power = share * wave.power_db + (1 - share) * informed.power_db
     batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
-    found, report = run.field.calibrate(params, run.cache, [batch])
+    found, report = weighted(run, params, [batch])
     spectra, powers = found.trust.spectra, found.trust.power
     assert not any(np.any(one.weights) for one in (spectra.coherent, spectra.uninformed, powers.coherent))  # few transmitters
     assert float(jax.nn.sigmoid(spectra.coherent.bias)) == pytest.approx(share, abs=0.05)
@@ -109,24 +120,22 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
 
     own = jnp.mean(jnp.stack([drawn() for _ in range(10)]), 0)
     own = own / own.max((1, 2), keepdims=True)
-    said = _Seen(
-        Opinions(seen.pas, own, own), Opinions(*3 * (seen.power_db,)), jnp.zeros((len(index), FEATURES)), drawn(), None
-    )
+    said = Seen(Opinions(seen.pas, own, own), Opinions(*3 * (seen.power_db,)), jnp.zeros((len(index), FEATURES)), drawn(), None)
 
     def opinions_without_floor(field, given, *_):
         assert float(given.trust.floor) == 0  # or it would be found in what is left of it
         return said
 
-    monkeypatch.setattr(hybrid, "_opinions", opinions_without_floor)
+    monkeypatch.setattr(expert_weights, "opinions_on", opinions_without_floor)
     monkeypatch.setattr(noise, "FEWEST_TX", 5)
-    found, report = run.field.calibrate(params, run.cache, [batch])
+    found, report = weighted(run, params, [batch])
     assert report["noise_floor"] == pytest.approx(float(found.trust.floor))
     assert found.trust.floor > 1e-3
     assert float(run.field.as_observed(found, jnp.zeros((1, 90, 360))).min()) > 0.03
-    again, _ = run.field.calibrate(found, run.cache, [batch])
+    again, _ = weighted(run, found, [batch])
     assert float(again.trust.floor) == float(found.trust.floor)
-    monkeypatch.setattr(hybrid, "floor_of", lambda *_: 0.0)
-    without, _ = run.field.calibrate(params, run.cache, [batch])
+    monkeypatch.setattr(expert_weights, "floor_of", lambda *_: 0.0)
+    without, _ = weighted(run, params, [batch])
     trusted, less = (report_of(p, said.told)["coherent"] for p in (found, without))
     assert trusted > less + 0.1  # the splatting one is as right here, but for the noise
 
@@ -152,10 +161,10 @@ def test_its_answers_are_without_the_floor(run):
 def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
     batch = run.data.batch(jnp.asarray(run.dataset.validation), run.key)
     image = dataclasses.replace(batch, snapshots=None, power_db=None)
-    trust = run.field.calibrate(run.state.params, run.cache, [image])[0].trust
+    trust = weighted(run, run.state.params, [image])[0].trust
     power = dataclasses.replace(batch, snapshots=None, pas=None, power_db=jnp.full(len(run.dataset.validation), -60.0))
     silent = dataclasses.replace(image, power_db=jnp.full(len(run.dataset.validation), -400.0))
-    others = [run.field.calibrate(run.state.params, run.cache, [one])[0].trust for one in (power, silent)]
+    others = [weighted(run, run.state.params, [one])[0].trust for one in (power, silent)]
     for shares in (trust.power, others[0].spectra, others[1].power):
         assert min(float(jax.nn.sigmoid(one.bias)) for one in (shares.coherent, shares.uninformed)) > 0.99
 
@@ -184,11 +193,11 @@ def test_its_loss_is_the_sum_and_the_coherent_field_knows_of_no_other(run):
     given = jnp.where(_informed(batch), jnp.asarray(seen), 0)
 
     def both(params):
-        return field.loss(params, run.cache, batch, run.limits, field.probe(params))[0]
+        return field.loss(params, run.prepared, batch, run.capacity, probe_of(run.hooks, params))[0]
 
     def one_by_one(params):
-        coherent, _ = field.wave.loss(params.wave, run.cache, batch)
-        return coherent + field.wideband.loss(params.wideband, None, batch, run.limits, field.probe(params), given)[0]
+        coherent, _ = field.wave.loss(params.wave, run.prepared, batch)
+        return coherent + field.wideband.loss(params.wideband, None, batch, run.capacity, probe_of(run.hooks, params), given)[0]
 
     (loss, gradient), (expected, other) = (jax.jit(jax.value_and_grad(f))(params) for f in (both, one_by_one))
     assert float(loss) == pytest.approx(float(expected), rel=1e-5)
@@ -219,7 +228,7 @@ def test_the_splatting_field_answers_to_the_coherent_one(run):
 
 
 def test_elsewhere_it_is_the_coherent_field(run):
-    field, params = run.field.anywhere(run.state.params)
+    field, params = run.field.receiver_independent(run.state.params)
     assert field.name == "wave" and params is run.state.params.wave
 
 
@@ -229,20 +238,20 @@ def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     dataset = dataclasses.replace(tiny_dataset(12), faces=nothing, materials=None, face_part=None)
     with pytest.warns(UserWarning, match="is its wideband half alone: box has no mesh"):
         result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
-    assert result.field.wave is None and set(result.field.known()) == {"pas", "power"}
+    assert result.field.wave is None and set(outputs_of(result.field)) == {"pas", "power"}
     seen = observe_links(result.field, result.params, dataset, dataset.test)
     alone = observe_links(result.field.wideband, result.params.wideband, dataset, dataset.test)
     np.testing.assert_allclose(seen.pas, alone.pas, atol=1e-6)
     plan = result.field.plan(result.params, dataset.receiver())
     with pytest.raises(UserError, match="no paths"):
-        result.field.arrivals(result.params, plan, dataset.query(dataset.test))
+        paths_of(result.field, result.params, plan, dataset.query(dataset.test))
     with pytest.raises(UserError, match="no receivers but those"):
-        result.field.anywhere(result.params)
+        result.field.receiver_independent(result.params)
 
 
 @pytest.mark.heavy
 def test_it_trains_grows_and_comes_back_as_it_was(dataset, tmp_path):
-    """Its host controls act on their parts, and a run that stopped half way ends where one goes that did not."""
+    """Its hooks act on their parts, and a run that stopped half way ends where one goes that did not."""
     config = RunConfig("box", "hybrid", "smoke", 0, None, SETTINGS)
     prepare_folder(tmp_path / "run", config, resume=False)
     result = train(dataset, "hybrid", SETTINGS, 0, tmp_path / "run")
@@ -262,7 +271,7 @@ def test_the_presets_have_both_fields_settings():
         assert settings.search == wave[name].search and settings.density == wideband[name].density
     phase_blind = dataclasses.replace(settings.field.wave, coherent=False)
     with pytest.raises(UserError, match="nothing to mix"):
-        HybridField.check(dataclasses.replace(settings.field, wave=phase_blind))
+        dataclasses.replace(settings.field, wave=phase_blind).check("hybrid")
 
 
 @pytest.mark.heavy

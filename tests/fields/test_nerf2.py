@@ -192,4 +192,4 @@ def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path):
 )
 def test_settings_that_cannot_work_are_refused(name, value):
     with pytest.raises(UserError, match=name.replace("_", "-")):
-        Nerf2Field.check(Nerf2Config(**{name: value}))
+        Nerf2Config(**{name: value}).check("nerf2")

@@ -49,8 +49,8 @@ def scene_of_known_materials(n_tx=16):
     scene = dataclasses.replace(tiny_scene(n_tx), snapshots=heard, **changes, **make_mesh_arrays(PARTS))
     dataset = scene_dataset(scene)
     known = WaveConfig(permittivity=6.5, conductivity=0.1, slope=0.0, excess_amplitude=1.0, mirror_areas=(0.0,), **SMALL)
-    params = WaveField.make(known, DatasetScene(dataset), 0).init(jax.random.key(0))
-    field = WaveField.make(trained_settings().field, DatasetScene(dataset), 0)
+    params = WaveField.build(known, DatasetScene(dataset), 0).init(jax.random.key(0))
+    field = WaveField.build(trained_settings().field, DatasetScene(dataset), 0)
     return dataclasses.replace(scene, snapshots=observe(field, params, dataset).snapshots.reshape(heard.shape))
 
 
@@ -102,7 +102,7 @@ def test_training_finds_the_materials_and_moves_nothing_else(trained):
     """Held-out spectra, and the permittivity itself: all it has seen are snapshots. The field's geometry stays what it was."""
     dataset, params = trained.dataset(), trained.params
     assert trained.step == STEPS
-    untouched = WaveField.make(trained.config.settings.field, DatasetScene(dataset), 0)
+    untouched = WaveField.build(trained.config.settings.field, DatasetScene(dataset), 0)
     start = untouched.init(jax.random.key(0))
     truth = np.asarray(dataset.pas(dataset.test))
     before, after = (np.median(ssim(observe(trained.field, p, dataset).pas[dataset.test], truth)) for p in (start, params))
@@ -120,7 +120,7 @@ def test_training_finds_the_materials_and_moves_nothing_else(trained):
 @pytest.mark.heavy
 def test_the_commands_answer(folder, trained, tmp_path):
     """Spectra, and quantities of the channel: traced anew, those of links whose paths are prepared."""
-    assert trained.field.sizes(trained.params)["facets"] == 12
+    assert trained.field.inspect(trained.params).sizes["facets"] == 12
     dataset = trained.dataset()
     seen, index = observe(trained.field, trained.params, dataset), 7 * len(FREQUENCIES) + np.array([1, 3])
     tx = dataset.tx_positions[index[0]]
@@ -179,9 +179,9 @@ def test_prepared_links_are_rendered_as_others_are(rng):
     query = make_query(tx[[2, 0, 2]], [2e9, 5e9, 20e9])
     links = Links(query, jnp.zeros(3, int), jnp.array([7, 3, 7]))
     receivers = jax.tree.map(lambda leaf: leaf[None], plan.receiver)
-    cache = field.prepare(links, receivers)
-    np.testing.assert_array_equal(cache.tx_index, [3, 7])
-    prepared = jax.jit(WaveField.render_links)(field, params, field.plan(params, plan.receiver, cache=cache), cache, links)
+    prepared = field.prepare(links, receivers)
+    np.testing.assert_array_equal(prepared.tx_index, [3, 7])
+    prepared = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, prepared), links)
     others = jax.jit(WaveField.render)(field, params, plan, query)
     powers = [seen._replace(pas=seen.pas**2) for seen in (prepared, others)]  # near zero roots are of rounding
     for a, b in zip(*powers, strict=True):
@@ -212,7 +212,7 @@ def test_links_of_several_receivers_are_rendered_as_those_of_each_alone():
         ):
             np.testing.assert_allclose(one[place], other, atol=2e-3 * np.abs(other).max())
     with pytest.raises(TypeError, match="traces no others"):
-        wave.trace(field.plan(params, own, cache=field.prepare(dataset.links(index), dataset.receivers)), jnp.ones((1, 3)))
+        wave.trace(field.plan(params, own, prepared=field.prepare(dataset.links(index), dataset.receivers)), jnp.ones((1, 3)))
 
 
 @pytest.mark.parametrize("parts", [SHEETS, pytest.param(PARTS, marks=pytest.mark.slow)], ids=["sheets", "edges"])
@@ -286,7 +286,7 @@ def test_an_array_in_metres_is_that_of_its_wavelengths_at_one_frequency(rng):
 
 def test_more_facets_than_can_be_numbered_are_refused():
     with pytest.raises(UserError, match="max-facets is 100001; the most is 100000"):
-        WaveField.check(WaveConfig(max_facets=100_001))
+        WaveConfig(max_facets=100_001).check("wave")
 
 
 @pytest.mark.heavy
@@ -313,20 +313,20 @@ def test_a_link_without_any_path_has_gradients(coherent):
     field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), coherent=coherent, **SMALL)
     query, receivers = make_query([[3.0, 2.0, 1.0]], 28e9), jax.tree.map(lambda leaf: leaf[None], plan.receiver)
     links = Links(query, jnp.zeros(1, int), jnp.zeros(1, int))
-    cache = field.prepare(links, receivers)
-    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, cache)
+    prepared = field.prepare(links, receivers)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, prepared)
     heard = jnp.exp(1j * jnp.arange(16.0))[None].astype(jnp.complex64)
     truth = snapshot_to_pas(heard, plan.receiver.element_positions)
     batch = Batch(links, plan.receiver, truth, heard, None, jax.random.key(0))
 
     @jax.jit
-    def found(params, cache):
-        return jax.value_and_grad(lambda params: field.loss(params, cache, batch)[0])(params)
+    def found(params, prepared):
+        return jax.value_and_grad(lambda params: field.loss(params, prepared, batch)[0])(params)
 
-    for paths in (cache, nothing):
+    for paths in (prepared, nothing):
         loss, gradient = found(params, paths)
         assert np.isfinite(loss) and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-    seen = jax.jit(WaveField.render_links)(field, params, field.plan(params, plan.receiver, cache=cache), nothing, links)
+    seen = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, nothing), links)
     assert not np.any(seen.pas)
     if coherent:
         assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB
@@ -363,7 +363,7 @@ def test_the_pattern_is_the_receivers():
 def test_a_field_of_data_is_asked_within_jit():
     """Its receivers are known, and where they were found to stand is decided on the host."""
     dataset = tiny_dataset()
-    field = get_field("wave").make(FIELDS["wave"], DatasetScene(dataset), 0)
+    field = get_field("wave").build(FIELDS["wave"], DatasetScene(dataset), 0)
     assert len(field.receivers)
     moved = field.motion.receiver.at[0, 0].add(0.01)
     field = dataclasses.replace(field, motion=dataclasses.replace(field.motion, receiver=moved))

@@ -22,13 +22,13 @@ CONFIG = FIELDS["wideband"]
 RECEIVER = make_receiver((0.2, -0.1, 1.0), (0.9, 0.1, -0.2, 0.3))
 ROOM = TileLimits(entries=16384, jobs=2048)
 render = jax.jit(wideband.render)
-plan_within = jax.jit(WidebandField.plan, static_argnums=3)
+plan_within = jax.jit(WidebandField.plan, static_argnames="capacity")
 
 
 @jax.jit
 def features(field, params, receiver, query):
     """delta and Sig, of a plan that is made for it."""
-    return wideband.em_features(params, WidebandField.plan(field, params, receiver, ROOM), query)
+    return wideband.em_features(params, WidebandField.plan(field, params, receiver, capacity=ROOM), query)
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def start(points, config=CONFIG):
 
 
 def plan_of(field, params, receiver=RECEIVER):
-    plan = plan_within(field, params, receiver, ROOM)
+    plan = plan_within(field, params, receiver, capacity=ROOM)
     assert not plan.geometry.jobs.overflow
     return plan
 
@@ -74,7 +74,7 @@ def test_starts_with_gaussians_on_the_surface_of_even_attenuation(points, query)
     np.testing.assert_allclose(attenuation[:N], INITIAL_ATTENUATION, rtol=1e-5)
     np.testing.assert_array_equal(attenuation[N:], 0)  # empty slots take nothing away
     assert bool((signal > 0).all())
-    assert field.sizes(params) == {"gaussians": N}
+    assert field.inspect(params).sizes == {"gaussians": N}
 
 
 def test_only_what_is_trained_is_a_parameter(points):
@@ -82,9 +82,9 @@ def test_only_what_is_trained_is_a_parameter(points):
     field = start(points)
     params = field.init(jax.random.key(0))
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(params))
-    labels = field.labels(params)
+    groups, labels = field.param_groups(CONFIG, params)
     assert jax.tree.structure(labels) == jax.tree.structure(params)
-    assert set(jax.tree.leaves(labels)) == set(field.groups(CONFIG))
+    assert set(jax.tree.leaves(labels)) == set(groups)
 
 
 @pytest.mark.parametrize(("attenuation", "radiance"), [(True, True), (True, False), (False, True), (False, False)])
@@ -176,7 +176,7 @@ def test_a_plan_for_a_file_renders_the_same(rng, points, query):
     field = start(points)
     params = trained(rng, field)
     plan = plan_of(field, params)
-    portable = field.portable(plan)
+    portable = plan.portable()
     assert portable.features is None and plan.features is not None
     np.testing.assert_allclose(render(params, portable, query), render(params, plan, query), atol=1e-6)
 
@@ -185,11 +185,11 @@ def test_limits_hold_all_receivers_and_grow(rng, points):
     field = start(points)
     params = trained(rng, field)
     receivers = [RECEIVER, make_receiver((1.0, 0.5, 1.5))]
-    limits = field.limits(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers))
+    capacity = field.capacity(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers))
     for receiver in receivers:
-        assert not plan_within(field, params, receiver, limits).geometry.jobs.overflow
-    grown = field.grow(limits, np.array([limits.entries + 1, 3]))
-    assert grown.entries > limits.entries and grown.jobs == limits.jobs
+        assert not plan_within(field, params, receiver, capacity=capacity).geometry.jobs.overflow
+    grown = capacity.grown_to(field.capacity(params, None, np.array([capacity.entries + 1, 3])))
+    assert grown.entries > capacity.entries and grown.jobs == capacity.jobs
 
 
 def test_the_order_of_the_gaussians_changes_nothing(rng, points, query):

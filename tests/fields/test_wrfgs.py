@@ -9,8 +9,8 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import select_frequencies
 from wbgs_jax.fields import Field, get_field
-from wbgs_jax.fields.wideband import WidebandConfig, WidebandField
-from wbgs_jax.fields.wrfgs import WrfgsField, without_frequency
+from wbgs_jax.fields.wideband import WidebandField
+from wbgs_jax.fields.wrfgs import WrfgsConfig, WrfgsField, without_frequency
 from wbgs_jax.inference.predictor import predict_spectra
 from wbgs_jax.training.loop import train
 
@@ -55,14 +55,14 @@ def test_no_configuration_lets_the_frequency_in(dataset, trained):
     assert aware.attenuation_frequency and aware.radiance_frequency
 
     def shapes(kind, config):
-        return jax.eval_shape(kind.make(config, scene, 0).init, jax.random.key(0))
+        return jax.eval_shape(kind.build(config, scene, 0).init, jax.random.key(0))
 
     blind = shapes(WrfgsField, aware)
     assert jax.tree.structure(blind) == jax.tree.structure(shapes(WrfgsField, without_frequency(aware)))
     assert jax.tree.structure(blind) != jax.tree.structure(shapes(WidebandField, aware))
     assert [leaf.shape for leaf in jax.tree.leaves(blind)] == [leaf.shape for leaf in jax.tree.leaves(trained.params)]
     with pytest.raises(UserError, match="--field wideband"):
-        WrfgsField.check(WidebandConfig())
+        WrfgsConfig().check("wrfgs")
 
 
 def test_one_model_a_frequency_learns_it_and_is_asked_about_other_transmitters(dataset, trained):

@@ -86,7 +86,7 @@ def test_the_answers_are_those_of_the_predictor(exported, predict):
 def test_all_outputs_and_their_intervals(tmp_path):
     """Of a field that outputs power and snapshots, with intervals of its spectra."""
     dataset = hold_out_validation(tiny_dataset(30))
-    field = get_field("wave").make(WaveConfig(specular_tried=32, specular_kept=8, diffracted_kept=8), DatasetScene(dataset), 0)
+    field = get_field("wave").build(WaveConfig(specular_tried=32, specular_kept=8, diffracted_kept=8), DatasetScene(dataset), 0)
     params = field.init(jax.random.key(1))
     confidence, of_powers = learn_confidence(field, params, dataset, None)
     whole = dataclasses.replace(
@@ -267,7 +267,7 @@ def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
     blurred = make_trained(tmp_path).field.config
     config = coherent if name == "wave" else HybridConfig(coherent, blurred)
     dataset = tiny_dataset(unit=unit)
-    field = get_field(name).make(config, DatasetScene(dataset), 0)
+    field = get_field(name).build(config, DatasetScene(dataset), 0)
     whole = dataclasses.replace(make_trained(tmp_path), field=field, params=field.init(jax.random.key(1)))
     export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
     exported, predict = load_exported(tmp_path / "field.zip"), predictor(whole, dataset.receiver())

@@ -10,6 +10,7 @@ from untrained import make_trained
 
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field
+from wbgs_jax.fields.base import portable
 from wbgs_jax.inference import predictor as inference
 from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
 from wbgs_jax.inference.predictor import predictor
@@ -126,11 +127,11 @@ def products_without(found, size):
 
 
 def test_a_plan_without_what_is_cheaply_computed_again_renders_the_same(trained, plan, expected):
-    """What a file holds (`Field.portable`) lacks what the networks make of the Gaussians alone."""
-    portable = trained.field.portable(plan)
-    size, smaller = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (plan, portable))
+    """What a file holds (`fields.base.portable`) lacks what the networks make of the Gaussians alone."""
+    small = portable(plan)
+    size, smaller = (sum(leaf.size for leaf in jax.tree.leaves(tree)) for tree in (plan, small))
     assert smaller < size
-    again = _render(trained.field, trained.params, portable, make_query(TX, HZ))
+    again = _render(trained.field, trained.params, small, make_query(TX, HZ))
     np.testing.assert_allclose(again, expected, atol=1e-6)
 
 
@@ -139,14 +140,14 @@ def test_what_does_not_depend_on_the_query_is_planned(name):
     """With a plan, all matrix products are of queries: encodings of the Gaussians and the layers behind them are not
     computed again. Without it they are."""
     queries = 7  # nothing else comes in sevens
-    field = get_field(name).make(tiny_settings(name).field, DatasetScene(tiny_dataset()), 0)
+    field = get_field(name).build(tiny_settings(name).field, DatasetScene(tiny_dataset()), 0)
     params = jax.eval_shape(field.init, jax.random.key(0))
-    limits = TileLimits(entries=4096, jobs=1024)
+    capacity = TileLimits(entries=4096, jobs=1024)
     receiver = tiny_dataset().receiver()
-    plan = jax.eval_shape(lambda params: field.plan(params, receiver, limits), params)
+    plan = jax.eval_shape(lambda params: field.plan(params, receiver, None, capacity), params)
     query = make_query(np.ones((queries, 3)), 28e9)
     planned = operations(field.render, params, plan, query)
-    again = operations(field.render, params, field.portable(plan), query)
+    again = operations(field.render, params, portable(plan), query)
     assert [name for name, _ in planned].count("dot_general") >= 3
     assert products_without(planned, queries) == []
     assert len(products_without(again, queries)) >= 2

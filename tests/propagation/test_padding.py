@@ -61,4 +61,4 @@ def test_a_moved_field_has_the_sizes_of_the_one_before(rng):
     numbers = [[leaf.shape for leaf in jax.tree.leaves(one.plan(None, receiver))] for one in (field, moved)]
     assert sum(own != other for own, other in zip(*numbers, strict=True)) <= 6
     edges, params = len(field.edges.length), field.init(jax.random.key(0))
-    assert field.sizes(params)["edges"] <= edges == padded_size(edges)
+    assert field.inspect(params).sizes["edges"] <= edges == padded_size(edges)

@@ -33,7 +33,7 @@ def truth(tmp_path_factory):
 
 def told_of(parts, truth, folder):
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, truth)
-    return run, Told(run.field, run.cache, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+    return run, Told(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
 
 
 def anything(rng):
@@ -89,9 +89,9 @@ def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
     motion = dataclasses.replace(run.field.motion, shift=ghosts[0], turn=ghosts[1])
     mover = jnp.where(run.field.facets.mover > 0, run.field.facets.mover + 2, 0)  # two have lost all of their facets
     facets = dataclasses.replace(run.field.facets, mover=mover)
-    surfaces = dataclasses.replace(run.cache.surfaces, facets=dataclasses.replace(run.cache.surfaces.facets, mover=mover))
+    surfaces = dataclasses.replace(run.prepared.surfaces, facets=dataclasses.replace(run.prepared.surfaces.facets, mover=mover))
     field = dataclasses.replace(run.field, facets=facets, motion=motion)
-    large = dataclasses.replace(told, field=field, cache=dataclasses.replace(run.cache, surfaces=surfaces))
+    large = dataclasses.replace(told, field=field, prepared=dataclasses.replace(run.prepared, surfaces=surfaces))
     np.testing.assert_array_equal(
         absent_movers(params, large, SETTINGS.search), absent_movers(params, told, SETTINGS.search) + 2
     )
@@ -102,7 +102,7 @@ def test_what_is_not_there_is_left_out_and_a_training_goes_on_without_it(truth, 
     extra = anything(rng)
     run, _ = told_of([*PARTS, extra], truth, tmp_path)
     facets = run.field.facets.offset.shape[0]
-    run.control()
+    run.run_hooks()
     report = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[0])["absent"]
     print(extra.bounds, report)
     assert len(report["centres"]) == 1 and report["after"] < report["before"] - 0.1

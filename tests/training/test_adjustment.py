@@ -48,27 +48,27 @@ def drawn(rng, run, size):
 @jax.jit
 def snapshots(flat, run_tree, links):
     """Of the room with its things and receivers elsewhere, to first order."""
-    field, params, receivers, cache, nothing = run_tree
+    field, params, receivers, prepared, nothing = run_tree
     motion = ravel_pytree(nothing)[1](flat)
 
     def one(link):
         number = link.receiver_index
-        plan = field.plan(params, jax.tree.map(lambda leaf: leaf[number], receivers), cache=cache)
+        plan = field.plan(params, jax.tree.map(lambda leaf: leaf[number], receivers), prepared=prepared)
         of_one = jax.tree.map(lambda leaf: leaf[None], link)
-        return wave_runs.snapshots(params, field.displaced(plan, motion.of_receiver(number)), cache, of_one)[0]
+        return wave_runs.snapshots(params, field.displaced(plan, motion.of_receiver(number)), prepared, of_one)[0]
 
     return jax.vmap(one)(links)
 
 
 def parts_of(run, count):
     index = jnp.arange(count)
-    tree = run.field, run.state.params, run.dataset.receivers, run.cache, run.field.motion
+    tree = run.field, run.state.params, run.dataset.receivers, run.prepared, run.field.motion
     return index, tree, jax.tree.map(lambda leaf: leaf[index], run.data.links)
 
 
 def certain(run):
     pairs = N_TX * len(RECEIVERS)
-    return jnp.zeros((pairs, run.cache.paths.specular.alive.shape[1] + run.cache.paths.diffracted.alive.shape[1]))
+    return jnp.zeros((pairs, run.prepared.paths.specular.alive.shape[1] + run.prepared.paths.diffracted.alive.shape[1]))
 
 
 def everything(run):
@@ -77,13 +77,13 @@ def everything(run):
 
 def variances(run, covariance, numbers, others):
     own = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
-    return np.asarray(length_variances(run.cache, *own, numbers, len(run.field.motion.shift)))
+    return np.asarray(length_variances(run.prepared, *own, numbers, len(run.field.motion.shift)))
 
 
 def equations(run, motion, index, data=None, numbers=None):
     """Of eights of snapshots; the block after them is none of them."""
     blocks = jnp.concatenate([index.reshape(-1, 8), jnp.zeros((1, 8), index.dtype)])
-    of = run.field, run.state.params, motion, run.cache, run.data if data is None else data
+    of = run.field, run.state.params, motion, run.prepared, run.data if data is None else data
     every = everything(run) if numbers is None else numbers
     return normal_equations(*of, blocks, certain(run), jnp.asarray(len(blocks) - 1), every)
 
@@ -129,9 +129,9 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
     found = variances(run, covariance, everything(run), np.zeros(flat.size))
     motion = back(jnp.zeros_like(flat).at[number].set(width))
     for k, name in enumerate(("specular", "diffracted")):
-        paths = getattr(run.cache.paths, name)
-        changes = jax.vmap(lambda some, number: length_changes(some, run.cache.surfaces, motion.of_receiver(number)))(
-            paths, run.cache.receiver_index
+        paths = getattr(run.prepared.paths, name)
+        changes = jax.vmap(lambda some, number: length_changes(some, run.prepared.surfaces, motion.of_receiver(number)))(
+            paths, run.prepared.receiver_index
         )
         own = found[:, : changes.shape[1]] if k == 0 else found[:, -changes.shape[1] :]
         alive = np.asarray(paths.alive)
@@ -142,16 +142,16 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
 def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch):
     """Any covariance of what is adjusted, and any variances of the rest: those of all lengths are J C J^T, written out."""
     monkeypatch.setattr(gauss_newton, "MOST", most)
-    numbers, movers = adjusted_numbers(run.cache, run.field.motion), len(run.field.motion.shift)
+    numbers, movers = adjusted_numbers(run.prepared, run.field.motion), len(run.field.motion.shift)
     size = ravel_pytree(run.field.motion)[0].size
     root, others = rng.normal(0, 1e-3, (len(numbers), 5)), rng.uniform(0, 1e-6, size)
     others[numbers] = 0
     found = variances(run, root @ root.T, numbers, others)
-    for pair, receiver in enumerate(np.asarray(run.cache.receiver_index)):
-        paths = jax.tree.map(lambda leaf, pair=pair: leaf[pair], run.cache.paths)
+    for pair, receiver in enumerate(np.asarray(run.prepared.receiver_index)):
+        paths = jax.tree.map(lambda leaf, pair=pair: leaf[pair], run.prepared.paths)
         expected, alive = [], np.concatenate([np.asarray(paths.specular.alive), np.asarray(paths.diffracted.alive)])
         for some in (paths.specular, paths.diffracted):
-            number, derivative = (np.asarray(a) for a in length_terms(some, run.cache.surfaces, movers))
+            number, derivative = (np.asarray(a) for a in length_terms(some, run.prepared.surfaces, movers))
             number = np.where(number < 6 * movers, number, number + 3 * int(receiver))
             jacobian = np.zeros((len(number), size))
             np.add.at(jacobian, (np.arange(len(number))[:, None], number), derivative)
@@ -161,17 +161,17 @@ def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch
 
 def test_the_movers_that_most_paths_meet_are_adjusted(run, monkeypatch):
     """All of them where there are few; every receiver in any case."""
-    np.testing.assert_array_equal(adjusted_numbers(run.cache, run.field.motion), everything(run))
+    np.testing.assert_array_equal(adjusted_numbers(run.prepared, run.field.motion), everything(run))
     monkeypatch.setattr(gauss_newton, "MOST", 2)
     movers, meets = len(run.field.motion.shift), np.zeros(len(run.field.motion.shift))
-    for some in (run.cache.paths.specular, run.cache.paths.diffracted):
-        number, derivative = jax.vmap(lambda paths: length_terms(paths, run.cache.surfaces, movers))(some)
+    for some in (run.prepared.paths.specular, run.prepared.paths.diffracted):
+        number, derivative = jax.vmap(lambda paths: length_terms(paths, run.prepared.surfaces, movers))(some)
         shifts = np.asarray(some.alive)[..., None] & (np.asarray(number) < 3 * movers)
         np.add.at(meets, np.asarray(number)[shifts] // 3, np.asarray(derivative)[shifts] ** 2)
     chosen = np.sort(np.argsort(-meets)[:2])
     shifts = np.concatenate([3 * m + np.arange(3) for m in chosen])
     expected = np.concatenate([shifts, 3 * movers + shifts, everything(run)[6 * movers :]])
-    np.testing.assert_array_equal(adjusted_numbers(run.cache, run.field.motion), expected)
+    np.testing.assert_array_equal(adjusted_numbers(run.prepared, run.field.motion), expected)
 
 
 @pytest.mark.heavy
@@ -196,7 +196,7 @@ def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
     found, covariance, frequency = still, np.diag(prior), np.asarray(links.query.frequency_hz)
     for highest in FREQUENCIES:
         pool, known = np.flatnonzero(frequency <= highest), (found, covariance, widths, everything(run))
-        found, covariance = adjust(run.field, run.state.params, run.cache, *known, data, pool, 64, rng)
+        found, covariance = adjust(run.field, run.state.params, run.prepared, *known, data, pool, 64, rng)
     before, after = (
         float(jnp.mean(log_decorrelation(snapshots(ravel_pytree(m)[0], tree, links), heard))) for m in (still, found)
     )

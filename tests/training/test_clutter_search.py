@@ -9,7 +9,8 @@ from synthetic import tiny_settings
 from wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.fields.coherent import WaveConfig, WaveField
+from wbgs_jax.fields.base import paths_of
+from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.coherent_model import densities, stored
 from wbgs_jax.training.calibration.objective import Told
 from wbgs_jax.training.calibration.obstacles import search_clutter
@@ -43,14 +44,14 @@ def hedge(field, rng):
 def heard_behind_a_hedge(folder, rng):
     """Snapshots of all places, and which cells the hedge fills."""
     run = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES)
-    run.field = run.field.cluttered()
+    run.field = run.field.with_absorption()
     clutter, filled = hedge(run.field, rng)
     return heard_in(run, dataclasses.replace(of_concrete(run), clutter=clutter), PLACES, FREQUENCIES), filled
 
 
 def told_of(parts, truth, folder, n_tx=N_TX):
     run = run_in(parts, SETTINGS, folder, PLACES[:n_tx], FREQUENCIES, truth[:n_tx])
-    return of_concrete(run), Told(run.field, run.cache, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+    return of_concrete(run), Told(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
 
 
 @pytest.mark.heavy
@@ -84,7 +85,7 @@ def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
 @pytest.mark.parametrize("values", [{"clutter_cells": 0}, {"clutter_cell": 0.0}])
 def test_grids_without_cells_are_refused(values):
     with pytest.raises(UserError, match="clutter-spectra 0 does without"):
-        WaveField.check(WaveConfig(**values))
+        WaveConfig(**values).check("wave")
 
 
 def test_few_transmitters_prove_nothing(tmp_path, rng):
@@ -97,14 +98,14 @@ def test_few_transmitters_prove_nothing(tmp_path, rng):
 def test_clutter_everywhere_darkens_all(tmp_path, rng):
     """With a density d everywhere, every path loses d times its length."""
     run = run_in(PARTS, SETTINGS, tmp_path, PLACES[:6], FREQUENCIES)
-    field, density = run.field.cluttered(), rng.uniform(0.1, 0.5)
+    field, density = run.field.with_absorption(), rng.uniform(0.1, 0.5)
     empty = of_concrete(run)
     dense = dataclasses.replace(empty, clutter=stored(jnp.full_like(field.first_clutter, density)))
     links = run.dataset.links(np.arange(6))
     seen = {}
     for name, one, params in (("empty", run.field, empty), ("dense", field, dense)):
         plan = one.plan(params, run.dataset.receiver())
-        seen[name] = one.arrivals(params, plan, links.query)
+        seen[name] = paths_of(one, params, plan, links)
     before, after = (np.abs(np.asarray(seen[name].amplitude)) for name in ("empty", "dense"))
     heard = before > 0
     expected = before * np.exp(-density * np.asarray(seen["empty"].length))

@@ -1,4 +1,4 @@
-"""The seam of host controls: what they watch, when they act, and how moments follow whatever they do."""
+"""The seam of hooks: what they watch, when they act, and how moments follow whatever they do."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import DensityConfig, SearchConfig
 from wbgs_jax.fields import Group
 from wbgs_jax.training import loop
-from wbgs_jax.training.hooks import Context, Control, Edit
+from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
 
@@ -28,10 +28,10 @@ SEED = 0
 
 @pytree
 class LayeredField(RippleField):
-    """Its levels are a sum of layers, whose number host controls change; its groups are called as its parameters are."""
+    """Its levels are a sum of layers, whose number hooks change; its groups are called as its parameters are."""
 
     name: ClassVar[str] = "layered"
-    controls: ClassVar = ("density", "search")
+    hooks: ClassVar = ("density", "search")
 
     def init(self, key):
         return {"layers": 0.1 * jax.random.normal(key, (2, 4)), "tilt": jnp.zeros(3)}
@@ -39,24 +39,17 @@ class LayeredField(RippleField):
     def render(self, params, plan, query):
         return super().render({"level": params["layers"].sum(0), "tilt": params["tilt"]}, plan, query)
 
-    def probe(self, params):
-        return jnp.zeros(4)
-
-    def loss(self, params, cache, batch, limits=None, probe=()):
-        moved = params | {"layers": params["layers"].at[0].add(probe)}
-        return super().loss(moved, cache, batch, limits)
+    def loss(self, params, prepared, batch, capacity=None, probe=None):
+        moved = params if probe is None else params | {"layers": params["layers"].at[0].add(probe)}
+        return super().loss(moved, prepared, batch, capacity)
 
     @classmethod
-    def groups(cls, config):
-        return {"layers": Group(config.learning_rate), "tilt": Group(0.01)}
-
-    @classmethod
-    def labels(cls, params):
-        return {"layers": "layers", "tilt": "tilt"}
+    def param_groups(cls, config, params=None):
+        return {"layers": Group(config.learning_rate), "tilt": Group(0.01)}, {"layers": "layers", "tilt": "tilt"}
 
 
 @dataclass(frozen=True)
-class Watching:
+class Watching(Hook):
     """Sums what it is shown; asks for nothing."""
 
     config: Any
@@ -65,15 +58,15 @@ class Watching:
     def statistics(self, params):
         return {"gradients": jax.tree.map(jnp.zeros_like, params), "probe": jnp.zeros(4), "steps": jnp.zeros(())}
 
+    def probe(self, params):
+        return jnp.zeros(4)
+
     def accumulate(self, statistics, gradients, probe):
         seen = {"gradients": gradients, "probe": probe, "steps": jnp.ones(())}
         return jax.tree.map(jnp.add, statistics, seen)
 
     def due(self, step, steps):
         return False
-
-    def next_size(self, params, step, steps):
-        return None
 
     def apply(self, field, params, statistics, context, step, rng):
         raise AssertionError("it is never due")
@@ -126,9 +119,9 @@ def toys():
 
 
 def use(monkeypatch, density, search=Watching):
-    """Other controls under the names that settings know."""
-    monkeypatch.setitem(loop.CONTROLS, "density", density)
-    monkeypatch.setitem(loop.CONTROLS, "search", search)
+    """Other hooks under the names that settings know."""
+    monkeypatch.setitem(loop.HOOKS, "density", density)
+    monkeypatch.setitem(loop.HOOKS, "search", search)
 
 
 def entries(folder):
@@ -147,14 +140,14 @@ def host(tree):
 
 def test_controls_are_what_their_protocol_says():
     for made in (
-        *(make(config) for make, config in zip(loop.CONTROLS.values(), (DENSITY, SEARCH), strict=True)),
+        *(make(config) for make, config in zip(loop.HOOKS.values(), (DENSITY, SEARCH, None), strict=True)),
         Growing(DENSITY),
     ):
-        assert isinstance(made, Control)
+        assert isinstance(made, Hook)
         assert hash(made) == hash(dataclasses.replace(made))
 
 
-_gradients = jax.jit(loss_and_gradients, static_argnames="limits")
+_gradients = jax.jit(loss_and_gradients, static_argnames="capacity")
 
 
 def test_a_control_is_shown_the_gradients_of_every_step(dataset, tmp_path, monkeypatch):
@@ -163,18 +156,18 @@ def test_a_control_is_shown_the_gradients_of_every_step(dataset, tmp_path, monke
     run, expected = Run(dataset, "layered", SETTINGS, SEED, tmp_path), []
     for step, index in enumerate(jnp.asarray(run.batches(0, 2))):
         key = jax.random.fold_in(run.key, step)
-        _, both = _gradients(run.field, run.state.params, run.cache, run.data, index, None, key)
+        _, both = _gradients(run.field, run.state.params, run.prepared, run.data, index, None, key, None, jnp.zeros(4))
         expected.append(host(both))
         run.state, report = run_epoch(
             run.state,
             run.field,
-            run.cache,
+            run.prepared,
             run.data,
             index[None],
             jnp.asarray(0, jnp.int32),
             run.key,
             optimizer=run.optimizer,
-            controls=run.controls,
+            hooks=run.hooks,
         )
         assert int(report.good_steps) == 1
     total = jax.tree.map(np.add, *expected)
@@ -191,11 +184,11 @@ def test_two_controls_that_are_due_at_once_act_in_the_order_the_field_names_them
     """The second sees what the first left; each has random numbers of its own; both are reported."""
     use(monkeypatch, Growing, Halving)
     run = Run(dataset, "layered", SETTINGS, SEED, tmp_path)
-    run.control()
+    run.run_hooks()
     assert entries(tmp_path) == [] and run.compilations == 1  # nothing is due before the first step
     run.epoch(), run.epoch()
     before = host(run.state)
-    run.control()
+    run.run_hooks()
     layer, other = (np.random.default_rng([SEED, stream, 4]).normal(size=4) for stream in (11, 12))
     expected = np.concatenate([before.params["layers"], layer[None]]) / 2
     np.testing.assert_allclose(run.state.params["layers"], expected, rtol=1e-6)
@@ -215,7 +208,7 @@ def test_moments_follow_the_parameters_where_groups_are_called_as_they_are(datas
     run = Run(dataset, "layered", SETTINGS, SEED, tmp_path)
     run.epoch(), run.epoch()
     before = host(adams(run.state.optimizer))
-    run.control()
+    run.run_hooks()
     after = adams(run.state.optimizer)
     for moment in ("mu", "nu"):
         layers = getattr(after["layers"], moment)["layers"]
@@ -230,17 +223,17 @@ def test_moments_start_anew_where_a_control_knows_nothing_of_them(dataset, tmp_p
     run = Run(dataset, "layered", SETTINGS, SEED, tmp_path)
     run.epoch(), run.epoch()
     watched = host(run.state.statistics[0])
-    run.control()
+    run.run_hooks()
     fresh = run.optimizer.init(run.state.params)
     for x, y in zip(jax.tree.leaves(run.state.optimizer), jax.tree.leaves(fresh), strict=True):
         np.testing.assert_array_equal(x, y)
     for x, y in zip(jax.tree.leaves(run.state.statistics[0]), jax.tree.leaves(watched), strict=True):
-        np.testing.assert_array_equal(x, y)  # of equal shapes: the other control goes on watching
+        np.testing.assert_array_equal(x, y)  # of equal shapes: the other hook goes on watching
     assert run.compilations == 1
 
 
 def test_a_run_with_two_controls_resumes_bit_for_bit(dataset, tmp_path, monkeypatch):
-    """From after the controls, and from before them."""
+    """From after the hooks, and from before them."""
     use(monkeypatch, Growing, Halving)
     whole = train(dataset, "layered", SETTINGS, SEED, tmp_path / "whole")
     assert whole.params["layers"].shape == (4, 4) and whole.compilations == 3  # the last of them after the last step
@@ -248,7 +241,7 @@ def test_a_run_with_two_controls_resumes_bit_for_bit(dataset, tmp_path, monkeypa
         stopped = Run(dataset, "layered", SETTINGS, SEED, tmp_path / str(stop))
         while stopped.step < stop:
             stopped.epoch()
-            stopped.control()
+            stopped.run_hooks()
         stopped.save()
         again = train(dataset, "layered", SETTINGS, SEED, tmp_path / str(stop), resume=True)
         for x, y in zip(jax.tree.leaves(whole.params), jax.tree.leaves(again.params), strict=True):
@@ -256,11 +249,11 @@ def test_a_run_with_two_controls_resumes_bit_for_bit(dataset, tmp_path, monkeypa
 
 
 def test_a_field_that_asks_for_no_control_has_none(dataset, tmp_path):
-    """Even where the settings hold what a control would want."""
+    """Even where the settings hold what a hook would want."""
     run = Run(dataset, "ripple", SETTINGS, SEED, tmp_path)
-    assert run.controls == () and run.state.statistics == ()
+    assert run.hooks == () and run.state.statistics == ()
     before = host(run.state.params)
-    run.control()
+    run.run_hooks()
     for x, y in zip(jax.tree.leaves(run.state.params), jax.tree.leaves(before), strict=True):
         np.testing.assert_array_equal(x, y)
     result = train(dataset, "ripple", SETTINGS, SEED, tmp_path)
@@ -271,7 +264,7 @@ def test_a_field_that_asks_for_no_control_has_none(dataset, tmp_path):
 def test_a_control_is_left_out_where_its_settings_are(dataset, tmp_path, monkeypatch):
     use(monkeypatch, Growing, Halving)
     run = Run(dataset, "layered", dataclasses.replace(SETTINGS, density=None), SEED, tmp_path)
-    assert run.controls == (Halving(SEARCH),)
+    assert run.hooks == (Halving(SEARCH),)
 
 
 def test_the_settings_of_the_toy_are_its_own():

@@ -26,7 +26,7 @@ from wbgs_jax.training.step import run_epoch as epoch_programs
 STEPS = 8
 PLAIN = ("ripple", toy_settings())
 CROWDED = ("wideband", GROWING)
-"""What is trained: a toy without host controls, or Gaussians that density control adds to, into more slots."""
+"""What is trained: a toy without hooks, or Gaussians that density control adds to, into more slots."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -111,7 +111,7 @@ def test_equal_seeds_give_equal_runs_and_others_do_not(dataset, tmp_path, uninte
 
 def test_equal_seeds_make_equal_fields_and_others_do_not(dataset):
     """Where the Gaussians start, and with which weights. (Below, a run that starts anew ends as another one did.)"""
-    made = [WidebandField.make(GROWING.field, DatasetScene(dataset), seed) for seed in (0, 0, 1)]
+    made = [WidebandField.build(GROWING.field, DatasetScene(dataset), seed) for seed in (0, 0, 1)]
     params = [field.init(jax.random.key(seed)) for field, seed in zip(made, (0, 0, 1), strict=True)]
     for x, y in zip(jax.tree.leaves((made[0], params[0])), jax.tree.leaves((made[1], params[1])), strict=True):
         np.testing.assert_array_equal(x, y)
@@ -198,34 +198,34 @@ def test_density_controls_are_reported_and_keep_their_schedule(uninterrupted):
 
 
 def test_the_next_size_is_compiled_before_it_is_needed(dataset, tmp_path, monkeypatch):
-    """By a call that runs no step; the epoch that needs it compiles nothing, and the limits have grown in proportion."""
+    """By a call that runs no step; the epoch that needs it compiles nothing, and the capacity has grown in proportion."""
     run, called = Run(dataset, *CROWDED, 0, tmp_path), []
     original = Run._run_epoch
 
-    def run_epoch(run, state, cache, batches, first, limits, stopped):
-        called.append((len(state.params.gaussians.means), first, limits))
-        return original(run, state, cache, batches, first, limits, stopped)
+    def run_epoch(run, state, prepared, batches, first, capacity, stopped):
+        called.append((len(state.params.gaussians.means), first, capacity))
+        return original(run, state, prepared, batches, first, capacity, stopped)
 
     monkeypatch.setattr(Run, "_run_epoch", run_epoch)
-    before = run.limits
+    before = run.capacity
     run.epoch()
     run.precompilation.wait(next(iter(run.precompilation._threads)))
     assert called == [(64, 0, before), (96, 2, before.scaled(1.5))] and run.precompilation.seconds > 0
     run.epoch()
-    run.control()
+    run.run_hooks()
     compiled = epoch_programs._cache_size()
-    assert len(run.state.params.gaussians.means) == 96 and run.limits == before.scaled(1.5) and run.compilations == 2
+    assert len(run.state.params.gaussians.means) == 96 and run.capacity == before.scaled(1.5) and run.compilations == 2
     seconds = run.compile_seconds
     run.epoch()
     assert epoch_programs._cache_size() == compiled and run.compile_seconds == seconds
 
 
 def test_a_device_that_goes_on_trains_what_one_does_that_waits(dataset, tmp_path, monkeypatch):
-    """Also where the first of two epochs that were given ends early: the second does nothing until limits hold."""
+    """Also where the first of two epochs that were given ends early: the second does nothing until the capacity holds."""
     states, figures = [], []
     for ahead in (False, True):
         run = Run(dataset, *CROWDED, 0, tmp_path / str(ahead))
-        run.limits = TileLimits(entries=1024, jobs=1024)
+        run.capacity = TileLimits(entries=1024, jobs=1024)
         figures.append([run.epoch(go_on=ahead), run.epoch()])
         assert not run.launched and run.step == 4 and run.compilations > 1
         states.append(run.state)
@@ -285,12 +285,12 @@ def test_curves_watch_the_validation_part_or_nothing(dataset, tmp_path):
 
 @pytest.mark.parametrize("field", ["wideband", "nerf2", "wave", "hybrid"])
 def test_nothing_of_a_training_looks_at_the_test(dataset, tmp_path, field):
-    """What is held out, place and spectrum, may be anything: field, cache, data and batches are the same to the last bit."""
+    """What is held out, place and spectrum, may be anything: field, links, data and batches are bit for bit the same."""
     heard, places = dataset.snapshots.copy(), dataset.tx_positions.copy()
     heard[dataset.test], places[dataset.test] = np.nan, 1e3
     poisoned = dataclasses.replace(dataset, snapshots=heard, tx_positions=places)
     runs = [Run(data, field, tiny_settings(field), 0, tmp_path) for data in (dataset, poisoned)]
-    seen = [(run.field, run.state, run.cache, run.data, run.batches(0, 3), run.watched) for run in runs]
+    seen = [(run.field, run.state, run.prepared, run.data, run.batches(0, 3), run.watched) for run in runs]
     for a, b in zip(*map(jax.tree.leaves, seen), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -50,16 +50,16 @@ def run_on(untrained, tmp_path):
         run.__dict__.update(untrained.__dict__)
         run.folder = tmp_path
         run.settings = dataclasses.replace(changed(SETTINGS, {"field": start}), search=search)
-        run.controls = (search_module.Search(search),)
+        run.hooks = (search_module.Search(search),)
         field = dataclasses.replace(run.field, config=run.settings.field)
         params = field.init(run.key)
         columns = [jnp.asarray(column, jnp.float32) for column in np.array(materials).T]
         made_of = dataclasses.replace(
             params.materials, log_susceptibility=jnp.log(columns[0] - 1), log_conductivity=jnp.log(columns[1]), slope=columns[2]
         )
-        plan = run.field.plan(params, run.dataset.receiver(), cache=run.cache)
+        plan = run.field.plan(params, run.dataset.receiver(), prepared=run.prepared)
         truth = dataclasses.replace(params, materials=made_of, **{name: jnp.asarray(1.0) for name in natural})
-        y = snapshots(truth, plan, run.cache, run.data.links)
+        y = snapshots(truth, plan, run.prepared, run.data.links)
         run.data = dataclasses.replace(run.data, snapshots=y)
         run.state = jax.tree.map(jnp.copy, dataclasses.replace(run.state, params=params))  # an epoch gives its own away
         return run
@@ -72,7 +72,7 @@ def test_it_names_the_materials(run_on, tmp_path, rng):
     """All seven at random, from 1 and 94 GHz alone, all starting alike."""
     names = rng.choice([name for name in ITU_MATERIALS if name != "metal"], len(PARTS), replace=False)
     run = run_on([ITU_MATERIALS[name] for name in names])
-    run.control()
+    run.run_hooks()
     report = json.loads((tmp_path / "metrics.jsonl").read_text())["search"]
     found = [report["taken"].get(str(i)) for i in range(len(PARTS))]
     assert sum(a == b for a, b in zip(found, names, strict=True)) >= len(PARTS) - 1, (found, names)
@@ -88,7 +88,7 @@ def test_what_fits_better_than_the_list_is_kept(run_on):
     run = run_on([(9.3, 0.05, 0.0)] * len(PARTS), permittivity=9.3, conductivity=0.05)
     before = np.asarray(run.state.params.materials.log_susceptibility)
     np.testing.assert_allclose(1 + np.exp(before), 9.3, rtol=1e-5)
-    run.control()
+    run.run_hooks()
     np.testing.assert_array_equal(before, np.asarray(run.state.params.materials.log_susceptibility))
 
 
@@ -113,7 +113,7 @@ def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_
     monkeypatch.setattr("wbgs_jax.training.calibration.objective.make_scores", scores)
     materials = with_entry(run.state.params.materials, 0, "concrete")
     params = dataclasses.replace(run.state.params, materials=materials)
-    told = Told(run.field, run.cache, run.data, np.asarray(run.dataset.train))
+    told = Told(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
     found, _ = search_materials(params, told, 48, dataclasses.replace(SETTINGS.search, rounds=1))
     np.testing.assert_allclose(found.materials.log_susceptibility[0], np.log(ITU_MATERIALS[expected][0] - 1), rtol=1e-5)
 
@@ -137,7 +137,7 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
 
     monkeypatch.setattr("wbgs_jax.training.calibration.objective.make_scores", scores)
     monkeypatch.setattr(search_module, "search_idealisations", lambda params, *_: (params, {}))
-    run.control()
+    run.run_hooks()
     count = len(PARTS)
     assert looked_at == [*range(count), 0, 1]
 
@@ -147,7 +147,7 @@ def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
 def test_it_finds_out_what_ray_tracers_leave_out(natural, run_on, tmp_path, rng):
     names = rng.choice(["concrete", "wood", "plasterboard", "glass"], len(PARTS))
     run = run_on([ITU_MATERIALS[name] for name in names], natural=natural)
-    run.control()
+    run.run_hooks()
     report = json.loads((tmp_path / "metrics.jsonl").read_text())["idealisations"]
     for name in ("curved", "thick"):
         assert report[name]["dropped"] == (name in natural) == float(getattr(run.state.params, name)), report
@@ -159,7 +159,7 @@ def test_it_is_left_out_when_resumed_or_switched_off(steps, rounds, run_on, tmp_
     run = run_on([ITU_MATERIALS["wood"]] * len(PARTS), search)
     run.state = dataclasses.replace(run.state, step=jnp.asarray(steps))
     before = run.state
-    run.control()
+    run.run_hooks()
     assert run.state is before
     assert not (tmp_path / "metrics.jsonl").exists()
 
@@ -177,7 +177,7 @@ def test_known_thickness_is_not_trained(run_on):
     places = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(params)]
     assert not any("known" in place for place in places)
     np.testing.assert_array_equal(run.field.known_thickness, np.full(len(PARTS), THICKNESS, np.float32))
-    plan = run.field.plan(params, run.dataset.receiver(), cache=run.cache)
+    plan = run.field.plan(params, run.dataset.receiver(), prepared=run.prepared)
     facets = run.field.facets.offset.shape[0]
     total, slope = _thickness(params, plan)
     assert float(total) == pytest.approx(THICKNESS * facets, rel=1e-6)
@@ -207,7 +207,7 @@ def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng
     run.data = dataclasses.replace(
         run.data, snapshots=None, steering=None, power_db=received_power_db(run.data.snapshots) + offset
     )
-    run.control()
+    run.run_hooks()
     entry = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert entry["gain_db"] == pytest.approx(offset, abs=2.5 if rounds else 10)  # wrong materials reflect more or less
     assert set(entry) == ({"step", "search", "gain_db"} if rounds else {"step", "gain_db"})
@@ -224,7 +224,7 @@ def test_snapshots_in_a_unit_of_their_own_get_a_gain(ordinary, run_on, tmp_path,
     silent = np.asarray(run.dataset.train)[:2]
     loud = (run.data.snapshots * 10 ** (offset / 20)).at[silent].set(0)
     run.data = dataclasses.replace(run.data, snapshots=loud)
-    run.control()
+    run.run_hooks()
     entry = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert ("gain_db" in entry) is not ordinary
     assert ordinary or entry["gain_db"] == pytest.approx(offset, abs=10)  # wrong materials reflect more or less

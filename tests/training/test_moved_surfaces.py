@@ -43,7 +43,7 @@ def learned(truth, parts, folder, receiver=RX, found=None):
     snapshots, params = truth
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots, (receiver,))
     params = dataclasses.replace(params, transmitter=found) if found else params
-    place = Place(run.field, params, run.cache)  # materials known: what is learned here is where they are
+    place = Place(run.field, params, run.prepared)  # materials known: what is learned here is where they are
     return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
 
 
@@ -111,11 +111,11 @@ def test_antennas_that_were_found_in_a_wrong_mesh_stay_if_they_explain_what_is_h
 @pytest.mark.heavy
 def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path, monkeypatch):
     run, likely, traced = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), {0: [Slab("wood", 0.02)]}, []
-    monkeypatch.setattr(alignment, "adjust", lambda field, params, cache, motion, covariance, *_: (motion, covariance))
-    cache = run.cache  # which is prepared when it is first asked for
-    monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or cache)
+    monkeypatch.setattr(alignment, "adjust", lambda field, params, prepared, motion, covariance, *_: (motion, covariance))
+    prepared = run.prepared  # which is done when it is first asked for
+    monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or prepared)
     heard = alignment._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
-    now = Place(run.field, run.state.params, run.cache, likely=likely)
+    now = Place(run.field, run.state.params, run.prepared, likely=likely)
     assert alignment._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
 
 
@@ -165,9 +165,9 @@ def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     still = run.field.motion
     moved = run.field.moved(dataclasses.replace(still, shift=still.shift + 1e-3))
     report = GeometryReport(-1.0, -2.0, True, True, 1.0, 1.0, 0.0, 0.0, 0.0)
-    monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.cache), report))
-    run.controls = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
-    run.control()
+    monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.prepared), report))
+    run.hooks = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
+    run.run_hooks()
     assert run.field is moved
     assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
 
@@ -185,8 +185,8 @@ def test_an_antenna_that_was_dropped_is_reported_no_more(truth, tmp_path, monkey
         return dataclasses.replace(place, params=dataclasses.replace(place.params, transmitter=new.transmitter)), report
 
     monkeypatch.setattr(pipeline, "learn_geometry", moved)
-    run.controls = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
-    run.control()
+    run.hooks = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
+    run.run_hooks()
     assert list(json.loads((tmp_path / "metrics.jsonl").read_text())["antennas"]["taken"]) == ["element"]
 
 
@@ -201,7 +201,7 @@ def test_places_are_believed_as_far_as_they_are_right(truth, metres, lowest, hig
     heard, params = truth
     parts = [part.copy().apply_translation(metres * rng.choice([-1, 1], 3)) for part in PARTS]
     run = run_in(parts, SETTINGS, tmp_path, PLACES, FREQUENCIES, heard)
-    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train), "spectra")
+    score = make_scores(run.field, run.prepared, run.data, jnp.asarray(run.dataset.train), "spectra")
     found, report = search_placement(params, score)
     assert lowest * 0.99 < float(jnp.exp(found.placement[0])) < highest * 1.01 and np.ptp(found.placement) == 0
     if metres:
@@ -214,8 +214,8 @@ def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_
     run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []
     report = GeometryReport(-1.0, -1.0, False, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
-    run.controls = (pipeline.Search(SETTINGS.search),)
-    run.control()
+    run.hooks = (pipeline.Search(SETTINGS.search),)
+    run.run_hooks()
     found = json.loads((tmp_path / "metrics.jsonl").read_text())["doubt"]
     assert (len(asked) == 1) == (metres > 0) == (found["spread_mm"] > 0.5), found
 
@@ -232,7 +232,7 @@ def test_training_believes_the_wrong_surface_less(truth, tmp_path):
     @jax.jit
     def learn(placement):
         def loss(placement):
-            return run.field.loss(dataclasses.replace(params, placement=placement), run.cache, batch)[0]
+            return run.field.loss(dataclasses.replace(params, placement=placement), run.prepared, batch)[0]
 
         def step(carry, _):
             updates, state = optimizer.update(jax.grad(loss)(carry[0]), carry[1])

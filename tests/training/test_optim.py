@@ -59,7 +59,7 @@ def params():
     """Parameters by field: their shapes, and made-up values."""
     rng, made = np.random.default_rng(0), {}
     for name in RATES:
-        field = get_field(name).make(config_of(name), DatasetScene(tiny_dataset()), 0)
+        field = get_field(name).build(config_of(name), DatasetScene(tiny_dataset()), 0)
         shapes = jax.eval_shape(field.init, jax.random.key(0))
         made[name] = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), shapes)
     return made

@@ -39,7 +39,7 @@ def other_materials(params, rng):
 def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
     params = run.state.params
     candidates = [params, *(other_materials(params, rng) for _ in range(2))]
-    score = make_scores(run.field, run.cache, run.data, jnp.asarray(run.dataset.train), compared)
+    score = make_scores(run.field, run.prepared, run.data, jnp.asarray(run.dataset.train), compared)
     found = score(candidates)
     assert found.shape == (3, len(run.dataset.train))
     apart = np.abs(found[0] - found[1:]).mean(1)
@@ -60,13 +60,13 @@ def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
     one_tx = train[np.asarray(run.data.links.tx_index)[train] == int(run.data.links.tx_index[train[0]])]
     few = run.field.prepare(jax.tree.map(lambda leaf: leaf[one_tx], run.data.links), run.data.receivers)
     candidates = [other_materials(params, rng) for _ in range(11)]
-    found = make_scores(run.field, run.cache, run.data, jnp.asarray(train))(candidates)
+    found = make_scores(run.field, run.prepared, run.data, jnp.asarray(train))(candidates)
     programs = objective._score._cache_size()
     np.testing.assert_allclose(
         make_scores(run.field, few, run.data, jnp.asarray(one_tx))(candidates[:9]), found[:9, np.isin(train, one_tx)], atol=1e-4
     )
     assert objective._score._cache_size() == programs
-    score = make_scores(run.field, run.cache, run.data, jnp.asarray(train))
+    score = make_scores(run.field, run.prepared, run.data, jnp.asarray(train))
     np.testing.assert_allclose(score(candidates[:1]), found[:1], atol=1e-4)  # one differs from nothing
     named = [dataclasses.replace(params, materials=with_entry(params.materials, 0, "wood", metres)) for metres in (None, 0.1)]
     score(named)
@@ -80,8 +80,8 @@ def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
 def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
     """In any order, some of them twice."""
     links = jax.tree.map(lambda leaf: leaf[rng.integers(0, len(run.dataset), 8)], run.data.links)
-    taken = run.field.cache_of(run.cache, links)
-    jax.tree.map(np.testing.assert_array_equal, taken.of(links), run.cache.of(links))
+    taken = run.prepared.subset(links)
+    jax.tree.map(np.testing.assert_array_equal, taken.of(links), run.prepared.of(links))
     assert len(taken.tx_index) == 8
 
 
@@ -91,7 +91,7 @@ def test_a_link_on_which_nothing_was_heard_speaks_for_no_candidate(run, rng, com
     train, params = np.asarray(run.dataset.train), run.state.params
     silent = dataclasses.replace(run.data, snapshots=run.data.snapshots.at[train[1]].set(0))
     candidates = [params, other_materials(params, rng), other_materials(params, rng)]
-    score, heard = (make_scores(run.field, run.cache, data, jnp.asarray(train), compared) for data in (silent, run.data))
+    score, heard = (make_scores(run.field, run.prepared, data, jnp.asarray(train), compared) for data in (silent, run.data))
     found = score(candidates)
     assert np.isfinite(found).all()
     assert np.ptp(found[:, 1]) == 0
@@ -106,7 +106,7 @@ def test_snapshots_of_one_element_are_compared_by_their_power(rng, tmp_path):
     run = Run(scene_dataset(scene), "wave", SETTINGS, 0, tmp_path)
     candidates = [run.state.params, other_materials(run.state.params, rng)]
     train = jnp.asarray(run.dataset.train)
-    found, powers = (make_scores(run.field, run.cache, run.data, train, by)(candidates) for by in ("snapshots", "powers"))
+    found, powers = (make_scores(run.field, run.prepared, run.data, train, by)(candidates) for by in ("snapshots", "powers"))
     np.testing.assert_allclose(found, powers, atol=1e-5)
     assert np.abs(found[0] - found[1]).mean() > 1e-3
 

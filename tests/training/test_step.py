@@ -17,6 +17,7 @@ from wbgs_jax.splat import TileLimits, project
 from wbgs_jax.splat.tiles import build_tile_jobs
 from wbgs_jax.training.batches import training_data
 from wbgs_jax.training.density import DensityControl
+from wbgs_jax.training.hooks import probe_of
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
 from wbgs_jax.types import Gaussians
@@ -37,9 +38,9 @@ def toys():
         yield
 
 
-def new_run(dataset, folder, name="ripple", settings=SETTINGS, limits=None):
+def new_run(dataset, folder, name="ripple", settings=SETTINGS, capacity=None):
     run = Run(dataset, name, settings, 0, folder)
-    run.limits = run.limits if limits is None else limits
+    run.capacity = run.capacity if capacity is None else capacity
     return run
 
 
@@ -48,14 +49,14 @@ def epoch(run, state, batches, start=0):
     return run_epoch(
         jax.tree.map(jnp.asarray, state),
         run.field,
-        run.cache,
+        run.prepared,
         run.data,
         jnp.asarray(batches),
         jnp.asarray(start, jnp.int32),
         run.key,
         optimizer=run.optimizer,
-        controls=run.controls,
-        limits=run.limits,
+        hooks=run.hooks,
+        capacity=run.capacity,
     )
 
 
@@ -155,8 +156,10 @@ def test_the_statistics_are_sums_of_the_positional_gradients(tmp_path, dataset):
     so for a toy field, quicker.)"""
     run = new_run(dataset, tmp_path, "wideband", GROWING)
     index = jnp.asarray(run.batches(0, 1)[0])
-    gradients = jax.jit(loss_and_gradients, static_argnames="limits")
-    _, (d_params, d_means2d) = gradients(run.field, run.state.params, run.cache, run.data, index, run.limits, run.key)
+    gradients, probe = jax.jit(loss_and_gradients, static_argnames="capacity"), probe_of(run.hooks, run.state.params)
+    _, (d_params, d_means2d) = gradients(
+        run.field, run.state.params, run.prepared, run.data, index, run.capacity, run.key, None, probe
+    )
     state, _ = epoch(run, run.state, jnp.tile(index, (2, 1)), 1)
     expected = np.hypot(d_means2d[:, 0] * 180, d_means2d[:, 1] * 45)
     (seen,) = state.statistics
@@ -168,7 +171,7 @@ def test_the_statistics_are_sums_of_the_positional_gradients(tmp_path, dataset):
 @pytest.mark.heavy
 def test_an_overflow_commits_nothing_and_the_host_grows_the_tile_lists(tmp_path, dataset):
     """And ends where a roomy run ends."""
-    roomy, short = (new_run(dataset, tmp_path, "wideband", GROWING, limits) for limits in (None, TINY))
+    roomy, short = (new_run(dataset, tmp_path, "wideband", GROWING, capacity) for capacity in (None, TINY))
     before = snapshot(short.state)
     state, report = epoch(short, before, short.batches(0, 2))
     assert bool(report.overflow) and bool(report.stopped) and int(report.good_steps) == 0
@@ -178,32 +181,32 @@ def test_an_overflow_commits_nothing_and_the_host_grows_the_tile_lists(tmp_path,
     results = [run.epoch() for run in (roomy, short)]
     assert results[0] == results[1]
     assert short.step == 2 and short.compilations > roomy.compilations
-    assert short.limits.entries > TINY.entries
+    assert short.capacity.entries > TINY.entries
     assert_equal_states(short.state, roomy.state)
 
 
 def test_an_overflow_in_the_middle_of_an_epoch_repeats_the_rest_of_it(tmp_path, dataset):
-    """A field that needs more room with every step outgrows limits that fit the first step exactly."""
+    """A field that needs more room with every step outgrows a capacity that fits the first step exactly."""
     swelling = toy_settings(field={"learning_rate": 0.2}, loop={"epoch_steps": LENGTH})
     short, probe = (new_run(dataset, tmp_path, "swelling", swelling) for _ in range(2))
     _, report = epoch(probe, probe.state, probe.batches(0, LENGTH))
     assert bool(report.overflow) and 0 < int(report.good_steps) < LENGTH
-    assert int(report.required[0]) > short.limits.size
+    assert int(report.required[0]) > short.capacity.size
     figures = short.epoch()
-    roomy = new_run(dataset, tmp_path, "swelling", swelling, short.limits)
+    roomy = new_run(dataset, tmp_path, "swelling", swelling, short.capacity)
     assert roomy.epoch() == figures and roomy.compilations < short.compilations
     assert_equal_states(short.state, roomy.state)
 
 
 def test_limits_that_have_grown_are_kept_by_checkpoints(tmp_path, dataset):
     run = new_run(dataset, tmp_path, "swelling", SETTINGS)
-    first = run.limits
+    first = run.capacity
     run.epoch()
-    assert run.limits.size > first.size
+    assert run.capacity.size > first.size
     run.save()
     again = new_run(dataset, tmp_path, "swelling", SETTINGS)
-    assert again.limits == first and again.restore() and again.limits == run.limits == Room(run.limits.size)
-    assert again.epoch() == run.epoch() and again.limits == run.limits
+    assert again.capacity == first and again.restore() and again.capacity == run.capacity == Room(run.capacity.size)
+    assert again.epoch() == run.epoch() and again.capacity == run.capacity
     assert_equal_states(again.state, run.state)
 
 
@@ -217,8 +220,8 @@ def test_tile_lists_that_overflow_in_the_middle_of_an_epoch(tmp_path, dataset):
         loop=dataclasses.replace(GROWING.loop, epoch_steps=LENGTH),
     )
 
-    def start(limits=None):
-        run = new_run(dataset, tmp_path, "wideband", swelling, limits)
+    def start(capacity=None):
+        run = new_run(dataset, tmp_path, "wideband", swelling, capacity)
         gaussians = run.state.params.gaussians
         small = dataclasses.replace(gaussians, log_scales=gaussians.log_scales - 1)
         run.state = dataclasses.replace(run.state, params=dataclasses.replace(run.state.params, gaussians=small))
@@ -231,10 +234,10 @@ def test_tile_lists_that_overflow_in_the_middle_of_an_epoch(tmp_path, dataset):
     good, report = epoch(probe, probe.state, batches)
     assert bool(report.overflow) and 0 < int(report.good_steps) < LENGTH
     figures = short.epoch()
-    # Bit for bit where both parts ran with the same limits; other limits sum in another order, and Adam makes much of it.
-    expected, _ = epoch(start(short.limits), good, batches, int(report.good_steps))
+    # Bit for bit where both parts ran with the same capacity; another sums in another order, and Adam makes much of it.
+    expected, _ = epoch(start(short.capacity), good, batches, int(report.good_steps))
     assert_equal_states(short.state, expected)
-    roomy = start(short.limits)
+    roomy = start(short.capacity)
     assert roomy.epoch() == pytest.approx(figures, rel=1e-3) and roomy.compilations < short.compilations
 
 
@@ -274,7 +277,9 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
     """The loss alone can look healthy: its value is finite, its derivative is not."""
     run = new_run(dataset, tmp_path, "cusp")
     before = snapshot(run.state)
-    (loss, _), _ = jax.jit(loss_and_gradients)(run.field, run.state.params, run.cache, run.data, jnp.arange(2), None, run.key)
+    (loss, _), _ = jax.jit(loss_and_gradients)(
+        run.field, run.state.params, run.prepared, run.data, jnp.arange(2), None, run.key
+    )
     assert np.isfinite(loss)
     state, report = epoch(run, before, run.batches(0, LENGTH))
     assert bool(report.stopped) and int(report.good_steps) == 0 and not report.overflow

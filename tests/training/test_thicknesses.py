@@ -48,9 +48,9 @@ def of(params, names, metres):
 
 
 def told(room, truth, field=None):
-    plan = room.field.plan(truth, room.dataset.receiver(), cache=room.cache)
-    data = dataclasses.replace(room.data, snapshots=snapshots(truth, plan, room.cache, room.data.links))
-    return Told(field or room.field, room.cache, data, np.asarray(room.dataset.train))
+    plan = room.field.plan(truth, room.dataset.receiver(), prepared=room.prepared)
+    data = dataclasses.replace(room.data, snapshots=snapshots(truth, plan, room.prepared, room.data.links))
+    return Told(field or room.field, room.prepared, data, np.asarray(room.dataset.train))
 
 
 @pytest.mark.heavy

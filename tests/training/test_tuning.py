@@ -54,14 +54,14 @@ def heard_by(run, field, params):
 
 def searched(run, heard, folder, rng):
     own = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES, heard)
-    told = Told(own.field, own.cache, own.data, rng.permutation(own.dataset.train))
+    told = Told(own.field, own.prepared, own.data, rng.permutation(own.dataset.train))
     return own.field, *search_tuning(run.state.params, told, 200)
 
 
 @pytest.mark.heavy
 def test_an_array_out_of_tune_is_tuned(run, tmp_path, rng):
     gains = draw_gains(rng)
-    heard = heard_by(run, run.field.tuned(gains[None]), run.state.params)
+    heard = heard_by(run, run.field.with_gains(gains[None]), run.state.params)
     np.testing.assert_allclose(heard, gains * heard_by(run, run.field, run.state.params), rtol=1e-3, atol=1e-9)
     _, tuned, report = searched(run, heard, tmp_path, rng)
     found = np.exp(np.asarray(tuned.tuning[0]) @ [1, 1j])
@@ -80,7 +80,7 @@ def test_an_array_in_tune_is_left_alone(run, tmp_path, rng):
 
 @pytest.mark.heavy
 def test_spectra_and_snapshots_are_of_the_same_tuning(run, rng):
-    field, params = run.field.tuned(draw_gains(rng)[None]), run.state.params
+    field, params = run.field.with_gains(draw_gains(rng)[None]), run.state.params
     params = dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(1e-7)))
     query = make_query(PLACES[:4], np.full(4, 4e9))
     plan = field.plan(params, run.dataset.receiver())
@@ -91,7 +91,7 @@ def test_spectra_and_snapshots_are_of_the_same_tuning(run, rng):
 
 
 def test_another_receiver_is_in_tune(run, rng):
-    field = run.field.tuned(draw_gains(rng)[None])
+    field = run.field.with_gains(draw_gains(rng)[None])
     known = run.dataset.receiver()
     other = dataclasses.replace(known, position=known.position + 0.5)
     np.testing.assert_array_equal(field.plan(None, other).tuning, 0)

@@ -112,6 +112,6 @@ def test_few_spectra_get_fewer_steps_and_gaussians():
     assert steps == [600, 600, 1000, 2000] and limit_steps(settings, 10).optim.steps == 1000
     dataset, tiny = tiny_dataset(9), tiny_settings()
     config = dataclasses.replace(tiny.field, gaussians=2000)
-    field = get_field("wideband").make(config, DatasetScene(dataset), 0)
+    field = get_field("wideband").build(config, DatasetScene(dataset), 0)
     assert len(field.surface.points) == 500
-    assert len(get_field("wideband").make(tiny.field, DatasetScene(dataset), 0).surface.points) == tiny.field.gaussians
+    assert len(get_field("wideband").build(tiny.field, DatasetScene(dataset), 0).surface.points) == tiny.field.gaussians

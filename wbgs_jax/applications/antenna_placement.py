@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.types import Query, make_receiver
 
 Powers = Callable[[Float[Array, "k 3"], Any], Float[Array, "k users"]]
@@ -53,15 +54,15 @@ def power_at_users(field: Field, params: Any, users: Any, frequencies_hz: Any) -
     many.
 
     Args:
-        field, params: a trained field; of it the part that holds anywhere (`Field.anywhere`).
+        field, params: a trained field; of it the part that holds anywhere (`Field.receiver_independent`).
         users: (users, 3), world frame, metres.
         frequencies_hz: (f,) or one, hertz.
 
     Raises:
         UserError: the field does not hold elsewhere than at the receivers that it was trained for.
     """
-    field, params = field.anywhere(params)
-    if "power" not in field.known():
+    field, params = field.receiver_independent(params)
+    if "power" not in outputs_of(field):
         raise UserError(f"the {field.name} field has no power, only spectra; train another field")
     one = np.zeros((1, 3))  # an antenna, no array
     places = np.atleast_2d(np.asarray(users, np.float32))
@@ -70,7 +71,7 @@ def power_at_users(field: Field, params: Any, users: Any, frequencies_hz: Any) -
 
     def at(plan: Any, places: Float[Array, "k 3"], blur: Any, frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
         query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
-        power = field.render(field.blurred(params, blur), plan, query).power_db
+        power = field.render(field.smoothed(params, blur), plan, query).power_db
         assert power is not None, "the field knows it"
         return power
 

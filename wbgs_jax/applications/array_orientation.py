@@ -16,6 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.radio.antenna import Antenna, antenna_field, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
 from wbgs_jax.radio.channel import Arrivals, decibels
@@ -43,7 +44,7 @@ def arrivals_anywhere(field: Field, params: Any, receiver: Any, transmitters: An
     """Returns what reaches an isotropic element at a place from n transmitters, over every path; its frame is the world's.
 
     Args:
-        field, params: a trained field that knows paths; of it the part that holds anywhere (`Field.anywhere`).
+        field, params: a trained field that knows paths; of it the part that holds anywhere (`Field.receiver_independent`).
         receiver: (3,), world frame, metres.
         transmitters: (n, 3), the same.
         frequency_hz: hertz.
@@ -51,12 +52,12 @@ def arrivals_anywhere(field: Field, params: Any, receiver: Any, transmitters: An
     Raises:
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
-    if "paths" not in field.known():
+    if "paths" not in outputs_of(field):
         raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
-    field, params = field.anywhere(params)
+    field, params = field.receiver_independent(params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
-    return field.arrivals(params, plan, Query(places, jnp.full(len(places), frequency_hz, jnp.float32)))
+    return paths_of(field, params, plan, Query(places, jnp.full(len(places), frequency_hz, jnp.float32)))
 
 
 def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:

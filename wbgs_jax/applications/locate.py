@@ -19,7 +19,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks, shrinking
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.base import Observation, as_observed, outputs_of
 from wbgs_jax.inference.predictor import check_power
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
@@ -110,13 +110,13 @@ class Locator:
 
     def ask(self, places: Float[Array, "k 3"], blur: Any) -> Float[Array, "k links m"]:
         """Returns what the field says of K places, in the form that is compared: (k, receivers * frequencies, m)."""
-        params = self.field.blurred(self.params, blur)
+        params = self.field.smoothed(self.params, blur)
 
         def at(plan: Any, frequency_hz: Float[Array, ""]) -> Array:
             query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
             seen = self.field.render(params, plan, query)
             if self.what == "spectra":  # an observation has the noise that the data had
-                seen = seen._replace(pas=self.field.as_observed(params, seen.pas))
+                seen = seen._replace(pas=as_observed(self.field, params, seen.pas))
             return _compared(self.what, seen)
 
         # Under `vmap` over frequencies what depends on places alone, such as paths, is computed once.
@@ -150,8 +150,8 @@ def locator(
         UserError: the field knows nothing of what is observed.
     """
     needed = {"spectra": "pas", "snapshots": "snapshots", "power": "power"}[what]
-    if needed not in trained.field.known():
-        raise UserError(f"the {trained.field.name} field knows no {what}, only {', '.join(trained.field.known())}")
+    if needed not in outputs_of(trained.field):
+        raise UserError(f"the {trained.field.name} field knows no {what}, only {', '.join(outputs_of(trained.field))}")
     dataset = trained.dataset()
     if what == "power":
         check_power(trained.field, dataset)

@@ -1,7 +1,7 @@
 """Multi-start descent in a box: a grid, the best places that stand apart from each other, and steps that lead on from each.
 
 A coherent field's answers have fringes: they change over a fraction of a wavelength, and slopes lead to the next fringe.
-Functions of places therefore take a blur (metres), over which answers are averaged (`Field.blurred`): the descent begins with
+Functions of places therefore take a blur (metres), over which answers are averaged (`Field.smoothed`): the descent begins with
 a wide one, under which there are few minima, and ends with a narrow one, under which they are sharp.
 """
 

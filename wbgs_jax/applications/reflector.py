@@ -19,6 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import NARROWEST_M, Powers, soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.propagation.paths import TRANSMITTED
 from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
@@ -158,15 +159,15 @@ def straight_powers(field: Field, params: Any, ends: Any, frequencies_hz: Any) -
     Raises:
         UserError: the field knows no paths, or holds nowhere else than at its receivers.
     """
-    if "paths" not in field.known():
+    if "paths" not in outputs_of(field):
         raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
-    field, params = field.anywhere(params)
+    field, params = field.receiver_independent(params)
     one = np.zeros((1, 3))  # an antenna, no array
     plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
 
     def at(plan: Any, places: Float[Array, "k 3"], frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
-        arrived = field.arrivals(params, plan, Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1])))
+        arrived = paths_of(field, params, plan, Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1])))
         assert arrived.interaction is not None, "arrivals of traced paths have them"
         straight = jnp.all(arrived.interaction <= TRANSMITTED, -1)
         return decibels(jnp.sum(jnp.where(straight, squared_magnitude(arrived.amplitude), 0), -1))

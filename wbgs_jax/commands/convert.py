@@ -118,7 +118,7 @@ def _write_gaussians(
 
     plan = trained.field.plan(trained.params, receiver)
     query = make_query(positions, np.full(len(positions), frequency_hz))
-    seen = trained.field.splatted(trained.params, plan, query)
+    seen = trained.field.inspect(trained.params, plan, query).gaussians
     if seen is None:
         raise UserError(
             f"the {trained.field.name} field of this run has no Gaussians; train a field that has (docs/which_field.md)"

@@ -26,6 +26,7 @@ from wbgs_jax._util.files import check_writable, write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.evaluation.report import closing_lines, provenance, result_path, table, with_part
 from wbgs_jax.evaluation.score import Part, evaluate, held_out
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.inference.trained_field import TrainedField, at_receivers
 from wbgs_jax.training import curves
@@ -77,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
         folder = command.run / f"{with_part('pictures', command.part)}{beside}"
         for path in plotting.draw_all(folder, dataset, index, predicted, report, entries):
             console.print(f"picture: {path}")
-        if (displaced := trained.field.displaced_surfaces()) is not None:
+        if (displaced := trained.field.inspect(trained.params).displaced_surfaces) is not None:
             console.print(f"picture: {plotting.draw_motion(folder, *displaced)}")
     if command.json:
         print(json.dumps(report, allow_nan=False))
@@ -105,7 +106,7 @@ def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
     lines = []
     if dataset.kind != "power":
         lines.append(f"next: wbgs-jax predict --run {folder} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
-    if "power" in trained.field.known() and dataset.kind != "pas":
+    if "power" in outputs_of(trained.field) and dataset.kind != "pas":
         lines.append(f"      wbgs-jax map --run {folder} --ghz {ghz} --picture map.png")
     return [*lines, f"      wbgs-jax view --run {folder}"]
 

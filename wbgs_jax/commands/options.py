@@ -101,7 +101,7 @@ def _check_frequency(loaded: "LoadedField", lowest_hz: float) -> None:
 
     field = loaded.trained.field
     if lowest_hz < (lowest := lowest_frequency(field, loaded.dataset)) * (1 - ROUNDED):
-        able = " or ".join(name for name in field_names() if "paths" in get_field(name).gives)
+        able = " or ".join(name for name in field_names() if "paths" in get_field(name).outputs)
         raise UserError(
             f"the {field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at {lowest_hz / 1e9:g} GHz; "
             f"below, only fields with paths do: train --field {able} on data with a mesh"

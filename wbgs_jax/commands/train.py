@@ -25,6 +25,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import released_scenes, source_names
 from wbgs_jax.data.splits import VALIDATION
 from wbgs_jax.fields import default_field, field_names, get_field
+from wbgs_jax.fields.base import check_config
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.kriging import write_neighbours
 from wbgs_jax.inference.trained_field import RunConfig
@@ -132,7 +133,7 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
             f"--test-box has {len(command.test_box)} numbers; give six: x y z of the lowest corner, then of the highest"
         )
     check(settings)
-    get_field(command.field).check(settings.field)
+    check_config(command.field, settings.field)
     source = command.scene if command.data is None else command.data
     words, released = source_names(str(source)), released_scenes() if command.data is None else {}
     names = [str(Path(word).resolve()) if word not in released and Path(word).exists() else word for word in words]

@@ -45,7 +45,7 @@ def provenance(trained: TrainedField) -> dict[str, Any]:
         "seed": trained.config.seed,
         "steps": trained.step,
         "training_seconds": round(trained.seconds, 1),
-        **trained.field.sizes(trained.params),
+        **trained.field.inspect(trained.params).sizes,
         "settings": to_dict(trained.config.settings, trained.config.field),
     }
 

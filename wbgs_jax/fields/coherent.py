@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
-from wbgs_jax.fields.base import Aux, Electrical, Field, Group, Observation, compare, heard_alone, register
+from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, heard_alone, register
+from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
     Materials,
     PreparedPaths,
@@ -38,7 +38,7 @@ from wbgs_jax.fields.coherent_model import (
     slabs_at,
     trace,
 )
-from wbgs_jax.fields.coherent_settings import MAX_FACETS, PRESETS, WaveConfig
+from wbgs_jax.fields.coherent_settings import PRESETS, WaveConfig
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.mesh.edges import Edges, edges_of_facets, padded_edges
 from wbgs_jax.mesh.facets import Facets, remaining
@@ -50,7 +50,7 @@ from wbgs_jax.propagation.image_method import Search, make_search
 from wbgs_jax.radio.array import Beams, beams_of
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import turned
-from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_query, check_receiver
+from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_receiver
 
 __all__ = [
     "Materials",
@@ -78,7 +78,7 @@ SAME_PLACE_M = 1e-3
 
 @register
 @pytree
-class WaveField(Field):
+class WaveField(Calibratable):
     """Facets and edges of the scene, and the thicknesses that are known."""
 
     facets: Facets
@@ -103,22 +103,14 @@ class WaveField(Field):
 
     name: ClassVar[str] = "wave"
     presets: ClassVar = PRESETS
-    gives: ClassVar = ("pas", "snapshots", "power", "paths")
-    controls: ClassVar = ("search",)
+    outputs: ClassVar = ("pas", "snapshots", "power", "paths")
+    hooks: ClassVar = ("search",)
     seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
 
     @classmethod
-    def check(cls, config: WaveConfig) -> None:
-        """Raises a `UserError` for settings that cannot work."""
-        if config.max_facets > MAX_FACETS:
-            raise UserError(f"--{cls.name}.max-facets is {config.max_facets}; the most is {MAX_FACETS}")
-        if config.clutter_cells < 1 or config.clutter_cell <= 0:
-            raise UserError(f"--{cls.name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 does without")
-
-    @classmethod
-    def make(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
+    def build(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
         """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
-        cls.check(config)
+        config.check(cls.name)
         return make_field(scene.mesh(), config, scene.receivers.position)
 
     def init(self, key: Key[Array, ""]) -> WaveParams:
@@ -126,12 +118,16 @@ class WaveField(Field):
         facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
         return first_params(self.config, facets, materials, self.first_placement, self.first_clutter)
 
-    def plan(self, params: Any, receiver: Receiver, limits: None = None, cache: PreparedPaths | None = None) -> WavePlan:
+    def plan(
+        self, params: WaveParams | None, receiver: Receiver, prepared: PreparedPaths | None = None, capacity: None = None
+    ) -> WavePlan:
         """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
         check_receiver(receiver)
         receiver, tuning = self._as_found(receiver)
-        surfaces, beams = (self._search(receiver), _beams(receiver)) if cache is None else (cache.surfaces, cache.beams)
-        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, self.config)
+        surfaces, beams = (
+            (self._search(receiver), _beams(receiver)) if prepared is None else (prepared.surfaces, prepared.beams)
+        )
+        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, prepared, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
         """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
@@ -174,27 +170,23 @@ class WaveField(Field):
         """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
         return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
-    def cache_of(self, cache: PreparedPaths, links: Links) -> PreparedPaths:
-        """Returns the paths of some links."""
-        return cache.only(links)
-
-    def render(self, params: WaveParams, plan: WavePlan, query: Query) -> Observation:
-        """Returns spectra, snapshots and received power of B queries."""
-        check_query(query)
-        return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz)
-
-    def render_links(self, params: WaveParams, plan: WavePlan, cache: PreparedPaths, links: Links) -> Observation:
-        """Returns the same of links of one receiver whose paths are prepared."""
-        return observe(params, plan, cache.of(links), links.query.frequency_hz)
+    def render(self, params: WaveParams, plan: WavePlan, links: Query | Links) -> Observation:
+        """Returns spectra, snapshots, received power and paths of B links; where paths are prepared, of `Links`."""
+        paths = plan.paths_of(links)
+        return observe(params, dataclasses.replace(plan, prepared=None), paths, links.frequency_hz)
 
     def loss(
-        self, params: WaveParams, cache: PreparedPaths, batch: Batch, limits: None = None, probe: Any = ()
+        self,
+        params: WaveParams,
+        prepared: PreparedPaths,
+        batch: Batch,
+        capacity: None = None,
+        probe: None = None,
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
         facet corrections and clutter. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum
         of 1."""
-        plan = self.plan(params, batch.receiver, cache=cache)
-        return self.compared(params, self.render_links(params, plan, cache, batch.links), batch)
+        return self.compared(params, self.render(params, self.plan(params, batch.receiver, prepared), batch.links), batch)
 
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of what it says of a batch."""
@@ -228,22 +220,22 @@ class WaveField(Field):
         parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
         return dataclasses.replace(self, **{name: to_device(part) for name, part in parts.items()})
 
-    def tuned(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
+    def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
         further = jnp.asarray(np.stack([np.log(np.abs(gains)), np.angle(gains)], -1), jnp.float32)
         return dataclasses.replace(self, tuning=further if self.tuning is None else self.tuning + further)
 
-    def cluttered(self) -> "WaveField":
+    def with_absorption(self) -> "WaveField":
         """Returns the field that knows of clutter: none of it yet, anywhere around its surfaces and receivers (host)."""
         around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
         grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
         return dataclasses.replace(self, grid=to_device(grid), first_clutter=no_clutter(shape))
 
-    def electrical(self, params: WaveParams) -> Electrical:
+    def material_properties(self, params: WaveParams) -> MaterialProperties:
         """Returns the properties of the materials, as far as they were learned."""
         m, known = jax.tree.map(np.asarray, (params.materials, self.known_thickness))
         thickness = np.where(known > 0, known, np.exp(m.log_thickness))
-        return Electrical(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
+        return MaterialProperties(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
 
     def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
         """Returns parameters in which one material has another permittivity (above 1) and conductivity."""
@@ -258,34 +250,28 @@ class WaveField(Field):
         known = self.known_thickness.at[material].set(metres)
         return tuple(dataclasses.replace(one, known_thickness=known) for one in (self, plan))  # type: ignore[return-value]
 
-    def blurred(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
+    def smoothed(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
         """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
         variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2
         return dataclasses.replace(params, placement=params.placement.at[-1].set(0.5 * jnp.log(variance)))
 
-    def anywhere(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
+    def receiver_independent(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
         """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""
         return self, params
 
-    def displaced_surfaces(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns the corners of the facets where they stand now, and how far their movers were shifted."""
-        if not np.any(self.motion.shift):
-            return None
-        return np.asarray(self.facets.corners), np.asarray(self.motion.shift)[np.asarray(self.facets.mover)]
-
-    def arrivals(self, params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
-        """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
-        return channels(params, plan, query)
-
-    def sizes(self, params: WaveParams) -> dict[str, int]:
-        """Returns the numbers of materials, facets and edges."""
+    def inspect(self, params: WaveParams, plan: WavePlan | None = None, links: Query | Links | None = None) -> Inspection:
+        """Returns the numbers of materials, facets and edges, the materials, and how far surfaces were moved."""
         edges = int(np.count_nonzero(np.asarray(self.edges.length)))
-        return {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
+        sizes = {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
+        shift, displaced = np.asarray(self.motion.shift), None
+        if np.any(shift):
+            displaced = np.asarray(self.facets.corners), shift[np.asarray(self.facets.mover)]
+        return Inspection(sizes, self.material_properties(params), displaced)
 
     @classmethod
-    def groups(cls, config: WaveConfig) -> dict[str, Group]:
-        """Returns the groups of parameters; idealisations are searched, and not trained."""
-        return {
+    def param_groups(cls, config: WaveConfig, params: WaveParams | None = None) -> tuple[dict[str, Group], Any]:
+        """Returns the groups of parameters, and which is whose; idealisations are searched, and not trained."""
+        groups = {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
             "corrections": Group(config.corrections_lr),
@@ -294,13 +280,11 @@ class WaveField(Field):
             "ideal": Group(0.0),
             "clutter": Group(config.clutter_lr),
         }
-
-    @classmethod
-    def labels(cls, params: WaveParams) -> Any:
-        """Returns the group of every parameter."""
+        if params is None:
+            return groups, None
         clutter = [] if params.clutter is None else ["clutter"]
         found = *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
-        return with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
+        return groups, with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
@@ -335,17 +319,14 @@ def _traced(*trees: Any) -> bool:
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
     """Returns the power angular spectra of B queries."""
-    check_query(query)
-    return observe(params, plan, trace(plan, query.tx_position), query.frequency_hz).pas
+    return observe(params, plan, plan.paths_of(query), query.frequency_hz).pas
 
 
 def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array, "b elements"]:
     """Returns the complex array snapshots (channel state) of B queries."""
-    check_query(query)
-    return path_snapshots(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+    return path_snapshots(params, plan, plan.paths_of(query), query.frequency_hz)
 
 
 def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
     """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
-    check_query(query)
-    return path_arrivals(params, plan, trace(plan, query.tx_position), query.frequency_hz)
+    return path_arrivals(params, plan, plan.paths_of(query), query.frequency_hz)

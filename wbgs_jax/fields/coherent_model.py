@@ -39,7 +39,7 @@ from wbgs_jax.radio.array import (
     wide_covariance_to_pas,
 )
 from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
-from wbgs_jax.types import Links, Receiver
+from wbgs_jax.types import Links, Query, Receiver, check_query
 
 FAINTEST_SUM = 1e-12
 """Of the power of several paths, relative to the strongest: what cancels further, or is nothing, has no spectrum."""
@@ -95,6 +95,41 @@ class WaveParams:
 
 
 @pytree
+class PreparedPaths:
+    """The paths of some pairs of a receiver and a transmitter."""
+
+    surfaces: Surfaces
+    """That they meet, of all receivers alike."""
+    beams: Beams | None
+    """Of the receivers' array; None where they differ from frequency to frequency or from receiver to receiver."""
+    paths: TracedPaths
+    """Leading axis: pairs, ascending by receiver, then by transmitter."""
+    receiver_index: Int[Array, " pairs"]
+    tx_index: Int[Array, " pairs"]
+
+    def place(self, links: Links) -> Int[Array, "*b"]:
+        """Returns which of the pairs links belong to."""
+        numbers = jnp.max(self.tx_index) + 1
+        pairs, asked = (one.receiver_index * numbers + one.tx_index for one in (self, links))
+        return jnp.searchsorted(pairs, asked)
+
+    def subset(self, links: Links) -> "PreparedPaths":
+        """Returns the pairs of links, one for each, so that what is done with them does not depend on how many others there
+        are."""
+        place = jnp.sort(self.place(links))
+        paths, receiver_index, tx_index = jax.tree.map(
+            lambda leaf: leaf[place], (self.paths, self.receiver_index, self.tx_index)
+        )
+        return dataclasses.replace(self, paths=paths, receiver_index=receiver_index, tx_index=tx_index)
+
+    def of(self, links: Links) -> TracedPaths:
+        """Returns the paths of links, with their axes."""
+        place = self.place(links)
+        paths: TracedPaths = jax.tree.map(lambda leaf: leaf[place], self.paths)
+        return paths
+
+
+@pytree
 class WavePlan:
     """What is independent of the query: geometry alone. No parameter is frozen in it."""
 
@@ -110,7 +145,18 @@ class WavePlan:
     """Of the array; None where they differ from frequency to frequency, or are traced."""
     grid: Grid | None
     """Of clutter, if there is any."""
+    prepared: PreparedPaths | None
+    """Paths of the links that it will be asked about; None: they are traced."""
     config: WaveConfig = static()
+
+    def paths_of(self, links: Query | Links) -> TracedPaths:
+        """Returns the paths of B links: those that are prepared, or traced anew."""
+        if self.prepared is None:
+            check_query(links.query)
+            return trace(self, links.tx_position)
+        if isinstance(links, Query):
+            raise TypeError("a plan that was made with prepared paths traces no others; plan without, or ask about `Links`")
+        return self.prepared.of(links)
 
 
 def first_params(config: WaveConfig, facets: int, materials: int, placement: Any, clutter: Any) -> WaveParams:
@@ -159,9 +205,10 @@ def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elemen
 
 @jax.jit
 def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
-    """Returns spectra, snapshots and received power of B transmitters whose paths are known."""
+    """Returns spectra, snapshots, received power and all that arrives of B transmitters whose paths are known."""
     if not plan.config.coherent:
-        return Observation(phase_blind_pas(params, plan, paths, frequency_hz))
+        blind = phase_blind_pas(params, plan, paths, frequency_hz)
+        return Observation(blind, paths=path_arrivals(params, plan, paths, frequency_hz))
     arrived = path_arrivals(params, plan, paths, frequency_hz)
     y, elements = _snapshots(params, plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
@@ -169,7 +216,7 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz
         pas = covariance_to_pas(covariance, plan.beams)
     else:
         pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (y.shape[0], *elements.shape[-2:])))
-    return Observation(pas, y, decibels(power), covariance)
+    return Observation(pas, y, decibels(power), covariance, arrived)
 
 
 @jax.jit
@@ -273,41 +320,6 @@ TRACED_AT_ONCE = 16
 """Transmitters."""
 
 
-@pytree
-class PreparedPaths:
-    """The paths of some pairs of a receiver and a transmitter."""
-
-    surfaces: Surfaces
-    """That they meet, of all receivers alike."""
-    beams: Beams | None
-    """Of the receivers' array; None where they differ from frequency to frequency or from receiver to receiver."""
-    paths: TracedPaths
-    """Leading axis: pairs, ascending by receiver, then by transmitter."""
-    receiver_index: Int[Array, " pairs"]
-    tx_index: Int[Array, " pairs"]
-
-    def place(self, links: Links) -> Int[Array, "*b"]:
-        """Returns which of the pairs links belong to."""
-        numbers = jnp.max(self.tx_index) + 1
-        pairs, asked = (one.receiver_index * numbers + one.tx_index for one in (self, links))
-        return jnp.searchsorted(pairs, asked)
-
-    def only(self, links: Links) -> "PreparedPaths":
-        """Returns the pairs of links, one for each, so that what is done with them does not depend on how many others there
-        are."""
-        place = jnp.sort(self.place(links))
-        paths, receiver_index, tx_index = jax.tree.map(
-            lambda leaf: leaf[place], (self.paths, self.receiver_index, self.tx_index)
-        )
-        return dataclasses.replace(self, paths=paths, receiver_index=receiver_index, tx_index=tx_index)
-
-    def of(self, links: Links) -> TracedPaths:
-        """Returns the paths of links, with their axes."""
-        place = self.place(links)
-        paths: TracedPaths = jax.tree.map(lambda leaf: leaf[place], self.paths)
-        return paths
-
-
 def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedPaths:
     """Returns the paths of all receivers and transmitters of some links (host).
 
@@ -332,7 +344,7 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     """Returns the paths of B transmitters; independent of frequency and materials."""
     config, search = plan.config, plan.surfaces
     if not isinstance(search, Search):
-        raise TypeError("a plan that was made with prepared paths traces no others; plan without `cache`")
+        raise TypeError("a plan that was made with prepared paths traces no others; plan without them")
     sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
     return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
 

@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS as COMMON
 from wbgs_jax.config import SearchConfig, Settings
 
@@ -71,6 +72,13 @@ class WaveConfig:
     """Learning rate of the logarithm (where it is small) of that density."""
     placement_lr: float = 2e-2
     """Learning rate of the logarithm of `placement`."""
+
+    def check(self, name: str) -> None:
+        """Raises a `UserError` for settings that cannot work, of the field of this name."""
+        if self.max_facets > MAX_FACETS:
+            raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {MAX_FACETS}")
+        if self.clutter_cells < 1 or self.clutter_cell <= 0:
+            raise UserError(f"--{name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 does without")
 
 
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}

@@ -28,7 +28,7 @@ they are raised to a higher one.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
-from wbgs_jax.types import Query
+from wbgs_jax.types import Links, Query
 
 SHARES = np.linspace(0, 1, 21)
 """Shares of the first of two opinions that links are scored at."""
@@ -85,6 +85,19 @@ class Opinions(NamedTuple):
     coherent: Any
     own: Any
     informed: Any
+
+
+@runtime_checkable
+class Mixing(Protocol):
+    """A field that mixes three opinions by shares that are found after its training."""
+
+    def opinions(self, params: Any, plan: Any, links: Query | Links) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+        """Returns what spectra and powers of B links are said to be, and what tells whom to trust."""
+        ...
+
+    def with_shares(self, params: Any, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0) -> Any:
+        """Returns parameters with other shares, where they are given, and another floor that noise has put under spectra."""
+        ...
 
 
 class Scored(NamedTuple):

@@ -30,7 +30,7 @@ from wbgs_jax.fields.networks import (
 )
 from wbgs_jax.radio.array import EXACT, PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
 from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
-from wbgs_jax.types import Batch, Query, Receiver, Scene, check_query, check_receiver
+from wbgs_jax.types import Batch, Links, Query, Receiver, Scene, check_query, check_receiver
 
 PIXELS = PAS_HEIGHT * PAS_WIDTH
 MIN_LENGTH = 1e-3
@@ -71,6 +71,15 @@ class Nerf2Config:
     """Learning rate of the networks (authors: 5e-4)."""
     network_weight_decay: float = 0.0
     """Decoupled weight decay of the networks."""
+
+    def check(self, name: str) -> None:
+        """Raises a `UserError` for settings that cannot work, of the field of this name."""
+        counts = {option: getattr(self, option) for option in ("samples", "directions", "width", "depth")}
+        check_positive({f"{name}.{option}": n for option, n in counts.items()})
+        check_positive({f"{name}.radiance-widths": min(self.radiance_widths, default=0)})
+        if self.directions > PIXELS:
+            raise UserError(f"--{name}.directions is {self.directions}; a spectrum has {PIXELS} pixels")
+        check_octaves(name, self, ("point", "direction", "tx", "frequency"))
 
 
 CONFIGS = {
@@ -117,17 +126,7 @@ class Nerf2Field(Field):
     presets: ClassVar = with_field(PRESETS, CONFIGS)
 
     @classmethod
-    def check(cls, config: Nerf2Config) -> None:
-        """Raises a `UserError` for settings that cannot work."""
-        counts = {name: getattr(config, name) for name in ("samples", "directions", "width", "depth")}
-        check_positive({f"{cls.name}.{name}": n for name, n in counts.items()})
-        check_positive({f"{cls.name}.radiance-widths": min(config.radiance_widths, default=0)})
-        if config.directions > PIXELS:
-            raise UserError(f"--{cls.name}.directions is {config.directions}; a spectrum has {PIXELS} pixels")
-        check_octaves(cls.name, config, ("point", "direction", "tx", "frequency"))
-
-    @classmethod
-    def make(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
+    def build(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
         """Returns the field that fills the box of a scene."""
         return cls(jnp.asarray(scene.box, jnp.float32), config)
 
@@ -135,7 +134,7 @@ class Nerf2Field(Field):
         """Returns networks of random weights."""
         return _init(self, key)
 
-    def plan(self, params: Weights, receiver: Receiver, limits: None = None, cache: None = None) -> Nerf2Plan:
+    def plan(self, params: Weights, receiver: Receiver, prepared: None = None, capacity: None = None) -> Nerf2Plan:
         """Returns the rays of all pixels."""
         check_receiver(receiver)
         local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)
@@ -145,12 +144,12 @@ class Nerf2Field(Field):
         box = jax.lax.stop_gradient(self.box)
         return Nerf2Plan(make_rays(box, receiver, local), receiver, box, self.config)
 
-    def render(self, params: Weights, plan: Nerf2Plan, query: Query) -> Observation:
-        """Returns the spectra of B queries."""
-        return Observation(render(params, plan, query))
+    def render(self, params: Weights, plan: Nerf2Plan, links: Query | Links) -> Observation:
+        """Returns the spectra of B links."""
+        return Observation(render(params, plan, links.query))
 
     def loss(
-        self, params: Weights, cache: None, batch: Batch, limits: None = None, probe: Any = ()
+        self, params: Weights, prepared: None, batch: Batch, capacity: None = None, probe: None = None
     ) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of some pixels of a batch, drawn with the step's key, the same ones in all of its spectra."""
         assert batch.pas is not None, "spectra are what it is trained on"
@@ -162,9 +161,10 @@ class Nerf2Field(Field):
         return pixel_loss(predicted, truth, self.config.pixel_loss), Aux({"batch_ssim": jnp.full((), jnp.nan)})
 
     @classmethod
-    def groups(cls, config: Nerf2Config) -> dict[str, Group]:
+    def param_groups(cls, config: Nerf2Config, params: Weights | None = None) -> tuple[dict[str, Group], Any]:
         """Returns one group, the networks."""
-        return {"all": Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8)}
+        group = Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8)
+        return {"all": group}, super().param_groups(config, params)[1]
 
 
 @jax.jit

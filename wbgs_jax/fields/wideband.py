@@ -15,10 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree, static, with_leaves
-from wbgs_jax.config import PRESETS, check_positive, check_share
-from wbgs_jax.fields.base import Aux, Field, Group, Observation, Splatted, compare, power_error_db, register, with_field
+from wbgs_jax.config import PRESETS
+from wbgs_jax.fields.base import (
+    Aux,
+    Field,
+    GaussianState,
+    Group,
+    Inspection,
+    Observation,
+    compare,
+    power_error_db,
+    register,
+    with_field,
+)
 from wbgs_jax.fields.em_features import (
     GIVEN_FEATURES,
     MAX_ATTENUATION,
@@ -33,12 +43,13 @@ from wbgs_jax.fields.em_features import (
     query_features,
     received_power_db,
 )
-from wbgs_jax.fields.networks import check_octaves, positional_encoding
+from wbgs_jax.fields.networks import positional_encoding
 from wbgs_jax.fields.wideband_settings import CONFIGS, DENSITY, OPTIM, PAPER, WidebandConfig
 from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, render_splats, slots_for
 from wbgs_jax.types import (
     Batch,
     Gaussians,
+    Links,
     Query,
     Receiver,
     Scene,
@@ -74,6 +85,10 @@ class WidebandPlan:
     receiver: Receiver
     config: WidebandConfig = static()
 
+    def portable(self) -> "WidebandPlan":
+        """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
+        return dataclasses.replace(self, features=None)
+
 
 @register
 @pytree
@@ -86,28 +101,12 @@ class WidebandField(Field):
 
     name: ClassVar[str] = "wideband"
     presets: ClassVar = with_field(PRESETS, CONFIGS, density=DENSITY, optim=OPTIM) | {"paper": PAPER}
-    gives: ClassVar = ("pas", "power")
-    controls: ClassVar = ("density",)
+    outputs: ClassVar = ("pas", "power")
+    hooks: ClassVar = ("density",)
     seconds: ClassVar = {"cpu": 180.0, "smoke": 30.0}
 
     @classmethod
-    def check(cls, config: WidebandConfig) -> None:
-        """Raises a `UserError` for settings that cannot work."""
-        widths = min(config.radiance_widths, default=0)
-        name = cls.name
-        sizes = {"width": config.width, "depth": config.depth, "radiance-widths": widths, "ssim-stride": config.ssim_stride}
-        check_positive({f"{name}.{option}": size for option, size in sizes.items()})
-        check_share(f"{name}.ssim-weight", config.ssim_weight)
-        if 0 < config.gaussians < 4 or config.gaussians < 0:
-            raise UserError(f"--{name}.gaussians is {config.gaussians}; give at least 4, or 0 for the size of the mesh")
-        if not 0 <= config.fusion < config.depth:
-            raise UserError(f"--{name}.fusion is {config.fusion}; it is the number of a layer, 0 to {config.depth - 1}")
-        check_octaves(name, config, ("gaussian", "tx", "frequency"))
-        if config.frequency_degree < 1 or config.frequency_heads < 0:
-            raise UserError(f"--{name}.frequency-degree must be at least 1, --{name}.frequency-heads at least 0")
-
-    @classmethod
-    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+    def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field whose Gaussians start on the surfaces of a scene."""
         count = min(config.gaussians, max(FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM * scene.spectra))
         return make_field(scene.surface(count, seed, config.sampling), config, cls)
@@ -119,34 +118,34 @@ class WidebandField(Field):
         return _init(self, key, given)
 
     def plan(
-        self, params: WidebandParams, receiver: Receiver, limits: TileLimits | None = None, cache: None = None
+        self, params: WidebandParams, receiver: Receiver, prepared: None = None, capacity: TileLimits | None = None
     ) -> WidebandPlan:
         """Returns the projected and sorted Gaussians, and what the networks make of them alone.
 
-        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. `limits`
-        are needed under jit (`splat.geometry_plan`).
+        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. A `capacity`
+        is needed under jit (`splat.geometry_plan`).
         """
-        return self._plan(params, receiver, limits, None)
+        return self._plan(params, receiver, capacity, None)
 
     def _plan(
         self,
         params: WidebandParams,
         receiver: Receiver,
-        limits: TileLimits | None,
+        capacity: TileLimits | None,
         offset: Float[Array, "n 2"] | None,
     ) -> WidebandPlan:
         check_receiver(receiver)
-        geometry = geometry_plan(params.gaussians, receiver, limits, self.config.projection, offset)
+        geometry = geometry_plan(params.gaussians, receiver, capacity, self.config.projection, offset)
         frame = jax.lax.stop_gradient(self.frame)
         features = gaussian_features(params.gaussians, params.networks, frame, receiver, self.config)
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(
-        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
+        self, params: WidebandParams, plan: WidebandPlan, links: Query | Links, given: Float[Array, "b 90 360"] | None = None
     ) -> Observation:
-        """Returns the spectra of B queries, and their received power; networks that were made for it see the spectra that
+        """Returns the spectra of B links, and their received power; networks that were made for it see the spectra that
         another field gives."""
-        return self._render(params, plan, query, given)
+        return self._render(params, plan, links.query, given)
 
     def _render(
         self,
@@ -164,21 +163,18 @@ class WidebandField(Field):
         known = plan.frame, plan.receiver, plan.config
         return Observation(spectra, power_db=received_power_db(summary, params.networks, *known, query))
 
-    def probe(self, params: WidebandParams) -> Float[Array, "n 2"]:
-        """Returns zero offsets (pixels) of the projected centres: density control watches their gradient."""
-        return jnp.zeros((params.gaussians.means.shape[0], 2))
-
     def loss(
         self,
         params: WidebandParams,
-        cache: None,
+        prepared: None,
         batch: Batch,
-        limits: TileLimits | None = None,
-        probe: Any = None,
+        capacity: TileLimits | None = None,
+        probe: Float[Array, "n 2"] | None = None,
         given: Float[Array, "b 90 360"] | None = None,
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it."""
-        planned = self._plan(params, batch.receiver, limits, probe)
+        """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it. The
+        probe is an offset of the projected centres, pixels."""
+        planned = self._plan(params, batch.receiver, capacity, probe)
         seen = self._render(params, planned, batch.links.query, given, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
@@ -187,37 +183,28 @@ class WidebandField(Field):
         required = jnp.stack([jobs.required_entries, jobs.required_jobs])
         return loss, aux._replace(required=required, overflow=jobs.overflow)
 
-    def limits(self, params: WidebandParams, receivers: Receiver) -> TileLimits:
-        """Returns tile limits that all of the receivers' plans keep, with room for footprints that grow."""
-        required = np.zeros(2, int)
-        for i in range(receivers.position.shape[0]):
-            receiver = jax.tree.map(lambda leaf, i=i: leaf[i], receivers)
-            jobs = geometry_plan(params.gaussians, receiver, None, self.config.projection).jobs
-            required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
+    def capacity(self, params: WidebandParams, receivers: Receiver, required: Int[np.ndarray, "2"] | None = None) -> TileLimits:
+        """Returns tile limits that all of the receivers' plans keep, or that hold the required entries and jobs, with room for
+        footprints that grow."""
+        if required is None:
+            required = np.zeros(2, int)
+            for i in range(receivers.position.shape[0]):
+                receiver = jax.tree.map(lambda leaf, i=i: leaf[i], receivers)
+                jobs = geometry_plan(params.gaussians, receiver, None, self.config.projection).jobs
+                required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
         return fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
 
-    def grow(self, limits: TileLimits, required: Int[np.ndarray, "2"]) -> TileLimits:
-        """Returns limits that hold the required entries and jobs, and no less than before."""
-        return limits.grown_to(fit_limits(int(required[0]), int(required[1]), TILE_SLACK, limits.tiling))
-
-    def splatted(
-        self, params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
-    ) -> Splatted:
-        """Returns the Gaussians with their attenuation and signal for B queries."""
-        return Splatted(params.gaussians, *em_features(params, plan, query, given))
-
-    def portable(self, plan: WidebandPlan) -> WidebandPlan:
-        """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
-        return dataclasses.replace(plan, features=None)
-
-    def sizes(self, params: WidebandParams) -> dict[str, int]:
-        """Returns the number of Gaussians."""
-        return {"gaussians": int(np.asarray(params.gaussians.alive).sum())}
+    def inspect(
+        self, params: WidebandParams, plan: WidebandPlan | None = None, links: Query | Links | None = None
+    ) -> Inspection:
+        """Returns the number of Gaussians, and what they are for B links."""
+        state = None if plan is None or links is None else gaussian_state(params, plan, links.query)
+        return Inspection({"gaussians": int(np.asarray(params.gaussians.alive).sum())}, gaussians=state)
 
     @classmethod
-    def groups(cls, config: WidebandConfig) -> dict[str, Group]:
-        """Returns a group for the networks and one for every kind of parameter of the Gaussians."""
-        return {
+    def param_groups(cls, config: WidebandConfig, params: WidebandParams | None = None) -> tuple[dict[str, Group], Any]:
+        """Returns a group for the networks and one for every kind of parameter of the Gaussians, and which is whose."""
+        groups = {
             "means": Group(config.means_lr),
             "log_scales": Group(config.log_scales_lr),
             "quats": Group(config.quats_lr),
@@ -225,12 +212,10 @@ class WidebandField(Field):
             "features": Group(config.features_lr),
             "networks": Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8),
         }
-
-    @classmethod
-    def labels(cls, params: WidebandParams) -> Any:
-        """Returns the group of every parameter."""
+        if params is None:
+            return groups, None
         gaussians = ["means", "log_scales", "quats", "opacity_logits", "features"][: len(jax.tree.leaves(params.gaussians))]
-        return with_leaves(params, *gaussians, *["networks"] * len(jax.tree.leaves(params.networks)))
+        return groups, with_leaves(params, *gaussians, *["networks"] * len(jax.tree.leaves(params.networks)))
 
 
 def make_field(
@@ -305,6 +290,13 @@ def em_features(
     4.5)."""
     features = _features(params, plan, query, given)
     return features.attenuation, features.signal
+
+
+def gaussian_state(
+    params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
+) -> GaussianState:
+    """Returns the Gaussians with their attenuation and signal for B queries."""
+    return GaussianState(params.gaussians, *em_features(params, plan, query, given))
 
 
 def _features(

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 
-from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings, setting
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.config import PRESETS, DensityConfig, LoopConfig, OptimConfig, Settings, check_positive, check_share, setting
 from wbgs_jax.fields.base import Optimizer
-from wbgs_jax.fields.networks import FrequencyScale, Precision
+from wbgs_jax.fields.networks import FrequencyScale, Precision, check_octaves
 from wbgs_jax.radio.geometry import Projection
 from wbgs_jax.types import SurfaceSampling
 
@@ -78,6 +79,20 @@ class WidebandConfig:
     """Learning rate of the rotations."""
     opacity_lr: float = 2.5e-2
     """Learning rate of delta_o."""
+
+    def check(self, name: str) -> None:
+        """Raises a `UserError` for settings that cannot work, of the field of this name."""
+        widths = min(self.radiance_widths, default=0)
+        sizes = {"width": self.width, "depth": self.depth, "radiance-widths": widths, "ssim-stride": self.ssim_stride}
+        check_positive({f"{name}.{option}": size for option, size in sizes.items()})
+        check_share(f"{name}.ssim-weight", self.ssim_weight)
+        if 0 < self.gaussians < 4 or self.gaussians < 0:
+            raise UserError(f"--{name}.gaussians is {self.gaussians}; give at least 4, or 0 for the size of the mesh")
+        if not 0 <= self.fusion < self.depth:
+            raise UserError(f"--{name}.fusion is {self.fusion}; it is the number of a layer, 0 to {self.depth - 1}")
+        check_octaves(name, self, ("gaussian", "tx", "frequency"))
+        if self.frequency_degree < 1 or self.frequency_heads < 0:
+            raise UserError(f"--{name}.frequency-degree must be at least 1, --{name}.frequency-heads at least 0")
 
     @property
     def sees_frequency(self) -> bool:

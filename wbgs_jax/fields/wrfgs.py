@@ -7,7 +7,8 @@ comparison is about the frequency and nothing else; docs/baselines.md says where
 """
 
 import dataclasses
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, TypeVar
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
@@ -16,8 +17,21 @@ from wbgs_jax.fields.base import register, with_field
 from wbgs_jax.fields.wideband import CONFIGS, DENSITY, OPTIM, WidebandConfig, WidebandField
 from wbgs_jax.types import Scene
 
+C = TypeVar("C", bound=WidebandConfig)
 
-def without_frequency(config: WidebandConfig) -> WidebandConfig:
+
+@dataclass(frozen=True)
+class WrfgsConfig(WidebandConfig):
+    """Settings of the wideband field, without a frequency."""
+
+    def check(self, name: str) -> None:
+        """Raises a `UserError` for settings that cannot work."""
+        super().check(name)
+        if self != without_frequency(self):
+            raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
+
+
+def without_frequency(config: C) -> C:
     """Returns the same settings with both frequency embeddings switched off."""
     return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False, frequency_heads=0)
 
@@ -29,17 +43,13 @@ class WrfgsField(WidebandField):
 
     name: ClassVar[str] = "wrfgs"
     presets: ClassVar = with_field(
-        PRESETS, {name: without_frequency(c) for name, c in CONFIGS.items()}, density=DENSITY, optim=OPTIM
+        PRESETS,
+        {name: without_frequency(WrfgsConfig(**dataclasses.asdict(c))) for name, c in CONFIGS.items()},
+        density=DENSITY,
+        optim=OPTIM,
     )
 
     @classmethod
-    def check(cls, config: WidebandConfig) -> None:
-        """Raises a `UserError` for settings that cannot work."""
-        super().check(config)
-        if config != without_frequency(config):
-            raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
-
-    @classmethod
-    def make(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
+    def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field of a scene; its networks never see a frequency."""
-        return super().make(without_frequency(config), scene, seed)
+        return super().build(without_frequency(config), scene, seed)

@@ -17,6 +17,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import Field, field_names, get_field
+from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.intervals import expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver
@@ -121,7 +122,7 @@ def domain_of(dataset: Dataset) -> Domain:
 def lowest_frequency(field: Field, dataset: Dataset) -> float:
     """Returns the lowest frequency (hertz) at which a field can be queried: that of the model's band, or of its training; paths
     hold below, too."""
-    if "paths" in field.known():
+    if "paths" in outputs_of(field):
         return LOWEST_OF_PATHS_HZ
     return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
 
@@ -129,8 +130,8 @@ def lowest_frequency(field: Field, dataset: Dataset) -> float:
 def check_quantity(what: str, field: Field, dataset: Dataset | None = None) -> None:
     """Raises a `UserError` where a field has no such quantity, or learned nothing of it from the data."""
     needs = set(QUANTITIES[what].needs)
-    if not needs & set(field.known()):
-        able = " or ".join(name for name in field_names() if needs & set(get_field(name).gives))
+    if not needs & set(outputs_of(field)):
+        able = " or ".join(name for name in field_names() if needs & set(get_field(name).outputs))
         if needs == {"paths"}:
             lacks = "knows no paths" if what == "paths" else f"has no {what}: it knows no paths"
             raise UserError(f"the {field.name} field {lacks}; train --field {able} on data with a mesh")
@@ -213,7 +214,7 @@ def _from_arrivals(
 
 @partial(jax.jit, static_argnames=("function",))
 def _measure(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfArrivals) -> Any:
-    arrivals = field.arrivals(params, plan, query)
+    arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
 
 
@@ -285,7 +286,7 @@ def mimo_matrices(
 
 @jax.jit
 def _matrices(field: Field, params: Any, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
-    arrivals = field.arrivals(params, plan, query)
+    arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, hertz: mimo_matrix(one, receiver, hertz, elements))(arrivals, query.frequency_hz)
 
 
@@ -322,4 +323,4 @@ def arrivals_of(
 
 @jax.jit
 def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> Arrivals:
-    return field.arrivals(params, plan, query)
+    return paths_of(field, params, plan, query)

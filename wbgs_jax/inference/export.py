@@ -33,6 +33,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import portable
 from wbgs_jax.inference.evaluate_quantities import known_quantities
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
@@ -151,7 +152,7 @@ def _metadata(trained: TrainedField, dataset: Dataset, platforms: Sequence[str])
 def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]) -> tuple[list[str], bytes]:
     """Returns the names of the outputs, and the field with its parameters and plan as constants, for any number of queries."""
     frozen, names = freeze(trained, dataset.receiver()), frozen_outputs(trained, dataset)
-    frozen = frozen._replace(plan=trained.field.portable(frozen.plan))
+    frozen = frozen._replace(plan=portable(frozen.plan))
 
     def answer(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> dict[str, Array]:
         return answer_all(frozen, Query(tx_position, frequency_hz), names)

@@ -15,7 +15,8 @@ from wbgs_jax._util.devices import Devices, own_devices, spread
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
-from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields import Field, Observation, base
+from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.kriging import Beside, correct, for_receiver
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_SHAPE
@@ -59,7 +60,7 @@ def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> 
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field learned nothing of spectra."""
-    if dataset.kind == "power" and "paths" not in field.known():
+    if dataset.kind == "power" and "paths" not in outputs_of(field):
         raise UserError(
             f"{dataset.name} holds received powers, from which the {field.name} field learned no spectra; ask for --what power"
         )
@@ -67,9 +68,9 @@ def check_spectra(field: Field, dataset: Dataset) -> None:
 
 def check_power(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field cannot say what power a receiver gets."""
-    if "power" not in field.known():
+    if "power" not in outputs_of(field):
         raise UserError(f"the {field.name} field has no power, only spectra; train another field")
-    if dataset.kind == "pas" and "paths" not in field.known():
+    if dataset.kind == "pas" and "paths" not in outputs_of(field):
         raise UserError(
             f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
         )
@@ -126,18 +127,17 @@ def _observe(
     field: Field,
     params: Any,
     plan: Any,
-    cache: Any,
     neighbours: Beside,
     links: Links,
     quantity: str | None,
     mesh: Mesh | None,
 ) -> Any:
-    def own(links: Links, field: Field, params: Any, plan: Any, cache: Any, neighbours: Beside) -> Any:
-        seen = field.render_links(params, plan, cache, links)
-        seen = seen._replace(pas=correct(neighbours, seen.pas, links.query))
+    def own(links: Links, field: Field, params: Any, plan: Any, neighbours: Beside) -> Any:
+        seen = field.render(params, plan, links)
+        seen = seen._replace(pas=correct(neighbours, seen.pas, links.query), paths=None)
         return getattr(seen, quantity) if quantity else seen
 
-    return spread(own, mesh, divided=0)(links, field, params, plan, cache, neighbours)
+    return spread(own, mesh, divided=0)(links, field, params, plan, neighbours)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,13 +168,13 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
     Several devices divide every block.
     """
     links, devices = dataset.links(index), _devices(len(index))
-    cache = field.prepare(links, dataset.receivers)
+    prepared = field.prepare(links, dataset.receivers)
 
     def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Observation]]:
         for number in np.unique(dataset.receiver_index[index]):
-            plan = field.plan(params, dataset.receiver(int(number)), None, cache)
+            plan = field.plan(params, dataset.receiver(int(number)), prepared)
             of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
-            known = devices.replicated((field, params, plan, cache))
+            known = devices.replicated((field, params, plan))
             for block, filled in _blocks(of_receiver, BLOCK * devices.count):
                 yield block, _observe(*known, None, _taken(links, filled), None, devices.mesh)
 
@@ -197,9 +197,9 @@ def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, qua
     def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Any]]:
         for start in range(0, count, PREPARED):
             some = np.arange(start, min(start + PREPARED, count))
-            cache = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
-            plan = field.plan(params, receiver, None, cache)
-            known = devices.replicated((field, params, plan, cache, neighbours))
+            prepared = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
+            plan = field.plan(params, receiver, prepared)
+            known = devices.replicated((field, params, plan, neighbours))
             for block, filled in _blocks(some, min(BLOCK, count) * devices.count):
                 yield block, _observe(*known, _taken(links, filled), quantity, devices.mesh)
 
@@ -262,7 +262,7 @@ def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.n
 
 def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns what a field says as it would appear in its training data (host): what noise adds is no error of the field."""
-    seen = [np.asarray(field.as_observed(params, jnp.asarray(pas[block]))) for block in _slices(len(pas))]
+    seen = [np.asarray(base.as_observed(field, params, jnp.asarray(pas[block]))) for block in _slices(len(pas))]
     return np.concatenate(seen or [pas])
 
 

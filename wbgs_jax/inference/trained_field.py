@@ -111,7 +111,7 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
     dataset = trained.dataset() if dataset is None else dataset
     if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
         return trained
-    field, params = trained.field.anywhere(trained.params)
+    field, params = trained.field.receiver_independent(trained.params)
     return dataclasses.replace(trained, field=field, params=params, neighbours=None, confidence=None, power_confidence=None)
 
 

@@ -152,8 +152,8 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
 
 
 def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
-    """Returns what a field with paths says (`Field.arrivals`) of T transmitters at one frequency, as seen by one element of the
-    receiver's array at its centre.
+    """Returns what a field with paths says (`fields.base.paths_of`) of T transmitters at one frequency, as seen by one element
+    of the receiver's array at its centre.
 
     Transmissions have no place (NaN): a field knows which walls a path passes, and where it is reflected or diffracted.
 

@@ -1,1 +1,1 @@
-"""The host loop, the jitted step, the host controls between epochs, checkpoints and run folders."""
+"""The host loop, the jitted step, the hooks between epochs, checkpoints and run folders."""

@@ -100,7 +100,7 @@ def training_data(dataset: Dataset) -> TrainingData:
 
 def knows_no_paths(dataset: Dataset, field: type[Field]) -> bool:
     """Returns whether all that a field can know of data are their observations: it follows no paths, or there is no mesh."""
-    return "paths" not in field.gives or not len(dataset.faces)
+    return "paths" not in field.outputs or not len(dataset.faces)
 
 
 def limited(settings: Settings, dataset: Dataset, field: type[Field]) -> Settings:
@@ -120,8 +120,8 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
             "mesh, transmitters and receivers",
             stacklevel=1,  # of this line, whoever checks: it is said once
         )
-    if dataset.kind == "power" and "power" not in field.gives:
-        able = ", ".join(name for name in field_names() if "power" in get_field(name).gives)
+    if dataset.kind == "power" and "power" not in field.outputs:
+        able = ", ".join(name for name in field_names() if "power" in get_field(name).outputs)
         raise UserError(
             f"{dataset.name} holds received powers, of which the {field.name} field knows nothing; choose one of: {able}"
         )

@@ -22,7 +22,7 @@ from wbgs_jax.fields import Field
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.splat import grown_slots
-from wbgs_jax.training.hooks import Context, Edit
+from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.types import Gaussians
 
 SPLIT_SHRINK = 1.6
@@ -56,9 +56,9 @@ class DensityReport:
 
 
 @dataclass(frozen=True)
-class DensityControl:
-    """The host control of fields whose parameters hold `gaussians` and whose probe is the offset (n, 2), in pixels, of their
-    projected centres."""
+class DensityControl(Hook):
+    """The hook of fields whose parameters hold `gaussians`. The probe is the offset (n, 2), in pixels, of their projected
+    centres, whose gradient it watches."""
 
     config: DensityConfig
     stream: int = 3
@@ -67,6 +67,10 @@ class DensityControl:
         """Returns zero statistics of all slots."""
         n = params.gaussians.means.shape[0]
         return DensityStatistics(jnp.zeros(n), jnp.zeros((n, 3)), jnp.zeros(n))
+
+    def probe(self, params: Any) -> Float[Array, "n 2"]:
+        """Returns zero offsets."""
+        return jnp.zeros((params.gaussians.means.shape[0], 2))
 
     def accumulate(self, statistics: DensityStatistics, gradients: Any, probe: Float[Array, "n 2"]) -> DensityStatistics:
         """Returns the statistics after a step."""

@@ -1,15 +1,17 @@
-"""Host controls: what is done to a field between jitted epochs. All are alike to the loop.
+"""Hooks: what is done to a field between jitted epochs. All are alike to the loop.
 
-A field asks for controls by name (`Field.controls`); the settings section of that name switches one on. A control may watch
-every step (`statistics` and `accumulate` are pure and run inside the epoch) and change parameters between epochs (`apply` runs
-on the host). It says how whatever is stored beside the parameters, such as optimiser moments, follows.
+A field asks for hooks by name (`Field.hooks`); the settings section of that name, if there is one, switches it on or off. A
+hook may watch every step (`statistics`, `probe` and `accumulate` are pure and run inside the epoch) and change parameters
+between epochs (`apply` runs on the host). It says how whatever is stored beside the parameters, such as optimiser moments,
+follows.
 
 What an optimiser stores beside the parameters, when these change their shapes.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -18,6 +20,7 @@ import optax
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax.fields import Field
 from wbgs_jax.training.batches import TrainingData
+from wbgs_jax.types import Batch
 
 Say = Callable[[str], None]
 """Told what long work turns to next; raises where it is to stop."""
@@ -28,81 +31,94 @@ def silent(stage: str) -> None:
 
 
 class Edit(NamedTuple):
-    """What a control did."""
+    """What a hook did."""
 
     params: Any
     statistics: Any
-    """What the control has watched, from here on."""
+    """What the hook has watched, from here on."""
     moments: Callable[[Any], Any] | None
     """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
     report: dict[str, Any]
     """For metrics.jsonl; nothing is written if it is empty."""
     field: Field | None = None
     """The field where it is another one now, ..."""
-    cache: Any = None
+    prepared: Any = None
     """... and what it knows of the links."""
     growth: float = 1.0
     """How much more room the field needs than before."""
 
 
 class Context(NamedTuple):
-    """What a control may look at."""
+    """What a hook may look at."""
 
     data: TrainingData
-    cache: Any
+    prepared: Any
     """Of the field's `prepare`."""
     train: np.ndarray
     """Indices of the training links."""
     say: Say = silent
+    validation: Callable[[], list[Batch]] = list
+    """Returns batches of validation links, each of one receiver."""
 
 
-@runtime_checkable
-class Control(Protocol):
-    """A host control: a frozen, hashable object."""
+class Hook(ABC):
+    """A hook: a frozen, hashable object. By default it watches no step."""
 
-    @property
-    def stream(self) -> int:
-        """Number of its stream of random numbers."""
-        ...
+    stream: int
+    """Number of its stream of random numbers."""
 
     def statistics(self, params: Any) -> Any:
         """Returns zeros, to be accumulated over steps; () if it watches nothing."""
-        ...
+        return ()
+
+    def probe(self, params: Any) -> Any:
+        """Returns zeros that the field's loss is to add where the hook wants to know the gradient; None: nowhere."""
+        return None
 
     def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
-        """Returns the statistics after a step, from the gradients of the parameters and of the field's probe (pure)."""
-        ...
+        """Returns the statistics after a step, from the gradients of the parameters and of the probe (pure)."""
+        return statistics
 
+    @abstractmethod
     def due(self, step: int, steps: int) -> bool:
         """Returns whether something is to be done after this step of so many."""
-        ...
 
-    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+    @abstractmethod
+    def apply(self, field: Any, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
         """Returns the changed parameters."""
-        ...
 
     def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns parameters of the shapes that the control may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
+        """Returns parameters of the shapes that the hook may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
         None where nothing is near after this step of so many."""
-        ...
+        return None
+
+
+def probe_of(hooks: Sequence[Hook], params: Any) -> Any:
+    """Returns the probe of the first hook that has one; None if none has."""
+    return next((probe for hook in hooks if (probe := hook.probe(params)) is not None), None)
 
 
 @dataclass(frozen=True)
-class OfPart:
-    """A control of one part of a field that is made of parts: of its field and parameters of that name."""
+class OfPart(Hook):
+    """A hook of one component of a field: of its field and parameters of that name."""
 
     part: str
-    inner: Control
+    inner: Hook
 
     @property
-    def stream(self) -> int:
+    def stream(self) -> int:  # type: ignore[override]
         """Number of its stream of random numbers."""
         return self.inner.stream
 
     def statistics(self, params: Any) -> Any:
-        """Returns zeros, to be accumulated over steps; () where there is no such part."""
+        """Returns zeros, to be accumulated over steps; () where there is no such component."""
         own = getattr(params, self.part)
         return () if own is None else self.inner.statistics(own)
+
+    def probe(self, params: Any) -> Any:
+        """Returns that of the component."""
+        own = getattr(params, self.part)
+        return None if own is None else self.inner.probe(own)
 
     def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
         """Returns the statistics after a step."""
@@ -114,7 +130,7 @@ class OfPart:
         return self.inner.due(step, steps)
 
     def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
-        """Returns all parameters, those of the part changed."""
+        """Returns all parameters, those of the component changed."""
         own = getattr(params, self.part)
         if own is None:
             return Edit(params, statistics, lambda tree: tree, {})
@@ -129,7 +145,7 @@ class OfPart:
         return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
 
     def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns the shapes of all parameters that the control may soon change to, and that growth."""
+        """Returns the shapes of all parameters that the hook may soon change to, and that growth."""
         own = getattr(params, self.part)
         found = None if own is None else self.inner.next_size(own, step, steps)
         if found is None:

@@ -1,4 +1,4 @@
-"""The host loop: jitted epochs, host controls between them, checkpoints, curves, resume.
+"""The host loop: jitted epochs, hooks between them, checkpoints, curves, resume.
 
 A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step.
 
@@ -9,7 +9,7 @@ it is there, or waited for.
 
 One training run: its state, its epochs, and what is done to the field between them.
 
-What a field is made of is the field's business; a run knows the seam alone (`fields.base.Field`).
+What a field is made of is the field's business; a run knows the interface alone (`fields.base.Field`).
 """
 
 import dataclasses
@@ -36,14 +36,17 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, get_field
+from wbgs_jax.fields.base import field_from_arrays
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
 from wbgs_jax.training.calibration.pipeline import Search
 from wbgs_jax.training.density import DensityControl
-from wbgs_jax.training.hooks import Context, Control, Edit, OfPart, Say, map_moments, silent
+from wbgs_jax.training.expert_weights import ExpertWeights
+from wbgs_jax.training.hooks import Context, Edit, Hook, OfPart, Say, map_moments, silent
 from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.progress import Interrupted, TrainingProgress, deferred_interrupt
 from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
+from wbgs_jax.types import Batch
 
 
 class Precompilation:
@@ -74,20 +77,24 @@ class Precompilation:
         self._ready.add(key)
 
 
-CONTROLS: dict[str, Callable[[Any], Control]] = {"density": DensityControl, "search": Search}
-"""Host controls by the names that fields and settings give them."""
-CALIBRATED, BLOCK = 720, 16
-"""Validation links that a field is calibrated by, at most, and how many at a time."""
+HOOKS: dict[str, Callable[[Any], Hook]] = {
+    "density": DensityControl,
+    "search": Search,
+    "expert_weights": lambda _: ExpertWeights(),
+}
+"""What makes a hook from its section of the settings, by the names that fields and settings give them."""
+VALIDATION_LINKS, BLOCK = 720, 16
+"""Validation links that hooks are shown, at most, and how many at a time."""
 
 
-def make_control(name: str, settings: Settings) -> Control | None:
-    """Returns the host control that a field asks for by this name; None where the settings switch it off."""
+def make_hook(name: str, settings: Settings) -> Hook | None:
+    """Returns the hook that a field asks for by this name; None where the settings have such a section, and switch it off."""
     part, _, kind = name.rpartition(".")
-    config = getattr(settings, kind)
+    config = getattr(settings, kind, True)
     if not config:
         return None
-    control = CONTROLS[kind](config)
-    return OfPart(part, control) if part else control
+    hook = HOOKS[kind](config)
+    return OfPart(part, hook) if part else hook
 
 
 @dataclass(frozen=True)
@@ -110,16 +117,16 @@ class Run:
         dataset = without_test(dataset)  # nothing in a training can look at the test
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
-        self.controls = tuple(control for name in kind.controls if (control := make_control(name, settings)))
+        self.hooks = tuple(hook for name in kind.hooks if (hook := make_hook(name, settings)))
         self.optimizer = make_optimizer(kind, settings.field, settings.optim)
         self.checkpoints = folder / "checkpoints"
         self.seconds, self.compilations, self.compile_seconds = 0.0, 1, 0.0
         self.launched: list[Launched] = []
         self.precompilation = Precompilation()
         self._known: set[Any] = set()  # programs that have run
-        self.field = kind.make(settings.field, DatasetScene(dataset), seed)
-        self.state = init_state(self.field.init(self.key), self.optimizer, self.controls)
-        self.limits = self.field.limits(self.state.params, dataset.receivers)
+        self.field = kind.build(settings.field, DatasetScene(dataset), seed)
+        self.state = init_state(self.field.init(self.key), self.optimizer, self.hooks)
+        self.capacity = self.field.capacity(self.state.params, dataset.receivers)
         self.data, self.virtual = data_with_virtual(dataset, kind, seed if settings.optim.virtual else None)
         rng = np.random.default_rng([seed, 1])
         watched = min(settings.loop.evaluate_spectra, len(dataset.validation))
@@ -129,7 +136,7 @@ class Run:
             warnings.warn(idle, stacklevel=2)
 
     @cached_property
-    def cache(self) -> Any:
+    def prepared(self) -> Any:
         """What the field has prepared of all links: when it is first asked for, since a checkpoint may bring another field."""
         return self.field.prepare(self.data.links, self.data.receivers)
 
@@ -145,8 +152,8 @@ class Run:
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """How large the field is: host controls alone change that."""
-        return self.field.sizes(self.state.params)
+        """How large the field is: hooks alone change that."""
+        return self.field.inspect(self.state.params).sizes
 
     def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
         """Returns the batches of an epoch, each of one receiver: a function of seed and epoch alone, so that a resumed run sees
@@ -175,7 +182,7 @@ class Run:
 
     def epoch(self, go_on: bool = False) -> dict[str, float]:
         """Runs one block of steps and returns means of the loss and of the metrics. Overflowed steps are repeated with larger
-        limits.
+        capacity.
 
         `go_on` gives the device the next block before it waits for the figures of this one: nothing may be due between them.
         """
@@ -205,64 +212,69 @@ class Run:
 
     def _launch(self, step: int, first: int = 0) -> None:
         """Gives the device the epoch that begins at a step, from its batch number `first` on."""
-        length, program, cache = self.settings.loop.epoch_steps, self._program(self.state.params, self.limits), self.cache
+        length, program, prepared = (
+            self.settings.loop.epoch_steps,
+            self._program(self.state.params, self.capacity),
+            self.prepared,
+        )
         batches = self.batches(step // length, length)
         stopped = self.launched[-1].report.stopped if self.launched else jnp.zeros((), bool)
         ready, begin = self.precompilation.wait(program), time.perf_counter()
-        self.state, report = self._run_epoch(self.state, cache, batches, first, self.limits, stopped)
+        self.state, report = self._run_epoch(self.state, prepared, batches, first, self.capacity, stopped)
         self.launched.append(Launched(step, batches, report))
         if not ready and program not in self._known:
             self.compile_seconds += time.perf_counter() - begin  # the call returns before a step is done
         self._known.add(program)
 
     def _run_epoch(
-        self, state: TrainState, cache: Any, batches: Any, first: int, limits: Any, stopped: Any
+        self, state: TrainState, prepared: Any, batches: Any, first: int, capacity: Any, stopped: Any
     ) -> tuple[TrainState, EpochReport]:
         given = state, (jnp.asarray(batches), jnp.asarray(first, jnp.int32), self.key), stopped
         state, rest, stopped = self.devices.replicated(given)
         results = run_epoch(
             state,
-            *self.devices.kept(self.field, cache, self.data),
+            *self.devices.kept(self.field, prepared, self.data),
             *rest,
             optimizer=self.optimizer,
-            controls=self.controls,
-            limits=limits,
+            hooks=self.hooks,
+            capacity=capacity,
             mesh=self.devices.mesh,
             stopped=stopped,
             branches=jax.default_backend() == "cpu",
         )
         return self.devices.own(results)
 
-    def _program(self, params: Any, limits: Any) -> Any:
+    def _program(self, params: Any, capacity: Any) -> Any:
         """Returns what distinguishes the compiled epochs of a run."""
-        return limits, tuple(_shapes(params)), jax.tree.structure(self.field)
+        return capacity, tuple(_shapes(params)), jax.tree.structure(self.field)
 
     def _compile_next(self) -> None:
         """Begins to compile the epoch for the next size of the field, where one is near; of one process and device alone."""
         if self.devices.mesh is not None or jax.process_count() > 1:
             return
-        for control in self.controls:
-            found = control.next_size(self.state.params, self.step, self.settings.optim.steps)
+        for hook in self.hooks:
+            found = hook.next_size(self.state.params, self.step, self.settings.optim.steps)
             if found is None:
                 continue
-            params, limits, cache = found[0], self._grown(found[1]), self.cache
-            shapes = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
+            params, capacity, prepared = found[0], self._grown(found[1]), self.prepared
+            shapes = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
             batches = np.zeros((self.settings.loop.epoch_steps, self.batch), np.int32)
 
-            def call(shapes: Any = shapes, cache: Any = cache, limits: Any = limits, batches: Any = batches) -> None:
+            def call(shapes: Any = shapes, prepared: Any = prepared, capacity: Any = capacity, batches: Any = batches) -> None:
                 state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-                self._run_epoch(state, cache, batches, len(batches), limits, jnp.zeros((), bool))
+                self._run_epoch(state, prepared, batches, len(batches), capacity, jnp.zeros((), bool))
 
-            self.precompilation.begin(self._program(params, limits), call)
+            self.precompilation.begin(self._program(params, capacity), call)
 
     def _grown(self, growth: float) -> Any:
-        """Returns the limits of the field once it has grown: a function of those that checkpoints keep."""
-        return self.limits if self.limits is None or growth == 1 else self.limits.scaled(growth)
+        """Returns the capacity of the field once it has grown: a function of those that checkpoints keep."""
+        return self.capacity if self.capacity is None or growth == 1 else self.capacity.scaled(growth)
 
     def _recover(self, report: EpochReport, batch: Int[np.ndarray, " b"]) -> None:
-        """Grows the limits after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
+        """Grows the capacity after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
         if report.overflow:
-            self.limits = self.field.grow(self.limits, np.asarray(report.required))
+            needed = self.field.capacity(self.state.params, self.dataset.receivers, np.asarray(report.required))
+            self.capacity = self.capacity.grown_to(needed)
             self.compilations += 1
             return
         saved = checkpoint.checkpoint_steps(self.checkpoints)
@@ -273,17 +285,17 @@ class Run:
             "start again with smaller learning rates"
         )
 
-    def control(self, say: Say = silent) -> bool:
-        """Lets every host control act that is due, and returns whether any was; `say` is told of long work."""
+    def run_hooks(self, say: Say = silent) -> bool:
+        """Lets every hook act that is due, and returns whether any was; `say` is told of long work."""
         acted = False
-        for number, control in enumerate(self.controls):
-            if control.due(self.step, self.settings.optim.steps):
+        for number, hook in enumerate(self.hooks):
+            if hook.due(self.step, self.settings.optim.steps):
                 begin, step = time.perf_counter(), self.step
-                rng = np.random.default_rng([self.seed, control.stream, step])
-                context = Context(self.data, self.cache, self.dataset.train, say)
-                edit = control.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
+                rng = np.random.default_rng([self.seed, hook.stream, step])
+                context = Context(self.data, self.prepared, self.dataset.train, say, self.validation_batches)
+                edit = hook.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
-                check_alike(self.state, f"what the {type(control).__name__} made of the parameters")
+                check_alike(self.state, f"what the {type(hook).__name__} made of the parameters")
                 self.seconds += time.perf_counter() - begin
                 if edit.report:
                     self.log({"step": step} | edit.report)
@@ -294,34 +306,34 @@ class Run:
         return acted
 
     def due(self, step: int) -> bool:
-        """Returns whether anything is to be done after a step but to go on: controls, curves, a checkpoint, the end."""
+        """Returns whether anything is to be done after a step but to go on: hooks, curves, a checkpoint, the end."""
         loop, total = self.settings.loop, self.settings.optim.steps
         before, shown = step - loop.epoch_steps, len(self.watched) > 0
         return (
             step >= total
-            or any(control.due(step, total) for control in self.controls)
+            or any(hook.due(step, total) for hook in self.hooks)
             or (shown and crosses(before, step, loop.evaluate_every))
             or crosses(before, step, loop.checkpoint_every)
         )
 
     def _commit(self, number: int, edit: Edit) -> None:
-        """Puts a control's edit into the state, moments and all."""
+        """Puts a hook's edit into the state, moments and all."""
         old, statistics = self.state, list(self.state.statistics)
         self.__dict__.pop("sizes", None)
         if _shapes(edit.params) != _shapes(old.params):
             self.compilations += 1
-            self.limits = self._grown(edit.growth)
-            statistics = [control.statistics(edit.params) for control in self.controls]  # what others saw is of other shapes
+            self.capacity = self._grown(edit.growth)
+            statistics = [hook.statistics(edit.params) for hook in self.hooks]  # what others saw is of other shapes
         follow = edit.moments
         moments = map_moments(old.optimizer, old.params, follow) if follow else self.optimizer.init(edit.params)
         statistics[number] = edit.statistics
         self.state = TrainState(edit.params, moments, tuple(statistics), old.step)
         if edit.field is not None:
-            self.field, self.cache = edit.field, edit.cache
+            self.field, self.prepared = edit.field, edit.prepared
 
-    def calibrate(self) -> None:
-        """Lets the field learn what only the validation part can say."""
-        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:CALIBRATED]
+    def validation_batches(self) -> list[Batch]:
+        """Returns batches of links of the validation part, each of one receiver."""
+        chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:VALIDATION_LINKS]
         receiver = self.dataset.receiver_index[chosen]
         blocks = [
             own[i : i + BLOCK]
@@ -329,11 +341,7 @@ class Run:
             for own in [chosen[receiver == number]]
             for i in range(0, len(own), BLOCK)
         ]
-        batches = [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
-        params, report = self.field.calibrate(self.state.params, self.cache, batches)
-        self.state = dataclasses.replace(self.state, params=params)
-        if report:
-            self.log({"step": self.step} | report)
+        return [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
 
     def evaluate(self) -> dict[str, float]:
         """Returns figures of the watched validation spectra."""
@@ -346,9 +354,9 @@ class Run:
 
     def save(self) -> None:
         """Writes a checkpoint of the present step."""
-        limits = dataclasses.asdict(self.limits) if self.limits else None
+        capacity = dataclasses.asdict(self.capacity) if self.capacity else None
         compiled = {"compilations": self.compilations, "compile_seconds": self.compile_seconds + self.precompilation.seconds}
-        metadata = {"limits": limits, "seconds": self.seconds, "data": self.checksum} | compiled
+        metadata = {"limits": capacity, "seconds": self.seconds, "data": self.checksum} | compiled
         keep = self.settings.loop.keep_checkpoints
         check_alike(self.state, f"the state of step {self.step}")
         checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, keep)
@@ -363,14 +371,14 @@ class Run:
         saved = checkpoint.read(self.checkpoints, steps[-1])
         if saved.metadata.get("data", self.checksum) != self.checksum:
             raise UserError(f"the data of {self.folder} are not those that it was trained on; put them back, or train again")
-        self.field = type(self.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), self.settings.field)
+        self.field = field_from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
-        like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.controls), params)
+        like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
         self.state = checkpoint.fill_like(saved, like)
         self.seconds = float(saved.metadata["seconds"])
         if saved.metadata["limits"]:
-            self.limits = type(self.limits)(**saved.metadata["limits"])
-        for derived in ("cache", "sizes"):
+            self.capacity = type(self.capacity)(**saved.metadata["limits"])
+        for derived in ("prepared", "sizes"):
             self.__dict__.pop(derived, None)
         return True
 
@@ -384,7 +392,7 @@ def crosses(before: int, after: int, interval: int) -> bool:
     return before // interval != after // interval
 
 
-__all__ = ["CONTROLS", "Interrupted", "Run", "TrainResult", "train"]
+__all__ = ["HOOKS", "Interrupted", "Run", "TrainResult", "train"]
 
 
 @dataclass(frozen=True)
@@ -404,7 +412,7 @@ class TrainResult:
     @property
     def sizes(self) -> dict[str, int]:
         """How large the trained field is."""
-        return self.field.sizes(self.params)
+        return self.field.inspect(self.params).sizes
 
 
 def train(
@@ -453,7 +461,7 @@ def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> 
         if any_process(interrupt["set"]):
             raise Interrupted("stopped before the first step; run the same command with --resume to begin again")
 
-    if run.control(say):
+    if run.run_hooks(say):
         run.save()
 
 
@@ -464,9 +472,7 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
     stopping = any_process(interrupt["set"])
     figures = run.epoch(go_on=not (stopping or run.due(after)))
     interrupted = any_process(interrupt["set"]) and not run.launched
-    run.control()
-    if run.step == total:
-        run.calibrate()
+    run.run_hooks()
     entry: dict[str, Any] = {"step": after} | {name: None if np.isnan(v) else v for name, v in figures.items()}
     entry |= run.sizes | {"seconds": run.seconds}
     if len(run.watched) and (crosses(before, after, loop.evaluate_every) or after == total):

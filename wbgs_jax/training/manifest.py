@@ -37,7 +37,7 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
         {
             "format": FORMAT,
             "data": {"source": config.source, "sha256": trained.data},
-            "model": {"field": config.field, "preset": config.preset, **trained.field.sizes(trained.params)},
+            "model": {"field": config.field, "preset": config.preset, **trained.field.inspect(trained.params).sizes},
             "training": {
                 "command": origin["command"],
                 "seed": config.seed,

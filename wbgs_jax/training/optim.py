@@ -25,8 +25,8 @@ al. 2025)."""
 def make_optimizer(field: type[Field], config: Any, optim: OptimConfig) -> optax.GradientTransformation:
     """Returns the optimiser of a field with some settings. Equal arguments share one, and with it the compiled epoch."""
     made = {"adam": _adam, "muon": make_muon}
-    groups = {name: made[group.optimizer](group, optim) for name, group in field.groups(config).items()}
-    return optax.multi_transform(groups, field.labels)
+    groups = {name: made[group.optimizer](group, optim) for name, group in field.param_groups(config)[0].items()}
+    return optax.multi_transform(groups, lambda params: field.param_groups(config, params)[1])
 
 
 def make_muon(group: Group, optim: OptimConfig) -> optax.GradientTransformation:

@@ -25,6 +25,7 @@ from wbgs_jax._util.typed import misfit
 from wbgs_jax.config import check, from_dict, sections, to_dict
 from wbgs_jax.data.load import source_paths
 from wbgs_jax.fields import field_names, get_field
+from wbgs_jax.fields.base import check_config, field_from_arrays
 from wbgs_jax.inference import intervals, kriging
 from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import read_neighbours
@@ -67,7 +68,7 @@ def read_config(folder: Path) -> RunConfig:
     for section, part in sections(settings, kind.name).items():
         _demand_types(path, part, f"{section}.")
     check(settings)
-    kind.check(settings.field)
+    check_config(kind.name, settings.field)
     config = replaced(RunConfig("", "", "", 0, None, settings), **values)  # unchecked, until the next line
     _demand_types(path, config, "")
     return config
@@ -125,7 +126,7 @@ def load_trained(folder: Path | str) -> TrainedField:
     if not steps:
         raise UserError(f"{folder} holds no checkpoint yet; train on with the same command and --resume")
     saved = checkpoint.read(folder / "checkpoints", steps[-1])
-    field = get_field(config.field).from_arrays(jax.tree.map(jnp.asarray, saved.field), config.settings.field)
+    field = field_from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
     seconds = float(saved.metadata["seconds"])
     beside = read_neighbours(folder), read_confidence(folder), read_power_confidence(folder)

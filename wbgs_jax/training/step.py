@@ -1,8 +1,8 @@
 """The jitted part of training: pure functions on a `TrainState`.
 
-An epoch is a `lax.scan` over a block of batches with donated state. A step that overflowed its field's limits, or whose loss or
-gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and says where
-it stopped, and the host decides (larger limits and repeat, or stop with a message).
+An epoch is a `lax.scan` over a block of batches with donated state. A step that overflowed its field's capacity, or whose loss
+or gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and says
+where it stopped, and the host decides (a larger capacity and repeat, or stop with a message).
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ from wbgs_jax._util.devices import averaged
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields import Aux, Field
 from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.training.hooks import Control
+from wbgs_jax.training.hooks import Hook, probe_of
 
 
 @pytree
@@ -28,7 +28,7 @@ class TrainState:
     params: Any
     optimizer: Any
     statistics: tuple[Any, ...]
-    """What every host control has watched since it last acted."""
+    """What every hook has watched since it last acted."""
     step: Int[Array, ""]
 
 
@@ -43,41 +43,42 @@ class EpochReport:
     good_steps: Int[Array, ""]
     """Steps committed, counted from the epoch's start."""
     overflow: Bool[Array, ""]
-    """The step after the last good one did not fit its limits ..."""
+    """The step after the last good one did not fit its capacity ..."""
     required: Int[Array, " r"] | None
-    """... and required this much (the largest seen); None for a field without limits."""
+    """... and required this much (the largest seen); None for a field without a capacity."""
     stopped: Bool[Array, ""]
     """The epoch ended early, by overflow or a loss or gradient that is not finite."""
 
 
-def init_state(params: Any, optimizer: optax.GradientTransformation, controls: tuple[Control, ...] = ()) -> TrainState:
+def init_state(params: Any, optimizer: optax.GradientTransformation, hooks: tuple[Hook, ...] = ()) -> TrainState:
     """Returns the state before the first step."""
-    statistics = tuple(control.statistics(params) for control in controls)
+    statistics = tuple(hook.statistics(params) for hook in hooks)
     return TrainState(params, optimizer.init(params), statistics, jnp.zeros((), jnp.int32))
 
 
 def loss_and_gradients(
     field: Field,
     params: Any,
-    cache: Any,
+    prepared: Any,
     data: TrainingData,
     index: Int[Array, " b"],
-    limits: Any,
+    capacity: Any,
     key: Key[Array, ""],
     mesh: Mesh | None = None,
+    probe: Any = None,
 ) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
     """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch. The devices of a mesh divide
     the links evenly; the loss is the mean of theirs."""
 
-    def loss(index, params, probe, field, cache, data, key):
-        return field.loss(params, cache, data.batch(index, key), limits, probe)
+    def loss(index, params, probe, field, prepared, data, key):
+        return field.loss(params, prepared, data.batch(index, key), capacity, probe)
 
     shared = averaged(loss, mesh, divided=0)
 
     def objective(params, probe):
-        return shared(index, params, probe, field, cache, data, key)
+        return shared(index, params, probe, field, prepared, data, key)
 
-    return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, field.probe(params))
+    return jax.value_and_grad(objective, argnums=(0, 1), has_aux=True)(params, probe)
 
 
 def _all_finite(tree: Any) -> Bool[Array, ""]:
@@ -89,19 +90,19 @@ def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-@partial(jax.jit, static_argnames=("optimizer", "controls", "limits", "mesh", "branches"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("optimizer", "hooks", "capacity", "mesh", "branches"), donate_argnames="state")
 def run_epoch(
     state: TrainState,
     field: Field,
-    cache: Any,
+    prepared: Any,
     data: TrainingData,
     batches: Int[Array, "k b"],
     first: Int[Array, ""],
     key: Key[Array, ""],
     *,
     optimizer: optax.GradientTransformation,
-    controls: tuple[Control, ...] = (),
-    limits: Any = None,
+    hooks: tuple[Hook, ...] = (),
+    capacity: Any = None,
     mesh: Mesh | None = None,
     stopped: Bool[Array, ""] | None = None,
     branches: bool = True,
@@ -115,13 +116,21 @@ def run_epoch(
 
     def run(state: TrainState, index: Int[Array, " b"]):
         (loss, aux), (gradients, probe) = loss_and_gradients(
-            field, state.params, cache, data, index, limits, jax.random.fold_in(key, state.step), mesh
+            field,
+            state.params,
+            prepared,
+            data,
+            index,
+            capacity,
+            jax.random.fold_in(key, state.step),
+            mesh,
+            probe_of(hooks, state.params),
         )
         overflow = jnp.zeros((), bool) if aux.overflow is None else aux.overflow
         ok = _all_finite((loss, gradients)) & ~overflow
         updates, moments = optimizer.update(gradients, state.optimizer, state.params)
-        watched = zip(controls, state.statistics, strict=True)
-        statistics = tuple(control.accumulate(seen, gradients, probe) for control, seen in watched)
+        watched = zip(hooks, state.statistics, strict=True)
+        statistics = tuple(hook.accumulate(seen, gradients, probe) for hook, seen in watched)
         new = TrainState(optax.apply_updates(state.params, updates), moments, statistics, state.step + 1)
         return _where(ok, new, state), loss, aux._replace(overflow=overflow), ok
 

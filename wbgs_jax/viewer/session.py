@@ -12,7 +12,8 @@ from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Electrical, Splatted
+from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, outputs_of, paths_of
+from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.intervals import Expected, expected_ssim
 from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
@@ -99,7 +100,7 @@ class Asker:
     @property
     def knows_paths(self) -> bool:
         """Whether the field knows paths."""
-        return "paths" in self.trained.field.known()
+        return "paths" in outputs_of(self.trained.field)
 
     @property
     def knows_power(self) -> bool:
@@ -141,10 +142,10 @@ class Asker:
             self._samples[link] = self._sample(link)
         return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
 
-    def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Splatted | None:
+    def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> GaussianState | None:
         """Returns the Gaussians with attenuation and signal (NumPy) of a field that splats."""
         query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
-        found: Splatted | None = self.trained.field.splatted(self.trained.params, self.plan, query)
+        found = self.trained.field.inspect(self.trained.params, self.plan, query).gaussians
         return jax.tree.map(np.asarray, found)
 
     def power_plane(
@@ -162,9 +163,9 @@ class Asker:
         now = dataclasses.replace(self.loaded, trained=self.trained)
         return evaluate_plane("power", now, plane, frequencies, advance)["power_db"][0]
 
-    def materials(self) -> tuple[tuple[str, ...], Electrical] | None:
+    def materials(self) -> tuple[tuple[str, ...], MaterialProperties] | None:
         """Returns names and properties of the materials; None of a field that knows of none."""
-        found = self.trained.field.electrical(self.trained.params)
+        found = self.trained.field.inspect(self.trained.params).materials
         if found is None:
             return None
         names = self.loaded.materials or ("everything",)
@@ -172,15 +173,24 @@ class Asker:
 
     def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
         """Gives a material another permittivity and conductivity at 1 GHz (S/m) from now on."""
-        params = self.trained.field.with_material(self.trained.params, number, permittivity, conductivity)
+        found = self._calibratable()
+        own = found.field.with_material(found.of(self.trained.params), number, permittivity, conductivity)
+        params = found.put(self.trained.params, own)
         self.trained = dataclasses.replace(self.trained, params=params)
         self._samples.clear()
 
     def change_thickness(self, number: int, metres: float) -> None:
         """Makes all walls of a material this thick from now on."""
-        field, self.plan = self.trained.field.with_thickness(self.plan, number, metres)
+        found = self._calibratable()
+        own, planned = found.field.with_thickness(found.of(self.plan), number, metres)
+        field, self.plan = found.put(self.trained.field, own), found.put(self.plan, planned)
         self.trained = dataclasses.replace(self.trained, field=field)
         self._samples.clear()
+
+    def _calibratable(self) -> Ability[Calibratable]:
+        found = self.trained.field.ability(Calibratable)
+        assert found is not None, "asked of a field with `materials`"
+        return found
 
     def restore(self, trained: TrainedField) -> None:
         """Asks a field as it was trained from now on."""
@@ -226,7 +236,7 @@ def _answer(
     expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
     paths = None
     if with_paths:
-        arrived = field.arrivals(params, plan, query)
+        arrived = paths_of(field, params, plan, query)
         paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
     return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, paths))
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.fields.base import Splatted
+from wbgs_jax.fields.base import GaussianState
 from wbgs_jax.inference.radio_map import Plane
 from wbgs_jax.radio.geometry import covariance_factor, rotation_matrix
 from wbgs_jax.types import Receiver
@@ -150,7 +150,7 @@ class SceneView:
             if event.instance_index is not None:
                 on_click(int(event.instance_index))
 
-    def draw_gaussians(self, splatted: Splatted | None, by: str) -> None:
+    def draw_gaussians(self, splatted: GaussianState | None, by: str) -> None:
         """Draws the Gaussians, coloured by "signal" or "attenuation"; None removes them."""
         if splatted is None:
             self.scene.remove_by_name("/gaussians")

@@ -14,7 +14,6 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from dataclasses import field as having
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,8 @@ from jaxtyping import Float, Int
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData
@@ -91,10 +92,10 @@ class GeometryReport:
 class Place:
     """A field in which things stand somewhere, with the paths of some transmitters there."""
 
-    field: Any
+    field: Calibratable
     """A field that can be `moved`."""
-    params: Any
-    cache: Any
+    params: WaveParams
+    prepared: PreparedPaths
     known: Float[np.ndarray, "m 3 3"] | None = None
     """Covariances of where the movers stand (square metres); None where they are not known."""
     likely: Likely | None = None
@@ -113,7 +114,7 @@ class _Heard:
 
     def told(self, now: Place) -> Told:
         """Returns what they say of a place, in an order drawn anew."""
-        return Told(now.field, now.cache, self.data, self.rng.permutation(self.spectra))
+        return Told(now.field, now.prepared, self.data, self.rng.permutation(self.spectra))
 
     def named(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
         """Names the materials: as far as places are believed, or as if all of them were known; with the thicknesses that the
@@ -134,14 +135,14 @@ class _Heard:
 
     def surprised(self, now: Place) -> float:
         """Returns how badly some spectra, always the same ones, are explained as far as places are known."""
-        told = Told(now.field, now.cache, self.data, np.random.default_rng(0).permutation(self.spectra))
+        told = Told(now.field, now.prepared, self.data, np.random.default_rng(0).permutation(self.spectra))
         return float(told.scores(self.config.spectra, "covariances")([now.params])[0].mean())
 
     def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
         """Returns places, each with as much doubt as suits it, the scores of some spectra at each, and their transmitters."""
         spectra = self.rng.choice(self.spectra, min(self.config.spectra, len(self.spectra)), replace=False)
         doubted = [self.guessed(one, "spectra") for one in places]
-        scores = [Told(p.field, p.cache, self.data, spectra).scores(compared="spectra")([p.params])[0] for p in doubted]
+        scores = [Told(p.field, p.prepared, self.data, spectra).scores(compared="spectra")([p.params])[0] for p in doubted]
         return doubted, scores, np.asarray(self.data.links.tx_index)[spectra]
 
 
@@ -235,7 +236,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
-    variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.cache, none)
+    variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)
     covariance = np.diag(variances[numbers])
     for highest in frequencies_apart(frequency):
         heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
@@ -247,10 +248,10 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
         pool = heard.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, before = config.geometry_snapshots, (motion, covariance, widths)
-            motion, covariance = adjust(now.field, now.params, now.cache, *before, numbers, data, pool, count, heard.rng)
+            motion, covariance = adjust(now.field, now.params, now.prepared, *before, numbers, data, pool, count, heard.rng)
         else:
             count = config.geometry_steps
-            params, motion = descend(now.field, now.params, now.cache, motion, widths, data, pool, count, heard.rng)
+            params, motion = descend(now.field, now.params, now.prepared, motion, widths, data, pool, count, heard.rng)
             now = dataclasses.replace(now, params=params)
     known = _known(covariance, numbers, variances, len(none.shift)) if data.snapshots is not None else None
     return dataclasses.replace(now, field=now.field.moved(motion), known=known)
@@ -318,8 +319,8 @@ def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[di
     return [dict(zip(names, row, strict=True)) for row in rows]
 
 
-def _retraced(now: Place, params: Any, links: Links, data: TrainingData) -> Place:
-    return dataclasses.replace(now, params=params, cache=now.field.prepare(links, data.receivers))
+def _retraced(now: Place, params: WaveParams, links: Links, data: TrainingData) -> Place:
+    return dataclasses.replace(now, params=params, prepared=now.field.prepare(links, data.receivers))
 
 
 def _doubted(now: Place, spread: float) -> Place:
@@ -329,7 +330,7 @@ def _doubted(now: Place, spread: float) -> Place:
     return dataclasses.replace(now, params=dataclasses.replace(now.params, placement=spreads))
 
 
-def _fresh(learned: Any, initial: Any) -> Any:
+def _fresh(learned: WaveParams, initial: WaveParams) -> WaveParams:
     """Returns parameters as they were before, but for materials, antennas and how far places are believed."""
     known = {name: getattr(learned, name) for name in ("materials", "placement", *ENDS)}
     return dataclasses.replace(initial, **known)

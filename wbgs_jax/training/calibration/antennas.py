@@ -5,16 +5,16 @@ transmitters share theirs. A wrong one misplaces the power of every path: in the
 down the scene's -z axis, and a field that takes them for isotropic says of half of them less than the mean image does.
 """
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from wbgs_jax._util.pytree import replaced
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.antenna import PATTERN_EXPONENTS, Antenna
 from wbgs_jax.training.calibration.objective import Scores, by_transmitter, surely_better
 
@@ -62,12 +62,12 @@ def _antenna(pattern: str, forward: str, up: str) -> Antenna:
 
 
 def search_antennas(
-    params: Any,
+    params: WaveParams,
     score: Scores,
     tx_index: Int[np.ndarray, " n"],
     config: SearchConfig,
     known_elements: bool,
-) -> tuple[Any, AntennaReport]:
+) -> tuple[WaveParams, AntennaReport]:
     """Returns parameters with the antennas whose scores are best, in turn for transmitters and elements, where they are surely
     better than what is there, or better by much; elements whose pattern the data say are left alone."""
     taken, settled, before, after = dict[str, str](), 0, np.zeros(1), np.zeros(1)
@@ -75,7 +75,7 @@ def search_antennas(
     for turn in range(config.antenna_rounds * len(ends)):
         end, candidates = ends[turn % len(ends)], antenna_candidates()  # anew: training gives every array away once
         # What is there is scored among the others: by itself it would need a program of its own.
-        tried = [params, *(dataclasses.replace(params, **{end: antenna}) for antenna in candidates.values())]
+        tried = [params, *(replaced(params, **{end: antenna}) for antenna in candidates.values())]
         scores = score(tried)
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before, after = before if turn else scores[0], scores[0]

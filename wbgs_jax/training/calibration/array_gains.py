@@ -11,14 +11,16 @@ spectra that are looked at, and believed where it explains the other half surely
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.fields.losses import GOOD_MATCH
+from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.training.calibration.objective import Told, surely_better
 
 ROUNDS = 20
@@ -47,18 +49,18 @@ class TuningReport:
     """... and of their amplitudes."""
 
 
-def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningReport]:
+def search_tuning(params: WaveParams, told: Told, count: int) -> tuple[Calibratable, TuningReport]:
     """Returns the field with its arrays tuned as training snapshots say, where that is surely better; as it is otherwise.
 
     Args:
-        params: of a field that can be `tuned`.
+        params: of a field whose arrays can be given gains.
         told: training spectra, with snapshots, and the field.
         count: how many of them are looked at: one half says the gains, the other whether they are right.
     """
     field, links = told.field, told.data.links
     chosen = told.spectra[:count]
     half = np.unique(np.asarray(links.tx_index)[chosen], return_inverse=True)[1] % 2 == 0
-    tuned = field.tuned(gains_of(field, params, told, chosen[half]))
+    tuned = field.with_gains(gains_of(field, params, told, chosen[half]))
     judge = dataclasses.replace(told, spectra=chosen[~half])
     before, after = (dataclasses.replace(judge, field=one).scores(compared="spectra")([params])[0] for one in (field, tuned))
     kept = surely_better(before - after, judge.tx_index(), SURE)
@@ -67,13 +69,15 @@ def search_tuning(params: Any, told: Told, count: int) -> tuple[Any, TuningRepor
     return tuned if kept else field, report
 
 
-def _parts(tuned: Any) -> tuple[np.ndarray, np.ndarray]:
+def _parts(tuned: Calibratable) -> tuple[np.ndarray, np.ndarray]:
     """Returns phases (radians) and amplitudes (dB) of all elements."""
     tuning = np.asarray(tuned.tuning, np.float64)
     return tuning[..., 1], 20 / np.log(10) * tuning[..., 0]
 
 
-def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> Complex[np.ndarray, "r elements"]:
+def gains_of(
+    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+) -> Complex[np.ndarray, "r elements"]:
     """Returns the gains of all receivers' elements, 1 where too few snapshots were heard; their mean phase is 0 and their root
     mean square 1, since a common factor says nothing."""
     receiver = np.asarray(told.data.links.receiver_index)[spectra]
@@ -86,19 +90,24 @@ def gains_of(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]
     return gains
 
 
-def _snapshots(field: Any, params: Any, told: Told, spectra: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+def _snapshots(
+    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns the snapshots (n, elements) that a field says of some links, and those that were heard."""
     padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeats itself: one shape
-    said = _said(field, params, told.cache, told.data, jnp.asarray(padded, jnp.int32))
+    said = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
     assert told.data.snapshots is not None, "tuning is found from snapshots"
     return np.asarray(said)[: len(spectra)], np.asarray(told.data.snapshots)[spectra]
 
 
 @jax.jit
-def _said(field: Any, params: Any, cache: Any, data: Any, spectra: Int[Array, " n"]) -> Complex[Array, "n elements"]:
+def _said(
+    field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " n"]
+) -> Complex[Array, "n elements"]:
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
         batch = data.batch(link[None], jax.random.key(0))
-        seen = field.render_links(params, field.plan(params, batch.receiver, cache=cache), cache, batch.links)
+        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
+        assert seen.snapshots is not None, "it is coherent"
         return seen.snapshots[0]
 
     found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)

@@ -19,15 +19,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
-from wbgs_jax.fields.coherent_model import arrivals_at, element_gains
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, arrivals_at, element_gains
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.propagation.displacement import Motion, length_terms
+from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import FAINTEST, Arrivals
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.types import Receiver
+from wbgs_jax.types import Links, Receiver
 
 ROUNDS = 3
 """Steps at every frequency."""
@@ -46,9 +48,9 @@ ARM = 3.0
 
 
 def adjust(
-    field: Any,
-    params: Any,
-    cache: Any,
+    field: Calibratable,
+    params: WaveParams,
+    prepared: PreparedPaths,
     motion: Motion,
     covariance: Float[np.ndarray, "q q"],
     widths: Motion,
@@ -62,7 +64,7 @@ def adjust(
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
-        cache: paths of the links of the pool.
+        prepared: paths of the links of the pool.
         motion: the one to start with, of all receivers.
         covariance: of the numbers that are adjusted, by lower frequencies, or by the prior.
         widths: standard deviations of the prior of the whole motion, that of the field included.
@@ -77,7 +79,7 @@ def adjust(
     others = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2
     stiffness, others[numbers] = 1 / others[numbers], 0
     known = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
-    variance = length_variances(cache, *known, numbers, len(motion.shift))
+    variance = length_variances(prepared, *known, numbers, len(motion.shift))
     frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
     for _ in range(ROUNDS):
@@ -85,7 +87,7 @@ def adjust(
         some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # of one shape, whatever the pool: compiled once
         some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
         now = back(jnp.asarray(moves, jnp.float32))
-        equations = normal_equations(field, params, now, cache, data, some, variance, np.int32(blocks), numbers)
+        equations = normal_equations(field, params, now, prepared, data, some, variance, np.int32(blocks), numbers)
         curvature, pull = (np.asarray(a, np.float64) / ALIKE for a in equations)
         precision = curvature + np.diag(stiffness)
         step = np.linalg.solve(precision, pull - stiffness * (start + moves[numbers]))
@@ -93,13 +95,13 @@ def adjust(
     return back(jnp.asarray(moves, jnp.float32)), np.linalg.inv(precision)
 
 
-def adjusted_numbers(cache: Any, motion: Motion) -> Int[np.ndarray, " q"]:
+def adjusted_numbers(prepared: PreparedPaths, motion: Motion) -> Int[np.ndarray, " q"]:
     """Returns which numbers of a motion are adjusted, as `ravel_pytree` orders them: those of all receivers, and those of the
     movers that change the lengths of paths most, at most `MOST` of these."""
     movers, size = len(motion.shift), ravel_pytree(motion)[0].size
     if movers <= MOST:
         return np.arange(size, dtype=np.int32)
-    felt = np.asarray(_felt(cache, movers, size))[: 3 * movers].reshape(movers, 3).sum(1)
+    felt = np.asarray(_felt(prepared, movers, size))[: 3 * movers].reshape(movers, 3).sum(1)
     chosen = np.sort(np.argsort(-felt, kind="stable")[:MOST])
     shifts = (3 * chosen[:, None] + np.arange(3)).reshape(-1)
     return np.concatenate([shifts, 3 * movers + shifts, np.arange(6 * movers, size)]).astype(np.int32)
@@ -117,26 +119,26 @@ def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
 
 
 @partial(jax.jit, static_argnames=("movers", "size"))
-def _felt(cache: Any, movers: int, size: int) -> Float[Array, " p"]:
+def _felt(prepared: PreparedPaths, movers: int, size: int) -> Float[Array, " p"]:
     """Returns how strongly the lengths of all paths together depend on every number of a motion."""
 
     def add(total: Float[Array, " p"], pair: Any) -> tuple[Float[Array, " p"], None]:
         paths, receiver = pair
-        number, derivative = _terms(cache, paths, receiver, movers)
+        number, derivative = _terms(prepared, paths, receiver, movers)
         alive = jnp.concatenate([paths.specular.alive, paths.diffracted.alive])
         return total.at[number].add(jnp.where(alive[:, None], derivative**2, 0)), None
 
-    return jax.lax.scan(add, jnp.zeros(size), (cache.paths, cache.receiver_index))[0]
+    return jax.lax.scan(add, jnp.zeros(size), (prepared.paths, prepared.receiver_index))[0]
 
 
 @partial(jax.jit, static_argnames="movers")
 def length_variances(
-    cache: Any, covariance: Float[Array, "q q"], others: Float[Array, " p"], numbers: Int[Array, " q"], movers: int
+    prepared: PreparedPaths, covariance: Float[Array, "q q"], others: Float[Array, " p"], numbers: Int[Array, " q"], movers: int
 ) -> Float[Array, "pairs k"]:
     """Returns the variances (square metres) of the lengths of all paths.
 
     Args:
-        cache: of the paths.
+        prepared: of the paths.
         covariance: of the numbers of the motion that are adjusted.
         others: variances of those that are not; 0 for the rest.
         numbers: those that are adjusted.
@@ -146,28 +148,30 @@ def length_variances(
 
     def of_pair(pair: Any) -> Float[Array, " k"]:
         paths, receiver = pair
-        number, derivative = _terms(cache, paths, receiver, movers)
+        number, derivative = _terms(prepared, paths, receiver, movers)
         own = place[number]
         known = jnp.einsum("ki,kij,kj->k", derivative, shared[own[:, :, None], own[:, None, :]], derivative, precision=EXACT)
         return jnp.maximum(known, 0) + jnp.sum(derivative**2 * others[number], -1)
 
-    variances: Float[Array, "pairs k"] = jax.lax.map(of_pair, (cache.paths, cache.receiver_index))
+    variances: Float[Array, "pairs k"] = jax.lax.map(of_pair, (prepared.paths, prepared.receiver_index))
     return variances
 
 
-def _terms(cache: Any, paths: Any, receiver: Int[Array, ""], movers: int) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
+def _terms(
+    prepared: PreparedPaths, paths: TracedPaths, receiver: Int[Array, ""], movers: int
+) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
     """Returns the numbers of a motion of all receivers that all paths to one of them depend on, and the derivatives."""
-    terms = [length_terms(some, cache.surfaces, movers) for some in (paths.specular, paths.diffracted)]
+    terms = [length_terms(some, prepared.surfaces, movers) for some in (paths.specular, paths.diffracted)]
     number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
     return jnp.where(number < 6 * movers, number, number + 3 * receiver), derivative
 
 
 @jax.jit
 def normal_equations(
-    field: Any,
-    params: Any,
+    field: Calibratable,
+    params: WaveParams,
     motion: Motion,
-    cache: Any,
+    prepared: PreparedPaths,
     data: TrainingData,
     index: Int[Array, "blocks b"],
     variance: Float[Array, "pairs k"],
@@ -182,17 +186,17 @@ def normal_equations(
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))
         assert batch.snapshots is not None, "phases are what it looks at"
-        asked: Any = jax.tree.map(lambda leaf: leaf[0], batch.links)
-        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), motion.of_receiver(asked.receiver_index))
-        paths, frequency = cache.of(asked), asked.query.frequency_hz
+        asked: Links = jax.tree.map(lambda leaf: leaf[0], batch.links)
+        plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(asked.receiver_index))
+        paths, frequency = prepared.of(asked), asked.query.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
         arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
-        expected = jnp.exp(-0.5 * wavenumber**2 * variance[cache.place(asked)])
+        expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(asked)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
         if plan.tuning is not None:
             voltages = voltages * element_gains(plan.tuning)
-        number, derivative = _terms(cache, paths, asked.receiver_index, movers)
+        number, derivative = _terms(prepared, paths, asked.receiver_index, movers)
         lengths = jnp.zeros((len(number), q + 1)).at[jnp.arange(len(number))[:, None], place[number]].add(derivative)
         parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
         real, imaginary = jnp.split(jnp.matmul(parts.T, lengths[:, :q], precision=EXACT), 2)

@@ -14,6 +14,8 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax.fields.base import compare, heard_alone
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import centres
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
@@ -35,21 +37,21 @@ SEARCHED = ("transmitter", "element", "placement", "thick", "curved")
 
 
 def descend(
-    field: Any,
-    params: Any,
-    cache: Any,
+    field: Calibratable,
+    params: WaveParams,
+    prepared: PreparedPaths,
     motion: Motion,
     widths: Motion,
     data: TrainingData,
     pool: Int[np.ndarray, " n"],
     count: int,
     rng: np.random.Generator,
-) -> tuple[Any, Motion]:
+) -> tuple[WaveParams, Motion]:
     """Returns parameters and a motion after some steps on spectra up to some frequency.
 
     Args:
         field, params: a coherent field, which is not moved: the motion is small.
-        cache: paths of the links of the pool.
+        prepared: paths of the links of the pool.
         motion: the one to start with, of all receivers.
         widths: standard deviations of the prior of the whole motion, that of the field included.
         data: with spectra.
@@ -63,33 +65,33 @@ def descend(
     # The curvature of the normal prior, beside a loss that is a mean over so many numbers.
     numbers = len(pool) * data.receivers.element_positions.shape[-2]
     prior = jax.tree.map(lambda far: 1 / (far**2 * numbers), widths)
-    return _steps(field, params, motion, cache, data, batches, rate, unseen, prior)
+    return _steps(field, params, motion, prepared, data, batches, rate, unseen, prior)
 
 
 @jax.jit
 def _steps(
-    field: Any,
-    params: Any,
+    field: Calibratable,
+    params: WaveParams,
     motion: Motion,
-    cache: Any,
+    prepared: PreparedPaths,
     data: TrainingData,
     batches: Int[Array, "k b"],
-    rate: Any,
-    unseen: Any,
+    rate: float | Float[Array, ""],
+    unseen: float | Float[Array, ""],
     prior: Motion,
-) -> tuple[Any, Motion]:
+) -> tuple[WaveParams, Motion]:
     """Learns a motion, with materials and corrections beside it, on some batches."""
     others, reach = optax.adam(RATE), _reach(field)
     # Steps of motions shrink to a tenth over the batches.
     shifts = optax.adam(optax.cosine_decay_schedule(1.0, batches.shape[0], 0.1), eps=unseen)
 
-    def objective(learned: Any, index: Int[Array, " b"]) -> Float[Array, ""]:
+    def objective(learned: tuple[WaveParams, Motion], index: Int[Array, " b"]) -> Float[Array, ""]:
         params, metres = learned
         batch = data.batch(index, jax.random.key(0))
         motion = _by(metres, reach)
         seen_from = motion.of_receiver(batch.links.receiver_index[0])
-        plan = field.displaced(field.plan(params, batch.receiver, cache=cache), seen_from)
-        seen = field.render_links(params, plan, cache, batch.links)
+        plan = field.displaced(field.plan(params, batch.receiver, prepared), seen_from)
+        seen = field.render(params, plan, batch.links)
         loss, _ = compare(seen, heard_alone(batch, seen))
         total = jax.tree.map(jnp.add, field.motion, motion)
         pulled = jax.tree.map(lambda stiffness, far: 0.5 * jnp.sum(stiffness * far**2), prior, total)
@@ -110,7 +112,7 @@ def _steps(
     return params, _by(metres, reach)
 
 
-def _reach(field: Any) -> Motion:
+def _reach(field: Calibratable) -> Motion:
     """Returns how far (metres) a motion of 1 metre or radian moves what it moves; the receiver's turn moves no more than phases
     along its array, and counts like metres."""
     facets, movers = field.facets, len(field.motion.shift)

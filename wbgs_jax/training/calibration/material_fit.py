@@ -10,7 +10,6 @@ entries are worth a closer look. Training goes on from there.
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Array, Float
 from wbgs_jax._util.pytree import same
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.coherent_model import Materials, WaveParams
 from wbgs_jax.training.calibration.objective import Compared, Told
 
 ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
@@ -73,8 +73,8 @@ class SearchReport:
 
 
 def search_materials(
-    params: Any, told: Told, count: int, config: SearchConfig, compared: Compared = "snapshots", usual: bool = False
-) -> tuple[Any, SearchReport]:
+    params: WaveParams, told: Told, count: int, config: SearchConfig, compared: Compared = "snapshots", usual: bool = False
+) -> tuple[WaveParams, SearchReport]:
     """Returns parameters with the materials by which spectra are explained best.
 
     Args:
@@ -115,13 +115,13 @@ def search_materials(
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
-def unknown_mm(materials: Any, known_thickness: Float[np.ndarray, " m"]) -> dict[int, float]:
+def unknown_mm(materials: Materials, known_thickness: Float[np.ndarray, " m"]) -> dict[int, float]:
     """Returns how thick (mm) those materials are whose thickness the scene does not say (0)."""
     metres = np.exp(np.asarray(materials.log_thickness))
     return {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(known_thickness == 0)}
 
 
-def entries_of(materials: Any) -> dict[int, str]:
+def entries_of(materials: Materials) -> dict[int, str]:
     """Returns which materials are entries of ITU-R P.2040, and which."""
     own = np.exp(np.stack([materials.log_susceptibility, materials.log_conductivity, materials.slope]))
     listed = {name: np.exp([np.log(permittivity - 1), np.log(c), d]) for name, (permittivity, c, d) in ITU_MATERIALS.items()}
@@ -129,12 +129,14 @@ def entries_of(materials: Any) -> dict[int, str]:
     return dict(alike)
 
 
-def with_entry(materials: Any, material: int, name: str, metres: float | None = None) -> Any:
+def with_entry(materials: Materials, material: int, name: str, metres: float | None = None) -> Materials:
     """Returns a copy in which one material is an entry of ITU-R P.2040, so many metres thick, or as thick as before."""
     return with_properties(materials, material, *ITU_MATERIALS[name], metres)
 
 
-def with_properties(materials: Any, material: int, permittivity: float, c: float, d: float, metres: float | None = None) -> Any:
+def with_properties(
+    materials: Materials, material: int, permittivity: float, c: float, d: float, metres: float | None = None
+) -> Materials:
     """Returns a copy in which one material has another relative permittivity (above 1), the conductivity c f^d (S/m, f in GHz),
     and is so many metres thick, or as thick as before."""
     new = {

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float, Int
 from scipy.stats import norm, permutation_test
 
 from wbgs_jax._util.statistics import by_transmitter, standard_error
-from wbgs_jax.fields import Field
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch, Links
@@ -40,24 +41,28 @@ dB), as always where they are all that is known. A link on which nothing was hea
 class Scores(Protocol):
     """How badly candidates for all parameters explain some spectra."""
 
-    def __call__(self, candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+    def __call__(self, candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
         """Returns the scores of K candidates on all of the spectra, or on the first so many."""
         ...
 
 
 def make_scores(
-    field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " n"], compared: Compared = "snapshots"
+    field: Calibratable,
+    prepared: PreparedPaths,
+    data: TrainingData,
+    spectra: Int[Array, " n"],
+    compared: Compared = "snapshots",
 ) -> Scores:
     """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
     (the very same arrays) is computed once for all of them."""
 
     @functools.cache
-    def block(start: int) -> tuple[Any, Batch]:
+    def block(start: int) -> tuple[PreparedPaths, Batch]:
         """Returns what is looked at of so many spectra; the last block repeats its last."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
-        return _looked_at(field, cache, data, own)
+        return _looked_at(field, prepared, data, own)
 
-    def score(candidates: Sequence[Any], first: int | None = None) -> Float[np.ndarray, "k n"]:
+    def score(candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
         room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
         if len(candidates) > room:
             return np.concatenate([score(candidates[:room], first), score(candidates[room:], first)])
@@ -78,8 +83,8 @@ def make_scores(
 class Told:
     """Some training spectra, and what they say of a field with the paths of their transmitters."""
 
-    field: Any
-    cache: Any
+    field: Calibratable
+    prepared: PreparedPaths
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
     """In the order in which they are looked at."""
@@ -87,7 +92,7 @@ class Told:
     def scores(self, count: int | None = None, compared: Compared = "snapshots", highest_hz: float = np.inf) -> Scores:
         """Returns the function that scores candidates on the first of those up to a frequency."""
         own = self.spectra[self.frequency_hz() <= highest_hz * (1 + 1e-6)][:count]
-        return make_scores(self.field, self.cache, self.data, jnp.asarray(own, jnp.int32), compared)
+        return make_scores(self.field, self.prepared, self.data, jnp.asarray(own, jnp.int32), compared)
 
     def frequency_hz(self) -> Float[np.ndarray, " n"]:
         """Returns their frequencies."""
@@ -113,19 +118,21 @@ def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> t
 
 
 @jax.jit
-def _looked_at(field: Field, cache: Any, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[Any, Batch]:
+def _looked_at(
+    field: Calibratable, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " m"]
+) -> tuple[PreparedPaths, Batch]:
     """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
-    return field.cache_of(cache, links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
+    return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
 @functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
 def _score(
-    field: Field,
-    structure: Any,
+    field: Calibratable,
+    structure: jax.tree_util.PyTreeDef,
     differ: tuple[bool, ...],
     leaves: tuple[Array, ...],
-    cache: Any,
+    prepared: PreparedPaths,
     batches: Batch,
     compared: Compared,
 ) -> Float[Array, "k m"]:
@@ -133,7 +140,7 @@ def _score(
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
-        seen = field.render_links(params, field.plan(params, batch.receiver, None, cache), cache, batch.links)
+        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
         elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
         several = batch.snapshots if elements > 1 else None  # that of a single element tells its power only
         if several is not None and compared == "snapshots" and seen.snapshots is not None:

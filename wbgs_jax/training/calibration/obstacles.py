@@ -25,6 +25,8 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import Materials, PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import centres
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData, batches_of_one_receiver
@@ -63,7 +65,9 @@ class AbsentReport:
     """Of all that were left out: metres, world frame."""
 
 
-def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = silent) -> tuple[Any, Told, AbsentReport]:
+def search_absent(
+    params: WaveParams, told: Told, config: SearchConfig, say: Say = silent
+) -> tuple[WaveParams, Told, AbsentReport]:
     """Returns parameters, and the field with its paths, without the bodies whose absence snapshots tell.
 
     Args:
@@ -82,7 +86,7 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
         if not len(movers):
             break
         field = told.field.without(movers)
-        fewer = dataclasses.replace(told, field=field, cache=field.prepare(told.data.links, told.data.receivers))
+        fewer = dataclasses.replace(told, field=field, prepared=field.prepare(told.data.links, told.data.receivers))
         others, _ = search_materials(_carried(params, field), fewer, config.spectra, once)
         after = _explained(others, dataclasses.replace(fewer, spectra=judged.spectra), config)
         if not surely_better(now - after, tx, SURE):
@@ -93,14 +97,14 @@ def search_absent(params: Any, told: Told, config: SearchConfig, say: Say = sile
     return params, told, AbsentReport(float(before.mean()), float(now.mean()), where)
 
 
-def _explained(params: Any, told: Told, config: SearchConfig) -> Float[np.ndarray, " n"]:
+def _explained(params: WaveParams, told: Told, config: SearchConfig) -> Float[np.ndarray, " n"]:
     """Returns how badly snapshots are explained, with as much doubt of all places as suits them: phases of what stands a little
     elsewhere are then believed no more, and it is better than nothing."""
     doubted, _ = search_placement(params, told.scores(config.placement_spectra, "covariances"))
     return told.scores(config.spectra, "covariances")([doubted])[0]
 
 
-def absent_movers(params: Any, told: Told, config: SearchConfig) -> Int[np.ndarray, " k"]:
+def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[np.ndarray, " k"]:
     """Returns the movers without which snapshots are explained surely better, each without those before it; never all."""
     highest = BELIEVED * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
     low = told.frequency_hz() <= highest
@@ -127,27 +131,27 @@ def absent_movers(params: Any, told: Told, config: SearchConfig) -> Int[np.ndarr
     return np.sort(np.array(gone, int))
 
 
-def _each_by_itself(params: Any, told: Told) -> tuple[Told, Any]:
+def _each_by_itself(params: WaveParams, told: Told) -> tuple[Told, WaveParams]:
     """Returns the field, its paths and its parameters with every mover of a material of its own, alike to begin with, and of a
     thickness that nobody knows."""
     facets = told.field.facets
     source = np.zeros(len(told.field.motion.shift), int)  # of a large mesh, some have lost all of their facets
     source[np.asarray(facets.mover)] = np.asarray(facets.material)
-    thickness = jnp.log(told.field.electrical(params).thickness[source])
-    own: Any = jax.tree.map(lambda leaf: leaf[source], params.materials)
+    thickness = jnp.log(told.field.material_properties(params).thickness[source])
+    own: Materials = jax.tree.map(lambda leaf: leaf[source], params.materials)
     own = dataclasses.replace(own, log_thickness=thickness)
     field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
-    surfaces = told.cache.surfaces
+    surfaces = told.prepared.surfaces
     surfaces = replaced(surfaces, facets=replaced(surfaces.facets, material=facets.mover))
-    cache = replaced(told.cache, surfaces=surfaces)
-    return dataclasses.replace(told, field=field, cache=cache), replaced(params, materials=own)
+    prepared = replaced(told.prepared, surfaces=surfaces)
+    return dataclasses.replace(told, field=field, prepared=prepared), replaced(params, materials=own)
 
 
-def _of_air(params: Any, mover: int) -> Any:
+def _of_air(params: WaveParams, mover: int) -> WaveParams:
     return replaced(params, materials=with_properties(params.materials, mover, *AIR))
 
 
-def _carried(params: Any, field: Any) -> Any:
+def _carried(params: WaveParams, field: Calibratable) -> WaveParams:
     """Returns the first parameters of a field with the materials and antennas that were found in another."""
     return replaced(field.init(jax.random.key(0)), **{name: getattr(params, name) for name in ("materials", *ENDS)})
 
@@ -176,8 +180,8 @@ class ClutterReport:
 
 
 def search_clutter(
-    params: Any, told: Told, config: SearchConfig, rng: np.random.Generator
-) -> tuple[Any, Told, ClutterReport | None]:
+    params: WaveParams, told: Told, config: SearchConfig, rng: np.random.Generator
+) -> tuple[WaveParams, Told, ClutterReport | None]:
     """Returns parameters and field with clutter, if it is there; no report where too few could say so.
 
     Args:
@@ -194,8 +198,8 @@ def search_clutter(
     judge = np.isin(tx, judges)
     judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.clutter_spectra])
     batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.clutter_steps, BATCH, rng)
-    field = told.field.cluttered()
-    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.cache, told.data, batches)
+    field = told.field.with_absorption()
+    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.prepared, told.data, batches)
     others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)
     before, after = _errors(judged, params), _errors(dataclasses.replace(judged, field=field), others)
     gains = before - after
@@ -204,25 +208,29 @@ def search_clutter(
     return (others, fuller, report) if taken else (params, told, report)
 
 
-def _errors(told: Told, params: Any) -> Float[np.ndarray, " n"]:
+def _errors(told: Told, params: WaveParams) -> Float[np.ndarray, " n"]:
     """Returns mean absolute errors: of their logarithms, spectra that are right anyway would have most to say."""
     found: Float[np.ndarray, " n"] = np.exp(told.scores(None, "spectra")([params])[0])
     return found
 
 
 @jax.jit
-def _fitted(field: Any, params: Any, cache: Any, data: TrainingData, batches: Int[Array, "k b"]) -> Float[Array, "x y z 2"]:
+def _fitted(
+    field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, batches: Int[Array, "k b"]
+) -> Float[Array, "x y z 2"]:
     """Returns the clutter after a step on every batch."""
     optimizer = optax.adam(optax.cosine_decay_schedule(field.config.clutter_lr, len(batches)))
 
     def loss(clutter: Float[Array, "x y z 2"], index: Int[Array, " b"]) -> Float[Array, ""]:
-        found: Float[Array, ""] = field.loss(replaced(params, clutter=clutter), cache, data.batch(index, jax.random.key(0)))[0]
-        return found
+        batch = data.batch(index, jax.random.key(0))
+        return field.loss(replaced(params, clutter=clutter), prepared, batch)[0]
 
     def step(carry: Any, index: Int[Array, " b"]) -> tuple[Any, None]:
         clutter, state = carry
         updates, state = optimizer.update(jax.grad(loss)(clutter, index), state)
         return (optax.apply_updates(clutter, updates), state), None
 
-    (clutter, _), _ = jax.lax.scan(step, (params.clutter, optimizer.init(params.clutter)), batches)
+    assert params.clutter is not None, "the field has an absorption grid"
+    clutter: Float[Array, "x y z 2"] = params.clutter
+    (clutter, _), _ = jax.lax.scan(step, (clutter, optimizer.init(clutter)), batches)
     return clutter

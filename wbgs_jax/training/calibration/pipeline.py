@@ -16,7 +16,8 @@ import numpy as np
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
-from wbgs_jax.fields import Field
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas
@@ -27,7 +28,7 @@ from wbgs_jax.training.calibration.obstacles import search_absent, search_clutte
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
 from wbgs_jax.training.calibration.uncertainty import search_placement
-from wbgs_jax.training.hooks import Context, Edit, Say
+from wbgs_jax.training.hooks import Context, Edit, Hook, Say
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
 """How far a gain may be from the one before, and the steps in which it is tried."""
@@ -38,7 +39,7 @@ SWEEPS = 2
 """Times that antennas are searched anew after materials are named, at most."""
 
 
-def search_gain(params: Any, score: Scores, gain: float = 0.0) -> tuple[Any, float]:
+def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[WaveParams, float]:
     """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB), near one
     that is given: nobody may have said what was transmitted."""
     for reach, step in GAINS_DB:
@@ -62,36 +63,31 @@ def unusual_level(told: Told) -> float:
 
 
 @dataclass(frozen=True)
-class Search:
-    """The host control of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
+class Search(Hook):
+    """The hook of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
 
     config: SearchConfig
     stream: int = 6
-
-    def statistics(self, params: Any) -> tuple[()]:
-        """Returns nothing: it watches no step."""
-        return ()
-
-    def accumulate(self, statistics: tuple[()], gradients: Any, probe: Any) -> tuple[()]:
-        """Returns nothing."""
-        return ()
 
     def due(self, step: int, steps: int) -> bool:
         """Returns whether it is before the first step."""
         return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
 
-    def next_size(self, params: Any, step: int, steps: int) -> None:
-        """Returns None: the search is over before an epoch is compiled."""
-
     def apply(
-        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+        self,
+        field: Calibratable,
+        params: WaveParams,
+        statistics: tuple[()],
+        context: Context,
+        step: int,
+        rng: np.random.Generator,
     ) -> Edit:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
         bodies that are not there and with its surfaces moved if the mesh is doubtful."""
-        config, data, cache, say = self.config, context.data, context.cache, context.say
+        config, data, prepared, say = self.config, context.data, context.prepared, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
-        told = Told(field, cache, data, spectra)
+        told = Told(field, prepared, data, spectra)
         if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
             say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
@@ -99,7 +95,7 @@ class Search:
                 params, named = search_materials(params, told, config.spectra, config, usual=True)
                 params, gain = search_gain(params, told.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
-            return Edit(params, (), None, report | {"gain_db": gain}, field, cache)
+            return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
         if config.antenna_rounds:
             say("search: antennas")
             params, _ = self._antennas(params, told, report)
@@ -111,7 +107,7 @@ class Search:
                 params, told, absent = search_absent(params, told, config, say)
                 report["absent"] = dataclasses.asdict(absent)
                 if absent.centres:
-                    field, cache = told.field, told.cache
+                    field, prepared = told.field, told.prepared
                     params, named, _ = search_slabs(params, told, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
             say("search: idealisations")
@@ -127,14 +123,14 @@ class Search:
             field = self._tuning(params, told, report)
             told = dataclasses.replace(told, field=field)
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
-                place, moved = learn_geometry(Place(field, params, cache), data, context.train, config, rng, say)
+                place, moved = learn_geometry(Place(field, params, prepared), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
                 if "antennas" in report:  # what is in it may have been dropped since
                     found = report["antennas"]["taken"].items()
                     kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
                     report["antennas"]["taken"] = kept
-                params, field, cache = place.params, place.field, place.cache
-                told = Told(field, cache, data, spectra)
+                params, field, prepared = place.params, place.field, place.prepared
+                told = Told(field, prepared, data, spectra)
                 field = self._tuning(params, told, report)
                 told = dataclasses.replace(told, field=field)
             params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
@@ -145,9 +141,9 @@ class Search:
         if data.snapshots is not None and (level := unusual_level(told)):
             told = dataclasses.replace(told, field=field)  # which may know of clutter since
             params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
-        return Edit(params, (), None, report, field, cache)
+        return Edit(params, (), None, report, field, prepared)
 
-    def _antennas(self, params: Any, told: Told, report: dict[str, Any]) -> tuple[Any, bool]:
+    def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
         """Returns parameters with the antennas that are found, and whether there are any."""
         count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
         params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
@@ -155,7 +151,7 @@ class Search:
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
         return params, bool(found.taken)
 
-    def _tuning(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+    def _tuning(self, params: WaveParams, told: Told, report: dict[str, Any]) -> Calibratable:
         """Returns the field with arrays that are out of tune as spectra say, which takes two transmitters."""
         count = self.config.tuning_spectra
         if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
@@ -164,7 +160,9 @@ class Search:
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
 
-    def _clutter(self, params: Any, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say) -> tuple[Any, Any]:
+    def _clutter(
+        self, params: WaveParams, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say
+    ) -> tuple[WaveParams, Calibratable]:
         """Returns parameters and field with what stands in the way and is not in the mesh."""
         if not self.config.clutter_spectra:
             return params, told.field
@@ -174,7 +172,7 @@ class Search:
             report["clutter"] = dataclasses.asdict(found)
         return params, told.field
 
-    def _idealisations(self, params: Any, told: Told, report: dict[str, Any]) -> Any:
+    def _idealisations(self, params: WaveParams, told: Told, report: dict[str, Any]) -> WaveParams:
         """Returns parameters without the idealisations that spectra contradict."""
         params, found = search_idealisations(params, told, self.config)
         named = {name: dataclasses.asdict(one) for name, one in found.items()}

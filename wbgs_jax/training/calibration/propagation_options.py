@@ -7,9 +7,9 @@ ray tracers with synthetic arrays make them plane. Data are of one kind or of th
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.training.calibration.material_fit import search_materials
 from wbgs_jax.training.calibration.objective import Told, surely_better
 
@@ -29,7 +29,7 @@ class Idealisation:
     """Whether nature's is taken."""
 
 
-def search_idealisations(params: Any, told: Told, config: SearchConfig) -> tuple[Any, dict[str, Idealisation]]:
+def search_idealisations(params: WaveParams, told: Told, config: SearchConfig) -> tuple[WaveParams, dict[str, Idealisation]]:
     """Returns parameters without the idealisations that spectra surely contradict; materials are named anew before walls are
     said to be thick."""
     once, found, count = dataclasses.replace(config, rounds=1), {}, config.ideal_spectra

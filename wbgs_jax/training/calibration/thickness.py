@@ -8,13 +8,14 @@ out is taken if it explains snapshots surely better than the materials that were
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields.coherent_model import Materials, WaveParams
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.calibration.material_fit import (
     ITU_MATERIALS,
@@ -63,8 +64,13 @@ has met."""
 
 
 def search_slabs(
-    params: Any, told: Told, config: SearchConfig, count: int, compared: Compared = "snapshots", likely: Likely | None = None
-) -> tuple[Any, SearchReport, Likely | None]:
+    params: WaveParams,
+    told: Told,
+    config: SearchConfig,
+    count: int,
+    compared: Compared = "snapshots",
+    likely: Likely | None = None,
+) -> tuple[WaveParams, SearchReport, Likely | None]:
     """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say; and
     the slabs that were likely, if any were looked for.
 
@@ -94,8 +100,13 @@ def search_slabs(
 
 
 def _sized(
-    params: Any, unknown: Bool[np.ndarray, " m"], told: Told, config: SearchConfig, compared: Compared, likely: Likely | None
-) -> tuple[Any, Likely]:
+    params: WaveParams,
+    unknown: Bool[np.ndarray, " m"],
+    told: Told,
+    config: SearchConfig,
+    compared: Compared,
+    likely: Likely | None,
+) -> tuple[WaveParams, Likely]:
     """Returns parameters with materials and thicknesses as spectra of ever higher frequencies say, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
     first, *others = frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
@@ -141,7 +152,7 @@ def _steps(entry: str, frequency_hz: float) -> Float[np.ndarray, " n"]:
     return np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(entry, frequency_hz))
 
 
-def _slabs_near(materials: Any, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[Slab]:
+def _slabs_near(materials: Materials, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[Slab]:
     """Returns entries in thicknesses that could not be told from the present one at the frequency before."""
     optical = float(jnp.exp(materials.log_thickness[material]) * jnp.sqrt(1 + jnp.exp(materials.log_susceptibility[material])))
     around, found = int(np.ceil(frequency_hz / before_hz)), []
@@ -157,7 +168,7 @@ def _wavelength(entry: str, frequency_hz: float) -> float:
     return SPEED_OF_LIGHT / frequency_hz / float(np.sqrt(ITU_MATERIALS[entry][0]))
 
 
-def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[Any, list[Slab]]:
+def _best(params: WaveParams, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[WaveParams, list[Slab]]:
     """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
     better; and the likely ones of them, the best first."""
     few, left = len(slabs) // FEWER, slabs
@@ -170,11 +181,11 @@ def _best(params: Any, material: int, slabs: list[Slab], score: Scores, glance: 
     return close[int(np.argmin(score(close).mean(1)))], likely
 
 
-def _ranked(params: Any, material: int, slabs: list[Slab], score: Scores, spectra: int) -> list[Slab]:
+def _ranked(params: WaveParams, material: int, slabs: list[Slab], score: Scores, spectra: int) -> list[Slab]:
     """Returns slabs, the best first by so many spectra; none, where the material makes no difference to these."""
     scores = score([_made_of(params, material, slab) for slab in slabs], spectra).mean(1)
     return [] if np.ptp(scores) < UNSEEN else [slabs[i] for i in np.argsort(scores)]
 
 
-def _made_of(params: Any, material: int, slab: Slab) -> Any:
+def _made_of(params: WaveParams, material: int, slab: Slab) -> WaveParams:
     return dataclasses.replace(params, materials=with_entry(params.materials, material, *slab))

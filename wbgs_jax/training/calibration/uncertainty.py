@@ -7,11 +7,11 @@ far it is for each.
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.training.calibration.objective import Scores
 
 SPREADS_M = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
@@ -30,7 +30,7 @@ class PlacementReport:
     """... and with the standard deviation that was taken."""
 
 
-def search_placement(params: Any, score: Scores) -> tuple[Any, PlacementReport]:
+def search_placement(params: WaveParams, score: Scores) -> tuple[WaveParams, PlacementReport]:
     """Returns parameters with the uncertainty of all places by which spectra are explained best."""
     candidates = [
         dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(spread))) for spread in SPREADS_M

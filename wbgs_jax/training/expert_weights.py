@@ -1,0 +1,85 @@
+"""How much each opinion of a field that mixes several counts: found on validation links after the last step, on the host."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import components_of
+from wbgs_jax.fields.mixture import (
+    Mixing,
+    Opinions,
+    coherent_alone,
+    floor_of,
+    learn_shares,
+    nearness,
+    observed_opinions,
+    reported,
+    similarity,
+)
+from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.training.hooks import Context, Edit, Hook
+from wbgs_jax.types import Batch
+
+
+class Seen(NamedTuple):
+    """What is said of B links, and what was observed."""
+
+    spectra: Opinions
+    power: Opinions
+    told: Float[Array, "b features"]
+    """What tells whom to trust."""
+    pas: Float[Array, "b 90 360"] | None
+    power_db: Float[Array, " b"] | None
+
+
+@dataclass(frozen=True)
+class ExpertWeights(Hook):
+    """Gives a field that is `Mixing` the shares that explain best what none of its components was trained on; of what was not
+    observed, spectra or powers, the coherent one's are taken. With them, the floor under noisy spectra is found
+    (`fields.mixture`)."""
+
+    stream: int = 4
+
+    def due(self, step: int, steps: int) -> bool:
+        """Returns whether the last step is done."""
+        return step >= steps
+
+    def apply(
+        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
+        """Returns the parameters with these shares; as they are where a component is missing, or nothing is held out."""
+        batches, mixing = context.validation(), field.ability(Mixing)
+        same = Edit(params, (), lambda tree: tree, {})
+        if mixing is None or not batches or len(components_of(field)) < len(field.components):
+            return same
+        raw = mixing.field.with_shares(params)
+        receivers = {_receiver_of(batch): batch.receiver for batch in batches}
+        plans = {number: field.plan(raw, receiver, context.prepared) for number, receiver in receivers.items()}
+        seen = [jax.tree.map(np.asarray, opinions_on(field, raw, plans[_receiver_of(batch)], batch)) for batch in batches]
+        said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
+        tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
+        floor, spectra = 0.0, coherent_alone()
+        if pas is not None:
+            floor = floor_of(said, pas, tx_index)
+            spectra = learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
+        known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
+        power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
+        report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
+        found = mixing.field.with_shares(params, spectra, power, floor)
+        return same._replace(params=found, report={"shares": report, "noise_floor": floor})
+
+
+def _receiver_of(batch: Batch) -> int:
+    return int(batch.links.receiver_index[0])
+
+
+@jax.jit
+def opinions_on(field: Any, params: Any, plan: Any, batch: Batch) -> Seen:
+    """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
+    spectra, power, told = field.opinions(params, plan, batch.links)
+    return Seen(spectra, power, told, batch.pas, batch.received_db)
