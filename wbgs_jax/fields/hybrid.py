@@ -166,9 +166,8 @@ class HybridField(Field):
         if coherent is None:
             return self.wideband.render(params.wideband, plan.wideband, query)
         pas, power_db, told = self._said(params, plan, query, coherent)
-        return Observation(
-            mixed(params.trust.spectra, told, pas), coherent.snapshots, mixed(params.trust.power, told, power_db)
-        )
+        spectra, power = mixed(params.trust.spectra, told, pas), mixed(params.trust.power, told, power_db)
+        return coherent._replace(pas=spectra, power_db=power, covariance=None)  # which is that of the coherent field alone
 
     def _said(
         self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
