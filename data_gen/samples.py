@@ -50,7 +50,7 @@ def draw(scene: SceneFile, out: Path, receiver: int = 0) -> None:
     dataset = scene_dataset(scene)
     if not dataset.has_spectra:
         raise UserError(
-            f"scene {scene.name} holds {dataset.kind.words}, no spectra to draw; give a scene of snapshots or spectra"
+            f"scene {scene.name} holds {dataset.observed.words}, no spectra to draw; give a scene of snapshots or spectra"
         )
     rx = dataset.receiver(receiver)
     distance = np.linalg.norm(scene.tx_positions - scene.rx_position[receiver], axis=-1)

@@ -49,8 +49,6 @@ class Kind:
     """Spectra depend on the receiver's array."""
     silence: float = 0
     """Value of links on which nothing is heard: no power is learned from it."""
-    learned_by: str = "pas"
-    """What a field has to know of a link (`Field.gives`) to be trained on observations that have no spectra."""
 
     def __post_init__(self) -> None:
         if self.to_spectra is None and self.to_power is None:
@@ -178,6 +176,5 @@ register_kind(
         measured=lambda values: values > NOT_HEARD_DB,  # nor is NaN
         fault=lambda values: "infinity, or NaN alone" if np.isinf(values).any() or np.isnan(values).all() else "",
         silence=NOT_HEARD_DB,
-        learned_by="power",
     )
 )

@@ -68,7 +68,7 @@ def test_a_folder_loads(folder):
     np.testing.assert_array_equal(dataset.frequencies_hz, [1e9, 2.4e9] * 3)
     assert dataset.tx_index.tolist() == [0, 0, 1, 1, 2, 2]
     assert (dataset.train.tolist(), dataset.validation.tolist(), dataset.test.tolist()) == ([0, 1, 2, 3], [], [4, 5])
-    assert (dataset.kind.name, dataset.n_receivers, dataset.receiver_index.tolist()) == ("pas", 1, [0] * N)
+    assert (dataset.observed.name, dataset.n_receivers, dataset.receiver_index.tolist()) == ("pas", 1, [0] * N)
     images = dataset.observations["pas"]
     for k in range(N):
         np.testing.assert_array_equal(images[k], np.asarray(Image.open(folder / f"spectrum/{k + 1:05d}.png")))

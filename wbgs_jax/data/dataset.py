@@ -78,8 +78,8 @@ class Dataset(Observed):
         return len(self.frequencies_hz)
 
     @property
-    def kind(self) -> Kind:
-        """What is observed on a link."""
+    def observed(self) -> Kind:
+        """The kind of its observations."""
         return only_kind(self.observations, self.name)
 
     @property
@@ -112,7 +112,7 @@ class Dataset(Observed):
         Raises:
             UserError: what was observed has no spectrum, as received powers have none.
         """
-        kind = self.kind
+        kind = self.observed
         if kind.to_spectra is None:
             raise UserError(f"{self.name} holds {kind.words}, which have no angular spectrum; give a scene that has one")
         values = self.observations[kind.name][index]
@@ -142,7 +142,7 @@ class Dataset(Observed):
     def received_db(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, " b"] | None:
         """Returns the received power of some links (dB, relative to the transmitted power), observed or of the snapshots; None
         where spectra alone are known, which have no scale."""
-        kind = self.kind
+        kind = self.observed
         return None if kind.to_power is None else np.asarray(kind.to_power(self.observations[kind.name][index]))
 
     def _arrays(self, index: Int[np.ndarray, " b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, " b"]]:

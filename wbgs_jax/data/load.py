@@ -71,8 +71,8 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
 
 def _check_alike(first: Dataset, other: Dataset) -> None:
     where = f"{first.name} and {other.name} cannot be joined"
-    if first.kind != other.kind:
-        raise UserError(f"{where}: one holds {first.kind.words} and the other {other.kind.words}")
+    if first.observed != other.observed:
+        raise UserError(f"{where}: one holds {first.observed.words} and the other {other.observed.words}")
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
         raise UserError(f"{where}: their arrays differ in the number or the unit of their elements")

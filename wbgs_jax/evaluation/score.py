@@ -267,7 +267,9 @@ def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | N
         UserError: the data know power alone, and the field nothing of it.
     """
     if seen.power_db is None and not dataset.has_spectra:
-        raise UserError(f"{dataset.name} holds {dataset.kind.words}, of which this field knows nothing; choose another field")
+        raise UserError(
+            f"{dataset.name} holds {dataset.observed.words}, of which this field knows nothing; choose another field"
+        )
     return None if seen.power_db is None else np.asarray(seen.power_db)
 
 

@@ -253,12 +253,17 @@ def heard_alone(batch: Batch, seen: Observation) -> Batch:
 
 
 def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stride: int = 1) -> tuple[Float[Array, ""], Aux]:
-    """Returns the image loss (paper, equation 5) of observed spectra, or the loss of a kind that has none (`LOSSES`)."""
+    """Returns the image loss (paper, equation 5) of observed spectra, or the loss of a kind that has none (`LOSSES`).
+
+    It is that of received power where the kind has no other, or the field says nothing else.
+    """
     if batch.pas is not None:
         loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight, ssim_stride)
         return loss, Aux({"batch_ssim": similarity})
     kind = only_kind(batch.observations, "the batch")
-    error = LOSSES[kind.name](seen, batch.observations[kind.name])
+    error = LOSSES[kind.name](seen, batch.observations[kind.name]) if kind.name in LOSSES else None
+    if error is None:  # the power that follows from what was observed
+        error = LOSSES["power_db"](seen, batch.received_db)
     if error is None:
         raise UserError(f"these data are {kind.words}, of which this field knows nothing; choose another field")
     return error, Aux({})

@@ -131,4 +131,4 @@ def power_loss(seen: Any, power_db: Float[Array, " n"]) -> Float[Array, ""] | No
 
 LOSSES: dict[str, Callable[[Any, Any], Float[Array, ""] | None]] = {"power_db": power_loss}
 """By kind of observation that has no spectra: (what a field says, an `Observation`; what was observed) -> loss of the batch;
-None if the field says nothing that could be compared."""
+None if the field says nothing that could be compared. A kind that is not here is learned by the power that follows from it."""

@@ -82,7 +82,7 @@ def batches_of_one_receiver(
 def training_data(dataset: Dataset) -> TrainingData:
     """Returns a dataset on the device."""
     receivers, steering = dataset.receivers, None
-    if dataset.kind.needs_array and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
+    if dataset.observed.needs_array and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
         steering = steering_vector(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
     return TrainingData(
         receivers=receivers,
@@ -114,12 +114,9 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
             "mesh, transmitters and receivers",
             stacklevel=1,  # of this line, whoever checks: it is said once
         )
-    kind = dataset.kind
-    if not dataset.has_spectra and kind.learned_by not in field.gives:
-        able = ", ".join(name for name in field_names() if kind.learned_by in get_field(name).gives)
-        raise UserError(
-            f"{dataset.name} holds {kind.words}, of which the {field.name} field knows nothing; choose one of: {able}"
-        )
+    if not dataset.has_spectra and "power" not in field.gives:
+        able, words = ", ".join(name for name in field_names() if "power" in get_field(name).gives), dataset.observed.words
+        raise UserError(f"{dataset.name} holds {words}, of which the {field.name} field knows nothing; choose one of: {able}")
 
 
 FEW = 128
