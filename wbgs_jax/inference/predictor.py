@@ -135,7 +135,7 @@ def check_spectra(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field learned nothing of spectra."""
     if not dataset.has_spectra and "paths" not in field.known():
         raise UserError(
-            f"{dataset.name} holds {dataset.kind.words}, from which the {field.name} field learned no spectra; "
+            f"{dataset.name} holds {dataset.observed.words}, from which the {field.name} field learned no spectra; "
             "ask for --what power"
         )
 
