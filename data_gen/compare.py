@@ -58,7 +58,9 @@ def _common(first: np.ndarray, second: np.ndarray) -> Int[np.ndarray, "n 2"]:
 def _row(first: SceneFile, second: SceneFile, tx: Int[np.ndarray, "n 2"], i: int, k: int) -> list[str]:
     """Returns the cells of frequency `i` of the first and `k` of the second, of the first receiver."""
     hz = first.frequencies_hz[i]
-    y, other = (s.observations[t, 0, f].astype(np.complex128) for s, t, f in ((first, tx[:, 0], i), (second, tx[:, 1], k)))
+    y, other = (
+        s.observations["snapshots"][t, 0, f].astype(np.complex128) for s, t, f in ((first, tx[:, 0], i), (second, tx[:, 1], k))
+    )
     elements = first.element_positions[0] * (hz / SPEED_OF_LIGHT if first.element_unit == "metres" else 1)
     scores = np.asarray(correlation(scaled(y), scaled(other))), ssim(scaled_images(other, elements), scaled_images(y, elements))
     power = 10 * np.log10(np.median((np.abs(other) ** 2).sum(-1) / (np.abs(y) ** 2).sum(-1)))

@@ -50,7 +50,7 @@ def report(files: tuple[Path, ...]) -> str:
 
 def _row(item: tuple[Path, SceneFile]) -> list[str]:
     file, scene = item
-    n_tx, n_rx, n_freq = scene.observations.shape[:3]
+    n_tx, n_rx, n_freq = scene.shape
     content = file.read_bytes()
     counts = (n_tx, n_freq, n_tx * n_rx * n_freq, len(scene.faces), round(len(content) / 1000))
     return [file.name, *(f"{count:,}" for count in counts), f"`{hashlib.sha256(content).hexdigest()[:16]}`"]

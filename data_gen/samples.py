@@ -48,12 +48,14 @@ def draw(scene: SceneFile, out: Path, receiver: int = 0) -> None:
         UserError: there is no such receiver, or the scene holds no spectra.
     """
     dataset = scene_dataset(scene)
-    if dataset.kind == "power":
-        raise UserError(f"scene {scene.name} holds received powers, no spectra to draw; give a scene of snapshots or spectra")
+    if not dataset.has_spectra:
+        raise UserError(
+            f"scene {scene.name} holds {dataset.observed.words}, no spectra to draw; give a scene of snapshots or spectra"
+        )
     rx = dataset.receiver(receiver)
     distance = np.linalg.norm(scene.tx_positions - scene.rx_position[receiver], axis=-1)
     transmitters, frequencies = _near_to_far(distance), _spread(len(scene.frequencies_hz), FREQUENCIES_SHOWN)
-    links = np.arange(len(dataset)).reshape(scene.observations.shape[:3])[:, receiver]
+    links = np.arange(len(dataset)).reshape(scene.shape)[:, receiver]
     size = (3.6 * len(frequencies), 1.55 * len(transmitters) + 0.6)
     figure, axes = plt.subplots(len(transmitters), len(frequencies), figsize=size, layout="constrained", squeeze=False)
     for axis, frequency in zip(axes[0], scene.frequencies_hz[frequencies], strict=True):

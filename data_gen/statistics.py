@@ -28,7 +28,7 @@ def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
 def channel_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
     """Returns by frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the path gain
     to an element (5th, 50th and 95th percentile over transmitters, dB), all of the first receiver."""
-    gain_db = 10 * np.log10(np.mean(np.abs(scene.observations[:, 0].astype(np.complex128)) ** 2, -1))
+    gain_db = 10 * np.log10(np.mean(np.abs(scene.observations["snapshots"][:, 0].astype(np.complex128)) ** 2, -1))
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
         p05, p50, p95 = np.percentile(gain_db[:, i], (5, 50, 95))

@@ -75,7 +75,7 @@ def _check(dataset: Dataset, fault: Fault) -> None:
     lacks = {
         "mesh": _of_mesh(fault) and not len(dataset.faces),
         "materials": (fault.one_material or fault.wrong_materials or fault.thickness_unknown) and dataset.materials is None,
-        "snapshots": (fault.snr_db is not None or fault.array_deg) and dataset.snapshots is None,
+        "snapshots": (fault.snr_db is not None or fault.array_deg) and not dataset.has("snapshots"),
     }
     for what, lacking in lacks.items():
         if lacking:
@@ -146,15 +146,15 @@ def with_wrong_receiver(dataset: Dataset, fault: Fault, rng: np.random.Generator
 
 def with_wrong_snapshots(dataset: Dataset, fault: Fault, rng: np.random.Generator) -> Dataset:
     """Returns it with noise on the training snapshots, and with elements out of tune on all."""
-    if dataset.snapshots is None:
+    if not dataset.has("snapshots"):
         return dataset
-    heard = dataset.snapshots
+    heard = dataset.observations["snapshots"]
     if fault.array_deg:
         heard = heard * np.exp(1j * np.deg2rad(rng.normal(0, fault.array_deg, heard.shape[-1])))
     if fault.snr_db is not None:
         heard = heard.copy()
         heard[dataset.train] += _noise(heard[dataset.train], fault.snr_db, rng)
-    return dataclasses.replace(dataset, snapshots=heard.astype(np.complex64))
+    return dataset.with_observations(snapshots=heard.astype(np.complex64))
 
 
 def as_images(dataset: Dataset) -> Dataset:
@@ -164,7 +164,7 @@ def as_images(dataset: Dataset) -> Dataset:
         for start in range(0, len(dataset), PAS_AT_ONCE)
     ]
     images = np.concatenate([(255 * block).round().astype(np.uint8) for block in blocks])
-    return dataclasses.replace(dataset, snapshots=None, images=images)
+    return dataset.with_observations(pas=images)
 
 
 def _without(dataset: Dataset, gone: Bool[np.ndarray, " faces"]) -> Dataset:

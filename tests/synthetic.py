@@ -6,7 +6,7 @@ import numpy as np
 
 from wbgs_jax.config import DensityConfig, LoopConfig, OptimConfig, SearchConfig, Settings, changed
 from wbgs_jax.data import scene_dataset
-from wbgs_jax.data.dataset import Dataset, Kind
+from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene_file import SceneFile
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.coherent import WaveConfig
@@ -29,7 +29,7 @@ REFLECTION = -0.6
 
 
 def tiny_scene(
-    n_tx: int = 6, seed: int = 0, n_rx: int = 1, kind: Kind = "snapshot", unit: ElementUnit = "wavelengths"
+    n_tx: int = 6, seed: int = 0, n_rx: int = 1, kind: str = "snapshot", unit: ElementUnit = "wavelengths"
 ) -> SceneFile:
     """A box-shaped room with one reflecting wall at the largest x; every third transmitter is a test one.
 

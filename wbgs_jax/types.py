@@ -8,13 +8,13 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from wbgs_jax._util.checks import check_array, concrete
 from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax.observation_kinds import Observations, Observed, power_of
 from wbgs_jax.radio.antenna import pattern_exponents
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
-from wbgs_jax.radio.channel import received_power_db
 
 ElementUnit = Literal["wavelengths", "metres"]
 """Unit of element positions: "wavelengths" is an array that scales with the frequency, "metres" one of fixed size."""
@@ -112,24 +112,25 @@ class Links:
 
 
 @pytree
-class Batch:
-    """B links of one receiver, and what was observed on them: whichever kinds the data allow."""
+class Batch(Observed):
+    """B links of one receiver, and what was observed on them."""
 
     links: Links
     receiver: Receiver
-    pas: Float[Array, "b 90 360"] | None
-    """Normalised power angular spectra."""
-    snapshots: Complex[Array, "b elements"] | None
-    """Complex array snapshots."""
-    power_db: Float[Array, " b"] | None
-    """Received power relative to the transmitted power, dB."""
+    observations: Observations
+    """By kind, as data have them, but spectra: wherever there are any, "pas" holds them as float32 of maximum 1."""
     key: Key[Array, ""]
     """Randomness of this training step."""
 
     @property
+    def pas(self) -> Float[Array, "b 90 360"] | None:
+        """Normalised power angular spectra, observed or of the snapshots; None where there are none."""
+        return self.observations.get("pas")
+
+    @property
     def received_db(self) -> Float[Array, " b"] | None:
         """The received power (dB), observed or of the snapshots; None where spectra alone are known."""
-        return self.power_db if self.snapshots is None else received_power_db(self.snapshots)
+        return power_of(self.observations)
 
 
 @pytree

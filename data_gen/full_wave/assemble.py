@@ -36,9 +36,7 @@ def assemble(model: Model, results: Sequence[ElementResult], scale: Scale, solve
         vertices=mesh["vertices"], faces=mesh["faces"], face_part=mesh["face_part"],
         meta=_provenance(model, solver) | {"checks": _checks(model, results, scale) | checks},
     )  # fmt: skip
-    unknown = {
-        "ceilings": np.full((*scene.observations.shape[:1], len(model.frequencies_hz), len(NAMES)), np.nan)
-    }  # has no paths
+    unknown = {"ceilings": np.full((len(scene.tx_positions), len(model.frequencies_hz), len(NAMES)), np.nan)}  # has no paths
     scene.meta.update(ceilings=ceiling_table(scene, unknown), channel=_channel(scene, spec.line_of_sight(model.points)))
     return scene
 
@@ -67,7 +65,7 @@ def _provenance(model: Model, solver: str) -> dict[str, Any]:
 
 def _channel(scene: SceneFile, in_sight: Bool[np.ndarray, " tx"]) -> list[dict[str, float]]:
     """Returns by frequency the share of transmitters in sight and the gain to an element (5th, 50th, 95th percentile, dB)."""
-    gain_db = 10 * np.log10(np.mean(np.abs(scene.observations[:, 0].astype(np.complex128)) ** 2, -1))
+    gain_db = 10 * np.log10(np.mean(np.abs(scene.observations["snapshots"][:, 0].astype(np.complex128)) ** 2, -1))
     names = ("line_of_sight_share", "gain_db_p05", "gain_db_p50", "gain_db_p95")
     columns = [np.full(len(scene.frequencies_hz), in_sight.mean()), *np.percentile(gain_db, (5, 50, 95), axis=0)]
     return [

@@ -52,11 +52,11 @@ class Spectra:
     def difference(self) -> float:
         """Returns the largest angle between a spot's middle and the transmitter, in units of a right angle."""
         dataset = load_dataset(self.path)
-        if not np.allclose(dataset.tx_positions, TRANSMITTERS) or dataset.images is None:
+        if not np.allclose(dataset.tx_positions, TRANSMITTERS) or not dataset.has("pas"):
             return float("inf")
         directions = np.asarray(pas_directions()).reshape(90, 360, 3)
         expected = spots(directions).astype(float)
-        found = dataset.images.astype(float)
+        found = dataset.observations["pas"].astype(float)
         middle = [self.middle(own, directions) for own in (found, expected)]
         return float(np.degrees(np.arccos(np.clip((middle[0] * middle[1]).sum(-1), -1, 1))).max()) / 90
 

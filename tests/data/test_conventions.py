@@ -102,11 +102,11 @@ def test_a_folder_is_read_as_it_reveals_or_as_it_is_named(tmp_path, rng):
     with pytest.warns(UserWarning, match="elevation is used, because the last row"):
         found = load_layout(folder)
     assert found.convention == "elevation"
-    np.testing.assert_array_equal(found.images, to_pas(images, "elevation"))
+    np.testing.assert_array_equal(found.observations["pas"], to_pas(images, "elevation"))
     assert np.ptp(np.asarray(found.receivers.element_positions[0, :, 2])) == 0  # the array lies flat
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        np.testing.assert_array_equal(load_layout(folder, convention="zenith").images, images)
+        np.testing.assert_array_equal(load_layout(folder, convention="zenith").observations["pas"], images)
         (folder / "gateway_info.yml").write_text("convention: elevation\n" + (folder / "gateway_info.yml").read_text())
         assert load_layout(folder).convention == load_layout(folder, convention="elevation").convention == "elevation"
     with pytest.raises(UserError, match="names the convention elevation; leave out zenith"):

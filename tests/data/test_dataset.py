@@ -25,7 +25,9 @@ def data():
 
 def test_kinds(data):
     for (kind, _), dataset in data.items():
-        assert (dataset.kind, len(dataset), dataset.n_receivers) == (kind, 6 * 3 * 3, 3)
+        assert (len(dataset), dataset.n_receivers) == (6 * 3 * 3, 3)
+        assert (dataset.has_spectra, dataset.has_scale) == (kind != "power", kind != "pas")
+        assert [dataset.has(name) for name in ("snapshots", "pas", "power_db")] == [kind == one for one in KINDS]
 
 
 def test_one_receiver_of_several(data):
@@ -57,9 +59,8 @@ def test_a_batch_of_one_receiver(data, kind):
     batch = Batch(
         links=dataset.links(index),
         receiver=dataset.receiver(1),
-        pas=None if kind == "power" else dataset.pas(index),
-        snapshots=None if dataset.snapshots is None else jnp.asarray(dataset.snapshots[index]),
-        power_db=None if dataset.power_db is None else jnp.asarray(dataset.power_db[index]),
+        observations={name: jnp.asarray(values[index]) for name, values in dataset.observations.items()}
+        | ({"pas": dataset.pas(index)} if dataset.has_spectra else {}),
         key=jax.random.key(0),
     )
     assert (np.asarray(batch.links.receiver_index) == 1).all()
@@ -137,10 +138,10 @@ def test_power_has_no_angular_spectrum(data):
 
 def test_inconsistent_data_sets_are_refused(data):
     dataset = data["snapshot", "wavelengths"]
-    with pytest.raises(ValueError, match="box has 0 kinds of observations; give one"):
-        dataclasses.replace(dataset, snapshots=None)
-    with pytest.raises(ValueError, match="box has 2 kinds of observations; give one"):
-        dataclasses.replace(dataset, power_db=np.zeros(len(dataset)))
+    with pytest.raises(ValueError, match="box holds none of pas, snapshots, power_db, and needs one"):
+        dataset.with_observations()
+    with pytest.raises(ValueError, match="box holds snapshots and power_db of pas, snapshots, power_db, and needs one"):
+        dataset.with_observations(power_db=np.zeros(len(dataset)), snapshots=dataset.snapshots)
     with pytest.raises(ValueError, match="receiver_index must lie between 0 and 2"):
         dataclasses.replace(dataset, receiver_index=dataset.receiver_index + 1)
     broken = object.__new__(type(dataset))  # past the type checker, which the shapes would not pass: users run without it

@@ -68,10 +68,11 @@ def test_a_folder_loads(folder):
     np.testing.assert_array_equal(dataset.frequencies_hz, [1e9, 2.4e9] * 3)
     assert dataset.tx_index.tolist() == [0, 0, 1, 1, 2, 2]
     assert (dataset.train.tolist(), dataset.validation.tolist(), dataset.test.tolist()) == ([0, 1, 2, 3], [], [4, 5])
-    assert (dataset.kind, dataset.n_receivers, dataset.receiver_index.tolist()) == ("pas", 1, [0] * N)
+    assert (dataset.observed.name, dataset.n_receivers, dataset.receiver_index.tolist()) == ("pas", 1, [0] * N)
+    images = dataset.observations["pas"]
     for k in range(N):
-        np.testing.assert_array_equal(dataset.images[k], np.asarray(Image.open(folder / f"spectrum/{k + 1:05d}.png")))
-    np.testing.assert_allclose(np.asarray(dataset.pas(np.array([2]))), dataset.images[2:3] / 255, atol=1e-7)
+        np.testing.assert_array_equal(images[k], np.asarray(Image.open(folder / f"spectrum/{k + 1:05d}.png")))
+    np.testing.assert_allclose(np.asarray(dataset.pas(np.array([2]))), images[2:3] / 255, atol=1e-7)
     receiver = dataset.receiver()
     np.testing.assert_array_equal(receiver.position, np.float32([2, 1, 0.5]))
     assert (receiver.pattern_exponents == 0).all()  # not known
@@ -116,7 +117,7 @@ def test_row_k_belongs_to_image_k_whatever_the_padding(folder):
     (spectra / "00005.png").rename(spectra / "005.png")
     (folder / "train_index.txt").write_text("1 2.png\n3\r\n00004")
     after = load_layout(folder)
-    np.testing.assert_array_equal(after.images, before.images)
+    np.testing.assert_array_equal(after.observations["pas"], before.observations["pas"])
     np.testing.assert_array_equal(after.train, before.train)
 
 

@@ -114,10 +114,10 @@ def test_links_are_transmitter_major(scene):
 
 def test_links_of_several_receivers_go_transmitter_receiver_frequency(three):
     dataset = scene_dataset(three)
-    observed = next(v for v in (dataset.snapshots, dataset.images, dataset.power_db) if v is not None)
+    (observed,), (array,) = dataset.observations.values(), three.observations.values()
     for i in range(len(dataset)):
         tx, rx, freq = np.unravel_index(i, (4, 3, 3))
-        np.testing.assert_array_equal(observed[i], three.observations[tx, rx, freq])
+        np.testing.assert_array_equal(observed[i], array[tx, rx, freq])
         np.testing.assert_array_equal(dataset.tx_positions[i], three.tx_positions[tx])
         assert (dataset.receiver_index[i], dataset.tx_index[i]) == (rx, tx)
         assert dataset.frequencies_hz[i] == three.frequencies_hz[freq]
@@ -201,7 +201,7 @@ def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
         ("snapshots", np.full((5, 1, 3, 16), 1e300), "snapshots contains infinity"),
         ("snapshots", np.zeros((5, 3, 16), np.complex64), "snapshots must be a 4-D complex64"),
         ("snapshots", np.zeros((5, 1, 3, 16), "U1"), "snapshots must be a 4-D complex64"),
-        ("snapshots", None, "it holds none of snapshots, pas, power_db"),
+        ("snapshots", None, "it holds none of pas, snapshots, power_db"),
         ("power_db", np.zeros((5, 1, 3), np.float32), "it holds snapshots and power_db"),
         ("tx_positions", np.full((5, 3), 1j), "tx_positions must be a 2-D float64"),
         ("tx_positions", np.full((5, 3), np.inf), "tx_positions contains NaN"),

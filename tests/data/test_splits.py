@@ -39,7 +39,7 @@ def dataset():
         train=np.flatnonzero(tx_index < 4),
         validation=np.zeros(0, int),
         test=np.flatnonzero(tx_index == 4),
-        snapshots=np.zeros((15, 16), np.complex64),
+        observations={"snapshots": np.zeros((15, 16), np.complex64)},
     )
 
 
@@ -140,7 +140,7 @@ def test_whole_transmitters_move_to_the_validation(three, fraction):
 def test_the_validation_depends_on_the_split_alone(dataset):
     """Equal splits, whatever else of the data differs; other splits draw anew."""
     held = hold_out_validation(dataset, 0.25)
-    louder = dataclasses.replace(dataset, snapshots=2 * dataset.snapshots)
+    louder = dataset.with_observations(snapshots=2 * dataset.snapshots)
     np.testing.assert_array_equal(hold_out_validation(louder, 0.25).validation, held.validation)
     once_more = hold_out_validation(held, 0.25)
     np.testing.assert_array_equal(once_more.validation, held.validation)  # data that name a part keep it
@@ -160,9 +160,8 @@ def test_a_training_sees_no_test(three):
     np.testing.assert_array_equal(kept[seen.validation], held.validation)
     np.testing.assert_array_equal(seen.tx_positions, held.tx_positions[kept])
     np.testing.assert_array_equal(seen.receiver_index, held.receiver_index[kept])
-    for name in ("snapshots", "images", "power_db"):
-        values = getattr(held, name)
-        np.testing.assert_array_equal(getattr(seen, name), None if values is None else values[kept])
+    (found,), (values,) = seen.observations.values(), held.observations.values()
+    np.testing.assert_array_equal(found, values[kept])
     assert sorted(set(seen.tx_index)) == list(range(seen.tx_index.max() + 1))
 
 
@@ -232,9 +231,10 @@ def test_receivers_are_chosen_and_numbered_in_order(three):
     np.testing.assert_array_equal(chosen.vertices, three.vertices)
     before = np.flatnonzero(three.receiver_index != 1)
     np.testing.assert_array_equal(np.array([2, 0])[chosen.receiver_index], three.receiver_index[before])
-    for key in ("tx_positions", "frequencies_hz", "tx_index", "snapshots", "images", "power_db"):
-        values = getattr(three, key)
-        np.testing.assert_array_equal(getattr(chosen, key), None if values is None else values[before])
+    for key in ("tx_positions", "frequencies_hz", "tx_index"):
+        np.testing.assert_array_equal(getattr(chosen, key), getattr(three, key)[before])
+    (found,), (values,) = chosen.observations.values(), three.observations.values()
+    np.testing.assert_array_equal(found, values[before])
     for part in ("train", "validation", "test"):
         np.testing.assert_array_equal(before[getattr(chosen, part)], np.intersect1d(before, getattr(held, part)))
 
@@ -243,7 +243,8 @@ def test_transmitters_that_no_chosen_receiver_hears_are_gone():
     full = tiny_dataset(n_rx=3, kind="power")
     scarce = np.flatnonzero((full.receiver_index == 0) | ~np.isin(full.tx_index, [1, 2]))
     heard = select_receivers(dataclasses.replace(
-        full, receiver_index=full.receiver_index[scarce], tx_index=full.tx_index[scarce], power_db=full.power_db[scarce],
+        full, receiver_index=full.receiver_index[scarce], tx_index=full.tx_index[scarce],
+        observations={"power_db": full.power_db[scarce]},
         tx_positions=full.tx_positions[scarce], frequencies_hz=full.frequencies_hz[scarce],
         train=np.arange(len(scarce) - 1), test=np.array([len(scarce) - 1]),
     ), [1])  # fmt: skip

@@ -30,7 +30,7 @@ def room(with_faces=True, with_vertices=True, receivers=((RX, UPRIGHT),), **know
         train=np.array([0]),
         validation=np.zeros(0, int),
         test=np.array([1]),
-        snapshots=np.ones((2, 16), np.complex64),
+        observations={"snapshots": np.ones((2, 16), np.complex64)},
         **known,
         vertices=np.asarray(box.vertices, np.float32) if with_vertices else np.zeros((0, 3), np.float32),
         faces=np.asarray(box.faces, np.int32) if with_faces else np.zeros((0, 3), np.int32),

@@ -35,7 +35,9 @@ def dataset(rng):
         train=np.flatnonzero(tx_index < 4),
         validation=np.zeros(0, int),
         test=np.flatnonzero(tx_index >= 4),
-        snapshots=(rng.normal(size=(N_TX * 3, 16)) + 1j * rng.normal(size=(N_TX * 3, 16))).astype(np.complex64),
+        observations={
+            "snapshots": (rng.normal(size=(N_TX * 3, 16)) + 1j * rng.normal(size=(N_TX * 3, 16))).astype(np.complex64)
+        },
     )
 
 
@@ -63,7 +65,7 @@ def test_the_order_of_the_questions_does_not_matter(dataset, rng):
 
 
 def test_no_baseline_sees_the_test(dataset, rng):
-    blind = dataclasses.replace(dataset, snapshots=dataset.snapshots.copy())
+    blind = dataset.with_observations(snapshots=dataset.snapshots.copy())
     blind.snapshots[dataset.test] = rng.normal(size=(len(dataset.test), 16))
     for name, predict in baselines(dataset).items():
         np.testing.assert_array_equal(predict(dataset.test), baselines(blind)[name](dataset.test))
@@ -142,7 +144,7 @@ def test_a_transmitter_at_the_receiver_is_no_reason_to_fail(dataset):
 
 def test_images_serve_as_well_as_snapshots(dataset):
     pas = truth(dataset, np.arange(len(dataset)))
-    images = dataclasses.replace(dataset, snapshots=None, images=np.round(pas * 255).astype(np.uint8))
+    images = dataset.with_observations(pas=np.round(pas * 255).astype(np.uint8))
     for name, predict in baselines(dataset).items():
         np.testing.assert_allclose(baselines(images)[name](dataset.test), predict(dataset.test), atol=0.5 / 255 + 1e-5)
 

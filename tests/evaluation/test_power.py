@@ -42,7 +42,7 @@ def dataset(rng) -> Dataset:
     found = tiny_dataset(n_rx=2)
     assert found.snapshots is not None
     scale = 10 ** rng.uniform(-5, -3, len(found))
-    return dataclasses.replace(found, snapshots=(found.snapshots * scale[:, None]).astype(np.complex64))
+    return found.with_observations(snapshots=(found.snapshots * scale[:, None]).astype(np.complex64))
 
 
 def test_the_power_of_snapshots_is_the_mean_over_the_elements(dataset, rng):
@@ -82,7 +82,7 @@ def test_the_nearest_transmitter_lends_its_power(dataset):
 def test_links_that_nothing_reaches_are_left_out(dataset):
     silent = dataset.snapshots.copy()
     silent[dataset.test[0]] = silent[dataset.train[0]] = 0
-    dataset = dataclasses.replace(dataset, snapshots=silent)
+    dataset = dataset.with_observations(snapshots=silent)
     truth = dataset.received_db(dataset.test)
     report = power_figures(truth + 1, dataset, dataset.test)
     assert report["n"] == len(dataset.test) - 1 and report["power_mae_db"] == pytest.approx(1, abs=1e-4)

@@ -113,7 +113,7 @@ def test_equal_seeds_draw_equal_faults(dataset):
 def test_what_data_do_not_have_cannot_be_wrong(fault, lacking):
     scene = scene_dataset(tiny_scene(6))
     nothing = {"vertices": scene.vertices[:0], "faces": scene.faces[:0], "face_part": None, "materials": None}
-    powers = {"snapshots": None, "power_db": np.zeros(len(scene), np.float32)}
+    powers = {"observations": {"power_db": np.zeros(len(scene), np.float32)}}
     without = dataclasses.replace(scene, **(powers if lacking == "snapshots" else nothing))
     with pytest.raises(UserError, match=f"no {lacking}"):
         faulty(without, fault, 0)

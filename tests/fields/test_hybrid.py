@@ -90,7 +90,7 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     wave, own, informed = opinions(run, params, index)
     truth = share * wave.pas + (1 - share) * own.pas
     power = share * wave.power_db + (1 - share) * informed.power_db
-    batch = dataclasses.replace(batch, pas=jnp.asarray(truth), snapshots=None, power_db=jnp.asarray(power))
+    batch = batch.with_observations(pas=jnp.asarray(truth), power_db=jnp.asarray(power))
     found, report = weighted(run, params, [batch])
     spectra, powers = found.trust.spectra, found.trust.power
     assert not any(np.any(one.weights) for one in (spectra.coherent, spectra.uninformed, powers.coherent))  # few transmitters
@@ -160,10 +160,10 @@ def test_its_answers_are_without_the_floor(run):
 @pytest.mark.heavy
 def test_of_what_was_not_observed_the_coherent_field_is_taken(run):
     batch = run.data.batch(jnp.asarray(run.dataset.validation), run.key)
-    image = dataclasses.replace(batch, snapshots=None, power_db=None)
+    image = batch.with_observations(pas=batch.pas)
     trust = weighted(run, run.state.params, [image])[0].trust
-    power = dataclasses.replace(batch, snapshots=None, pas=None, power_db=jnp.full(len(run.dataset.validation), -60.0))
-    silent = dataclasses.replace(image, power_db=jnp.full(len(run.dataset.validation), -400.0))
+    power = batch.with_observations(power_db=jnp.full(len(run.dataset.validation), -60.0))
+    silent = batch.with_observations(pas=batch.pas, power_db=jnp.full(len(run.dataset.validation), -400.0))
     others = [weighted(run, run.state.params, [one])[0].trust for one in (power, silent)]
     for shares in (trust.power, others[0].spectra, others[1].power):
         assert min(float(jax.nn.sigmoid(one.bias)) for one in (shares.coherent, shares.uninformed)) > 0.99

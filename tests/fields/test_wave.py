@@ -317,7 +317,7 @@ def test_a_link_without_any_path_has_gradients(coherent):
     nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, prepared)
     heard = jnp.exp(1j * jnp.arange(16.0))[None].astype(jnp.complex64)
     truth = snapshot_to_pas(heard, plan.receiver.element_positions)
-    batch = Batch(links, plan.receiver, truth, heard, None, jax.random.key(0))
+    batch = Batch(links, plan.receiver, {"pas": truth, "snapshots": heard}, jax.random.key(0))
 
     @jax.jit
     def found(params, prepared):

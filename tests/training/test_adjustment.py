@@ -31,7 +31,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room")
     run = run_in(PARTS, SETTINGS, folder, places(N_TX, 0.4), FREQUENCIES, receivers=RECEIVERS)
     _, tree, links = parts_of(run, len(run.data.links.tx_index))
-    run.data = dataclasses.replace(run.data, snapshots=snapshots(ravel_pytree(run.field.motion)[0], tree, links))
+    run.data = run.data.with_observations(snapshots=snapshots(ravel_pytree(run.field.motion)[0], tree, links))
     return run
 
 
@@ -190,7 +190,7 @@ def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
     moved = drawn(rng, run, 0.5)
     index, tree, links = parts_of(run, len(run.data.links.tx_index))
     heard = snapshots(ravel_pytree(moved)[0], tree, links)
-    data = dataclasses.replace(run.data, snapshots=heard)
+    data = run.data.with_observations(snapshots=heard)
     still, widths = run.field.motion, widths_of(run)
     prior = np.asarray(ravel_pytree(widths)[0], float) ** 2
     found, covariance, frequency = still, np.diag(prior), np.asarray(links.query.frequency_hz)

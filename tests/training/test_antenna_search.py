@@ -32,7 +32,7 @@ def searched(run, known_elements=False, **antennas):
     """What is found in snapshots that the field itself made with these antennas."""
     plan = run.field.plan(run.state.params, run.dataset.receiver(), prepared=run.prepared)
     y = snapshots(dataclasses.replace(run.state.params, **antennas), plan, run.prepared, run.data.links)
-    data, spectra = dataclasses.replace(run.data, snapshots=y), run.dataset.train[:60]
+    data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:60]
     score = make_scores(run.field, run.prepared, data, jnp.asarray(spectra))
     tx = run.dataset.tx_index[spectra]
     return search_antennas(run.state.params, score, tx, SETTINGS.search, known_elements)

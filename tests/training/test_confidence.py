@@ -166,7 +166,7 @@ def test_it_is_learned_from_the_validation_part_alone(dataset):
     learned, _ = learn_confidence(field, params, dataset, None)
     heard = dataset.snapshots.copy()
     heard[dataset.test] = 1
-    poisoned = dataclasses.replace(dataset, snapshots=heard)
+    poisoned = dataset.with_observations(snapshots=heard)
     again, _ = learn_confidence(field, params, poisoned, None)
     for a, b in zip(jax.tree.leaves(learned), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -184,7 +184,7 @@ def test_answers_are_judged_as_they_would_be_observed(dataset):
     params = clean.init(jax.random.key(1))
     said = observe_links(clean, params, dataset, np.arange(len(dataset))).pas
     observed = np.asarray(255 * noisy.as_observed(params, jnp.asarray(said))).round().astype(np.uint8)
-    told = dataclasses.replace(dataset, snapshots=None, images=observed)
+    told = dataset.with_observations(pas=observed)
     sure, doubted = (
         expectations(learn_confidence(field, params, told, None)[0], told, told.test, said[told.test], None)
         for field in (noisy, clean)
@@ -300,14 +300,14 @@ def test_confidence_of_powers_is_learned_over_all_receivers(rng):
     assert learned.mean.shape == (POWER_SETS[-1],)
     heard = dataset.snapshots.copy()
     heard[dataset.test] = 1
-    poisoned = dataclasses.replace(dataset, snapshots=heard)
+    poisoned = dataset.with_observations(snapshots=heard)
     for a, b in zip(jax.tree.leaves(learned), jax.tree.leaves(learn_confidence(field, params, poisoned, None)[1]), strict=True):
         np.testing.assert_array_equal(a, b)
     said = np.asarray(observe_links(field, params, dataset, dataset.test).power_db)
     report = calibrate_power(learned, said, dataset, dataset.test)
     assert report["coverage"] > 0.6 and report["expected"] == pytest.approx(report["scored"], rel=0.6)
     assert report["risk_coverage"]["1"] == pytest.approx(np.abs(said - dataset.received_db(dataset.test)).mean(), rel=1e-4)
-    pictures = dataclasses.replace(dataset, snapshots=None, images=np.zeros((len(dataset), 90, 360), np.uint8))
+    pictures = dataset.with_observations(pas=np.zeros((len(dataset), 90, 360), np.uint8))
     assert learn_confidence(field, params, pictures, None)[1] is None
 
 

@@ -1,6 +1,5 @@
 """The share of a field beside simple methods: what held-out spectra prove, and nothing else."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -124,7 +123,7 @@ def test_held_out_links_are_looked_at_alone(dataset, known, rng):
     found = learn_mixture(dataset, known, held(dataset, known, pas))
     snapshots = dataset.snapshots.copy()
     snapshots[dataset.test] = 1
-    again = learn_mixture(dataclasses.replace(dataset, snapshots=snapshots), known, held(dataset, known, pas))
+    again = learn_mixture(dataset.with_observations(snapshots=snapshots), known, held(dataset, known, pas))
     np.testing.assert_array_equal(found.scores, again.scores)
     assert found.scores == pytest.approx(ssim(found.answers, truth), abs=0.03)
 

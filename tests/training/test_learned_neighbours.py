@@ -32,7 +32,7 @@ def alike(dataset, rng, spread):
     base = {f: dataset.snapshots[np.flatnonzero(dataset.frequencies_hz == f)[0]] for f in np.unique(dataset.frequencies_hz)}
     snapshots = np.stack([base[f] for f in dataset.frequencies_hz])
     offsets = rng.uniform(-spread, spread, (len(first), 3))[dataset.tx_index]
-    return dataclasses.replace(dataset, snapshots=snapshots, tx_positions=dataset.tx_positions[0] + offsets)
+    return dataclasses.replace(dataset, observations={"snapshots": snapshots}, tx_positions=dataset.tx_positions[0] + offsets)
 
 
 def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
@@ -52,7 +52,7 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     plan = field.plan(params, dataset.receiver())
     images = np.asarray(jax.jit(lambda query: field.render(params, plan, query).pas)(dataset.query(np.arange(len(dataset)))))
     told = np.clip(255 * images + rng.normal(0, 3, images.shape), 0, 255).astype(np.uint8)  # what the field says already
-    noisy = dataclasses.replace(dataset, snapshots=None, images=told)
+    noisy = dataset.with_observations(pas=told)
     neighbours, line, _ = learn_neighbours(field, params, hold_out_validation(noisy))
     assert neighbours is None and "the field answers alone" in line
 
@@ -63,7 +63,7 @@ def test_noise_is_nothing_that_neighbours_know(field, params):
     plan = field.plan(params, dataset.receiver())
     clean = jax.jit(lambda query: field.render(params, plan, query).pas)(dataset.query(np.arange(len(dataset))))
     observed = np.asarray(255 * noisy.as_observed(params, clean)).round().astype(np.uint8)
-    told = hold_out_validation(dataclasses.replace(dataset, snapshots=None, images=observed))
+    told = hold_out_validation(dataset.with_observations(pas=observed))
     assert learn_neighbours(noisy, params, told)[0] is None
     assert learn_neighbours(field, params, told)[0] is not None
 
@@ -105,7 +105,7 @@ def test_the_test_part_changes_nothing(field, params, rng):
     poisoned = dataset.snapshots.copy()
     poisoned[dataset.test] = np.nan
     found, *_ = learn_neighbours(field, params, dataset)
-    again, *_ = learn_neighbours(field, params, dataclasses.replace(dataset, snapshots=poisoned))
+    again, *_ = learn_neighbours(field, params, dataset.with_observations(snapshots=poisoned))
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
 

@@ -288,7 +288,7 @@ def test_nothing_of_a_training_looks_at_the_test(dataset, tmp_path, field):
     """What is held out, place and spectrum, may be anything: field, links, data and batches are bit for bit the same."""
     heard, places = dataset.snapshots.copy(), dataset.tx_positions.copy()
     heard[dataset.test], places[dataset.test] = np.nan, 1e3
-    poisoned = dataclasses.replace(dataset, snapshots=heard, tx_positions=places)
+    poisoned = dataclasses.replace(dataset, observations={"snapshots": heard}, tx_positions=places)
     runs = [Run(data, field, tiny_settings(field), 0, tmp_path) for data in (dataset, poisoned)]
     seen = [(run.field, run.state, run.prepared, run.data, run.batches(0, 3), run.watched) for run in runs]
     for a, b in zip(*map(jax.tree.leaves, seen), strict=True):

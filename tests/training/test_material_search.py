@@ -60,7 +60,7 @@ def run_on(untrained, tmp_path):
         plan = run.field.plan(params, run.dataset.receiver(), prepared=run.prepared)
         truth = dataclasses.replace(params, materials=made_of, **{name: jnp.asarray(1.0) for name in natural})
         y = snapshots(truth, plan, run.prepared, run.data.links)
-        run.data = dataclasses.replace(run.data, snapshots=y)
+        run.data = run.data.with_observations(snapshots=y)
         run.state = jax.tree.map(jnp.copy, dataclasses.replace(run.state, params=params))  # an epoch gives its own away
         return run
 
@@ -204,9 +204,8 @@ def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng
     """Nobody has said what was transmitted; what reflects well and what does not is told by powers."""
     search = dataclasses.replace(SETTINGS.search, rounds=rounds, antenna_rounds=1)
     run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search), float(rng.uniform(-90, 40))
-    run.data = dataclasses.replace(
-        run.data, snapshots=None, steering=None, power_db=received_power_db(run.data.snapshots) + offset
-    )
+    powers = received_power_db(run.data.snapshots) + offset
+    run.data = dataclasses.replace(run.data, steering=None, observations={"power_db": powers})
     run.run_hooks()
     entry = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert entry["gain_db"] == pytest.approx(offset, abs=2.5 if rounds else 10)  # wrong materials reflect more or less
@@ -223,7 +222,7 @@ def test_snapshots_in_a_unit_of_their_own_get_a_gain(ordinary, run_on, tmp_path,
     run = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search)
     silent = np.asarray(run.dataset.train)[:2]
     loud = (run.data.snapshots * 10 ** (offset / 20)).at[silent].set(0)
-    run.data = dataclasses.replace(run.data, snapshots=loud)
+    run.data = run.data.with_observations(snapshots=loud)
     run.run_hooks()
     entry = json.loads((tmp_path / "metrics.jsonl").read_text())
     assert ("gain_db" in entry) is not ordinary

@@ -89,7 +89,7 @@ def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
 @pytest.mark.parametrize("compared", ["snapshots", "covariances", "spectra"])
 def test_a_link_on_which_nothing_was_heard_speaks_for_no_candidate(run, rng, compared):
     train, params = np.asarray(run.dataset.train), run.state.params
-    silent = dataclasses.replace(run.data, snapshots=run.data.snapshots.at[train[1]].set(0))
+    silent = run.data.with_observations(snapshots=run.data.snapshots.at[train[1]].set(0))
     candidates = [params, other_materials(params, rng), other_materials(params, rng)]
     score, heard = (make_scores(run.field, run.prepared, data, jnp.asarray(train), compared) for data in (silent, run.data))
     found = score(candidates)

@@ -243,7 +243,7 @@ def test_tile_lists_that_overflow_in_the_middle_of_an_epoch(tmp_path, dataset):
 
 def broken(dataset, factor=np.nan, index=slice(None)):
     """The data set with snapshots that are no numbers."""
-    made = dataclasses.replace(dataset, snapshots=dataset.snapshots.copy())
+    made = dataset.with_observations(snapshots=dataset.snapshots.copy())
     made.snapshots[index] *= factor
     return made
 

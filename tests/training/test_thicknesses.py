@@ -49,7 +49,7 @@ def of(params, names, metres):
 
 def told(room, truth, field=None):
     plan = room.field.plan(truth, room.dataset.receiver(), prepared=room.prepared)
-    data = dataclasses.replace(room.data, snapshots=snapshots(truth, plan, room.prepared, room.data.links))
+    data = room.data.with_observations(snapshots=snapshots(truth, plan, room.prepared, room.data.links))
     return Told(field or room.field, room.prepared, data, np.asarray(room.dataset.train))
 
 
@@ -110,7 +110,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
 def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
-    heard = dataclasses.replace(heard, data=dataclasses.replace(heard.data, snapshots=None))
+    heard = dataclasses.replace(heard, data=heard.data.with_observations())
     nothing = SearchReport(0.0, 0.0, {})
     monkeypatch.setattr("wbgs_jax.training.calibration.thickness.search_materials", lambda params, *_, **__: (params, nothing))
     monkeypatch.setattr("wbgs_jax.training.calibration.thickness._sized", lambda *_: pytest.fail("searched"))

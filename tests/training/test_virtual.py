@@ -55,9 +55,9 @@ def test_they_lie_around_the_known_ones_and_hold_mixtures_of_theirs():
     again, other = virtual_links(dataset, 0), virtual_links(dataset, 1)
     np.testing.assert_array_equal(found.images, again.images)
     assert (found.tx_position != other.tx_position).any()
-    poisoned = dataset.images.copy()
+    poisoned = dataset.observations["pas"].copy()
     poisoned[dataset.test] = 255
-    np.testing.assert_array_equal(virtual_links(dataclasses.replace(dataset, images=poisoned), 0).images, found.images)
+    np.testing.assert_array_equal(virtual_links(dataset.with_observations(pas=poisoned), 0).images, found.images)
 
 
 def test_who_has_none(monkeypatch):

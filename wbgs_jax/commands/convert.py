@@ -173,7 +173,7 @@ def take_in(command: Command) -> str:
         choice = shape, command.port, command.tx_antenna, command.swap
         scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, room, str(command.paths))
     save_scene(command.out, scene)
-    heard = int((np.abs(scene.observations) > 0).any((-1, -2, -3)).sum())
+    heard = int((np.abs(scene.observations["snapshots"]) > 0).any((-1, -2, -3)).sum())
     count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
     return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {shlex.quote(str(command.out))}"
 

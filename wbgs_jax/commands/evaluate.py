@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
         path = result_path(command.results, report, trained.config.preset)
         write_json(path, report | {"provenance": provenance(trained)})
         console.print(f"results: {path}")
-    if command.pictures and dataset.kind != "power":
+    if command.pictures and dataset.has_spectra:
         entries = curves.read(command.run / "metrics.jsonl")
         folder = command.run / f"{with_part('pictures', command.part)}{beside}"
         for path in plotting.draw_all(folder, dataset, index, predicted, report, entries):
@@ -104,9 +104,9 @@ def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
     place = ",".join(f"{x:.3g}" for x in dataset.tx_positions[dataset.test[0] if len(dataset.test) else 0])
     ghz = f"{dataset.frequencies_hz.max() / 1e9:g}"
     lines = []
-    if dataset.kind != "power":
+    if dataset.has_spectra:
         lines.append(f"next: wbgs-jax predict --run {folder} --tx {place} --ghz {ghz} --out pas.npz --picture pas.png")
-    if "power" in outputs_of(trained.field) and dataset.kind != "pas":
+    if "power" in outputs_of(trained.field) and dataset.has_scale:
         lines.append(f"      wbgs-jax map --run {folder} --ghz {ghz} --picture map.png")
     return [*lines, f"      wbgs-jax view --run {folder}"]
 

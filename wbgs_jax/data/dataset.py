@@ -6,21 +6,18 @@ A checksum of a data set: a run keeps that of its data, so that nobody goes on w
 import dataclasses
 import hashlib
 from dataclasses import dataclass, field
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.radio.array import PAS_SHAPE, snapshot_to_pas
-from wbgs_jax.radio.channel import received_power_db
+from wbgs_jax.observation_kinds import HostObservations, Kind, Observed, only_kind
+from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver
 
-Kind = Literal["snapshot", "pas", "power"]
-"""Kind of the observations of a data set."""
 AT_ONCE = 1024
 """Spectra that are made of snapshots."""
 
@@ -38,7 +35,7 @@ class Materials:
 
 
 @dataclass(frozen=True)
-class Dataset:
+class Dataset(Observed):
     """Observations of the links of one scene: observation i belongs to link (transmitter position, receiver, frequency) i."""
 
     name: str
@@ -56,12 +53,8 @@ class Dataset:
     validation: Int[np.ndarray, " n_validation"]
     """Indices of the links that decide between settings; may be empty."""
     test: Int[np.ndarray, " n_test"]
-    snapshots: Complex[np.ndarray, "n elements"] | None = None
-    """Complex array snapshots, or ..."""
-    images: UInt8[np.ndarray, "n 90 360"] | None = None
-    """... 8-bit images of the power angular spectrum, or ..."""
-    power_db: Float[np.ndarray, " n"] | None = None
-    """... received power relative to the transmitted power, dB. Exactly one of the three is not None."""
+    observations: HostObservations
+    """What was observed, of exactly one kind: `{"snapshots": ...}`, `{"pas": ...}` or `{"power_db": ...}`, say."""
     vertices: Float[np.ndarray, "vertices 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """The scene's surfaces in the world frame, metres, float32; empty where no mesh is known."""
     faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
@@ -74,10 +67,8 @@ class Dataset:
     """By which the images of a folder were read; None for scene files, which have one alone."""
 
     def __post_init__(self) -> None:
-        observed = [values for values in (self.snapshots, self.images, self.power_db) if values is not None]
-        if len(observed) != 1:
-            raise ValueError(f"{self.name} has {len(observed)} kinds of observations; give one: snapshots, images or power_db")
-        columns = (self.tx_positions, self.receiver_index, self.tx_index, *observed)
+        only_kind(self.observations, self.name)
+        columns = (self.tx_positions, self.receiver_index, self.tx_index, *self.observations.values())
         if any(len(column) != len(self) for column in columns):
             raise ValueError(f"{self.name}: arrays of links have lengths {[*map(len, columns)]}; all must be {len(self)}")
         if len(self) and not 0 <= self.receiver_index.min() <= self.receiver_index.max() < self.n_receivers:
@@ -87,11 +78,9 @@ class Dataset:
         return len(self.frequencies_hz)
 
     @property
-    def kind(self) -> Kind:
-        """What is observed on a link."""
-        if self.snapshots is not None:
-            return "snapshot"
-        return "pas" if self.images is not None else "power"
+    def observed(self) -> Kind:
+        """The kind of its observations."""
+        return only_kind(self.observations, self.name)
 
     @property
     def n_receivers(self) -> int:
@@ -121,26 +110,27 @@ class Dataset:
         """Returns the observed power angular spectra (float32, maximum 1) of some links.
 
         Raises:
-            UserError: powers alone are known.
+            UserError: what was observed has no spectrum, as received powers have none.
         """
-        if self.images is not None:
-            return jnp.asarray(self.images[index], jnp.float32) / 255
-        if self.snapshots is None:
-            raise UserError(f"{self.name} holds received powers, which have no angular spectrum; give a scene that has one")
-        snapshots = self.snapshots[index]
+        kind = self.observed
+        if kind.to_spectra is None:
+            raise UserError(f"{self.name} holds {kind.words}, which have no angular spectrum; give a scene that has one")
+        values = self.observations[kind.name][index]
+        if not kind.needs_array:
+            return kind.to_spectra(values, None, None)
         arrays, which = self._arrays(index)
         if len(arrays) == 1:
-            return snapshot_to_pas(jnp.asarray(snapshots), arrays[0])
-        spectra = np.zeros((len(snapshots), *PAS_SHAPE), np.float32)
+            return kind.to_spectra(values, arrays[0], None)
+        spectra = np.zeros((len(values), *PAS_SHAPE), np.float32)
         for number, element_positions in enumerate(arrays):
             chosen = which == number
-            spectra[chosen] = snapshot_to_pas(jnp.asarray(snapshots[chosen]), element_positions)
+            spectra[chosen] = kind.to_spectra(values[chosen], element_positions, None)
         return jnp.asarray(spectra)
 
     def eight_bit(self, index: Int[np.ndarray, " b"]) -> UInt8[np.ndarray, "b 90 360"]:
         """Returns the observed spectra of some links in bytes, as published data have them; raises what `pas` raises."""
-        if self.images is not None:
-            return self.images[index]
+        if self.has("pas"):
+            return self.observations["pas"][index]
         blocks = [index[start : start + AT_ONCE] for start in range(0, len(index), AT_ONCE)]
         made = [np.asarray(255 * self.pas(block)).round().astype(np.uint8) for block in blocks]
         return np.concatenate(made) if made else np.zeros((0, *PAS_SHAPE), np.uint8)
@@ -152,9 +142,8 @@ class Dataset:
     def received_db(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, " b"] | None:
         """Returns the received power of some links (dB, relative to the transmitted power), observed or of the snapshots; None
         where spectra alone are known, which have no scale."""
-        if self.power_db is not None:
-            return self.power_db[index]
-        return None if self.snapshots is None else np.asarray(received_power_db(jnp.asarray(self.snapshots[index])))
+        kind = self.observed
+        return None if kind.to_power is None else np.asarray(kind.to_power(self.observations[kind.name][index]))
 
     def _arrays(self, index: Int[np.ndarray, " b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, " b"]]:
         """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""
@@ -165,12 +154,15 @@ class Dataset:
 
 
 NAMES = ("name", "convention")
+RENAMED = {"pas": "images"}
+"""Kinds of observation that checksums call otherwise: those of old run folders stay valid."""
 
 
 def checksum(dataset: Dataset) -> str:
     """Returns a checksum (SHA-256) of all numbers of a data set, its split included; names do not count."""
     found = hashlib.sha256()
     parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
+    parts |= {RENAMED.get(name, name): values for name, values in parts.pop("observations").items()}
     parts["materials"] = None if dataset.materials is None else dataclasses.asdict(dataset.materials) | {"names": ()}
     for path, leaf in jax.tree_util.tree_leaves_with_path(parts):
         array = np.ascontiguousarray(leaf)

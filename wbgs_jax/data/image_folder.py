@@ -176,7 +176,7 @@ def load_layout(
         train=split["train"],
         validation=split["validation"],
         test=split["test"],
-        images=to_pas(images, named),
+        observations={"pas": to_pas(images, named)},
         vertices=room.vertices,
         faces=room.faces,
         face_part=room.face_part if room.parts else None,
@@ -195,8 +195,8 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
             no training or no test spectra, for which the layout has no form.
     """
     dataset = scene_dataset(scene)
-    if dataset.n_receivers > 1 or dataset.kind == "power":
-        what = "received powers alone" if dataset.kind == "power" else f"{dataset.n_receivers} receivers"
+    if dataset.n_receivers > 1 or not dataset.has_spectra:
+        what = f"{dataset.n_receivers} receivers" if dataset.has_spectra else f"{dataset.observed.words} alone"
         raise UserError(f"scene {scene.name} has {what}, which the layout has no form for; keep the scene file")
     if len(dataset.train) == 0 or len(dataset.test) == 0:
         raise UserError(f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; give its split both")

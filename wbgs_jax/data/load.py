@@ -22,11 +22,10 @@ from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.room_file import Room
 from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
 
 SURFACES = ("vertices", "faces", "face_part")
-OBSERVED = ("snapshots", "images", "power_db")
 
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
@@ -52,8 +51,6 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     }
     listed = np.isin(np.arange(len(tx_index)), np.concatenate(list(named.values())))
     tested, validated = (np.isin(tx_index, np.unique(tx_index[index])) for index in (named["test"], named["validation"]))
-    arrays: dict[str, Any] = {name: _together(datasets, name) for name in OBSERVED}
-    arrays |= {name: getattr(first, name) for name in SURFACES}
     return Dataset(
         name="+".join(one.name for one in datasets),
         receivers=jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(one.receivers for one in datasets)),
@@ -64,15 +61,18 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
         train=np.flatnonzero(listed & ~tested & ~validated),
         validation=np.flatnonzero(listed & validated & ~tested),
         test=np.flatnonzero(listed & tested),
-        **arrays,
+        observations={name: np.concatenate([one.observations[name] for one in datasets]) for name in first.observations},
+        vertices=first.vertices,
+        faces=first.faces,
+        face_part=first.face_part,
         materials=first.materials,
     )
 
 
 def _check_alike(first: Dataset, other: Dataset) -> None:
     where = f"{first.name} and {other.name} cannot be joined"
-    if first.kind != other.kind:
-        raise UserError(f"{where}: one holds {first.kind} and the other {other.kind} observations")
+    if first.observed != other.observed:
+        raise UserError(f"{where}: one holds {first.observed.words} and the other {other.observed.words}")
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
         raise UserError(f"{where}: their arrays differ in the number or the unit of their elements")
@@ -82,11 +82,6 @@ def _check_alike(first: Dataset, other: Dataset) -> None:
 
 def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"]) -> Int[np.ndarray, " n"]:
     return np.concatenate([one.receiver_index + start for one, start in zip(datasets, receivers, strict=False)])
-
-
-def _together(datasets: Sequence[Dataset], name: str) -> np.ndarray | None:
-    values = [getattr(one, name) for one in datasets]
-    return None if values[0] is None else np.concatenate(values)
 
 
 SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
@@ -207,7 +202,6 @@ def scene_dataset(scene: SceneFile) -> Dataset:
     """
     links = _observed(scene)
     tx, rx, freq = np.nonzero(links)
-    observed = {"snapshots": scene.snapshots, "images": scene.pas, "power_db": scene.power_db}
     split = scene.split[tx]
     tx_index = group_transmitters(scene.tx_positions[tx])
     parts = {name: np.flatnonzero(split == code) for name, code in PARTS.items()}
@@ -222,7 +216,7 @@ def scene_dataset(scene: SceneFile) -> Dataset:
         train=parts["train"],
         validation=parts["validation"],
         test=parts["test"],
-        **{key: None if values is None else values[links] for key, values in observed.items()},
+        observations={name: values[links] for name, values in scene.observations.items()},
         vertices=scene.vertices,
         faces=scene.faces,
         face_part=scene.face_part,
@@ -255,9 +249,8 @@ def _scene_folder() -> Path:
 
 def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
     """Returns which links of a scene file were observed."""
-    if scene.power_db is not None:
-        return scene.power_db > NOT_HEARD_DB  # nor is what is no number
-    return np.ones(scene.observations.shape[:3], bool) if scene.snapshots is None else ~np.isnan(scene.snapshots).all(-1)
+    kind = only_kind(scene.observations, scene.name)
+    return np.ones(scene.shape, bool) if kind.measured is None else kind.measured(scene.observations[kind.name])
 
 
 def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tuple[str, float]]:

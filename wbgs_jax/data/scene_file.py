@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays, safe_name, told
-from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
+from wbgs_jax.observation_kinds import KINDS, HostObservations, Kind, only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ, ElementUnit
 
 TRAIN, TEST, VALIDATION = 0, 1, 2
@@ -28,12 +28,6 @@ TRAIN, TEST, VALIDATION = 0, 1, 2
 
 Spec = tuple[type[np.generic], tuple[str | int, ...]]
 """dtype and axes: a name stands for the same length everywhere."""
-OBSERVATIONS: dict[str, Spec] = {
-    "snapshots": (np.complex64, ("tx", "rx", "freq", "elements")),
-    "pas": (np.uint8, ("tx", "rx", "freq", PAS_HEIGHT, PAS_WIDTH)),
-    "power_db": (np.float32, ("tx", "rx", "freq")),
-}
-"""Exactly one of these is in a file ..."""
 ARRAYS: dict[str, Spec] = {
     "element_positions": (np.float64, ("rx", "elements", 3)),
     "tx_positions": (np.float64, ("tx", 3)),
@@ -45,11 +39,13 @@ ARRAYS: dict[str, Spec] = {
     "face_part": (np.int32, ("faces",)),
     "split": (np.int8, ("tx",)),
 }
-"""... and all of these, ..."""
+"""All of these are in a file, ..."""
 MESH = ("vertices", "faces", "face_part")
 """Those of the surfaces."""
 TEXTS = ("element_unit", "element_pattern")
-"""... and these, arrays of text."""
+"""... these, arrays of text, and the observations of exactly one kind (`observation_kinds.KINDS`)."""
+BY_KEYWORD = ("snapshots", "pas", "power_db")
+"""Kinds of observation that are fields of a `SceneFile`."""
 
 
 def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
@@ -60,13 +56,13 @@ def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
     """
     try:
         kind = _kind(arrays)
-        specs = {kind: OBSERVATIONS[kind], **ARRAYS}
+        specs = {kind.name: (kind.dtype, ("tx", "rx", "freq", *kind.axes)), **ARRAYS}
         sizes = _sizes(arrays, specs)
         _demand(all(sizes[axis] > 0 for axis in ("tx", "rx", "freq", "elements")), "there is no link in it")
-        _check_values(arrays, sizes["vertices"])
+        _check_values(arrays, kind, sizes["vertices"])
         _check_texts(arrays, sizes["rx"])
         cast = _cast(arrays, specs)
-        _check_values(cast, sizes["vertices"])
+        _check_values(cast, kind, sizes["vertices"])
     except _Wrong as error:
         raise UserError(f"{where}: {error}; mend the scene or make it again (docs/formats.md)") from None
     return cast | {key: arrays[key] for key in TEXTS}
@@ -99,13 +95,14 @@ def _demand(ok: bool | np.bool_, what: str) -> None:
         raise _Wrong(what)
 
 
-def _kind(arrays: dict[str, np.ndarray]) -> str:
-    """Returns the name of the observations; nothing that a scene needs is missing."""
+def _kind(arrays: dict[str, np.ndarray]) -> Kind:
+    """Returns the kind of the observations; nothing that a scene needs is missing."""
     missing = [key for key in (*ARRAYS, *TEXTS) if key not in arrays]
-    observed = [key for key in OBSERVATIONS if key in arrays]
     _demand(not missing, f"it is no scene, it lacks {', '.join(missing)}")
-    _demand(len(observed) == 1, f"it holds {' and '.join(observed) or 'none'} of {', '.join(OBSERVATIONS)}, and needs one")
-    return observed[0]
+    try:
+        return only_kind(arrays, "it")
+    except ValueError as error:
+        raise _Wrong(str(error)) from None
 
 
 def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, int]:
@@ -135,18 +132,14 @@ def _check_positions(arrays: dict[str, np.ndarray], key: str) -> None:
     _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres, from a place on the site")
 
 
-def _check_values(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
+def _check_values(arrays: dict[str, np.ndarray], kind: Kind, n_vertices: int) -> None:
     for key in ("tx_positions", "rx_position", "element_positions"):
         _check_positions(arrays, key)
     for key in ("rx_orientation", "frequencies_hz"):
         _demand(np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
     _check_surfaces(arrays, n_vertices)
-    if (snapshots := arrays.get("snapshots")) is not None:
-        known, nothing = np.isfinite(snapshots).all(-1), np.isnan(snapshots).all(-1)
-        _demand((known | nothing).all(), "snapshots contains infinity, or NaN in some elements of a link alone")
-        _demand(known.any(), "snapshots contains NaN alone")
-    if (power := arrays.get("power_db")) is not None:
-        _demand(not np.isinf(power).any() and not np.isnan(power).all(), "power_db contains infinity, or NaN alone")
+    fault = kind.fault(arrays[kind.name])
+    _demand(not fault, f"{kind.name} contains {fault}")
     lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
     band = f"the model knows {LOWEST_OF_PATHS_HZ:g} to {MAX_FREQUENCY_HZ:g} Hz"
     _demand(lowest > 0, "frequencies_hz must be positive")
@@ -171,7 +164,7 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of a scene file; exactly one of `snapshots`, `pas` and `power_db` is not None."""
+    """The content of a scene file; observations are of one kind alone: `snapshots`, `pas`, `power_db`, or one of `others`."""
 
     name: str
     tx_positions: Float[np.ndarray, "tx 3"]
@@ -195,6 +188,8 @@ class SceneFile:
     """Power angular spectra times 255."""
     power_db: Float[np.ndarray, "tx rx freq"] | None = None
     """float32: received power relative to the transmitted power, dB; NaN where a receiver does not hear a transmitter."""
+    others: HostObservations = field(default_factory=dict)
+    """Observations (tx, rx, freq, ...) of a kind that has no field here, by its name."""
     element_unit: ElementUnit = "wavelengths"
     """Of `element_positions`: "metres" is an array of fixed size."""
     element_pattern: str | tuple[str, ...] = ""
@@ -202,17 +197,21 @@ class SceneFile:
     meta: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def observations(self) -> np.ndarray:
-        """Returns what was observed, of whichever kind: (tx, rx, freq, ...)."""
-        (observed,) = (values for values in (self.snapshots, self.pas, self.power_db) if values is not None)
-        return observed
+    def observations(self) -> HostObservations:
+        """What was observed, by kind: arrays (tx, rx, freq, ...)."""
+        named = {name: getattr(self, name) for name in BY_KEYWORD}
+        return {name: values for name, values in named.items() if values is not None} | self.others
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Numbers of transmitters, receivers and frequencies."""
+        return len(self.tx_positions), len(self.rx_position), len(self.frequencies_hz)
 
 
 def save_scene(path: Path | str, scene: SceneFile) -> None:
     """Checks and writes a scene file; equal scenes give equal bytes."""
-    arrays = {key: getattr(scene, key) for key in (*ARRAYS, *OBSERVATIONS, *TEXTS)}
-    arrays = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
-    arrays = check_arrays(arrays, str(path))
+    arrays = {key: getattr(scene, key) for key in (*ARRAYS, *TEXTS)} | scene.observations
+    arrays = check_arrays({key: np.asarray(value) for key, value in arrays.items()}, str(path))
     meta = json.dumps(scene.meta | {"format": FORMAT, "name": scene.name}, sort_keys=True)
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for key, value in (arrays | {"meta": np.array(meta)}).items():
@@ -231,7 +230,7 @@ def load_scene(path: Path | str) -> SceneFile:
     """
     path = Path(path)
     advice = "check the path, copy it again, or make it again (docs/formats.md)"
-    arrays = read_arrays(path, "scene file", advice, {"meta", *ARRAYS, *OBSERVATIONS, *TEXTS})
+    arrays = read_arrays(path, "scene file", advice, {"meta", *ARRAYS, *KINDS, *TEXTS})
     if "meta" not in arrays:
         raise UserError(f"{path} is not a scene file: it lacks meta; make one with `save_scene` (docs/formats.md)")
     with told(f"meta of scene file {path}", advice):
@@ -242,8 +241,10 @@ def load_scene(path: Path | str) -> SceneFile:
     if found == 1:
         arrays = _from_format_1(arrays, meta)
     arrays = check_arrays(arrays, str(path))
+    others = {key: arrays.pop(key) for key in KINDS if key in arrays and key not in BY_KEYWORD}
     texts = {"element_unit": str(arrays.pop("element_unit")), "element_pattern": _text(arrays.pop("element_pattern"))}
-    return SceneFile(name=safe_name(str(meta.get("name", path.stem))), meta=meta, **texts, **arrays)  # type: ignore[arg-type]
+    name = safe_name(str(meta.get("name", path.stem)))
+    return SceneFile(name=name, meta=meta, others=others, **texts, **arrays)  # type: ignore[arg-type]
 
 
 def _from_format_1(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, np.ndarray]:

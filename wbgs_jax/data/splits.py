@@ -171,9 +171,6 @@ def _keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
     place = np.full(len(dataset), -1)  # of every link among those that stay
     place[kept] = np.arange(len(kept))
 
-    def rows(values: np.ndarray | None) -> np.ndarray | None:
-        return None if values is None else values[kept]
-
     def remaining(index: np.ndarray) -> np.ndarray:
         return place[index][place[index] >= 0]
 
@@ -186,9 +183,7 @@ def _keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
         train=remaining(dataset.train),
         validation=remaining(dataset.validation),
         test=remaining(dataset.test),
-        snapshots=rows(dataset.snapshots),
-        images=rows(dataset.images),
-        power_db=rows(dataset.power_db),
+        observations={name: values[kept] for name, values in dataset.observations.items()},
     )
 
 

@@ -12,7 +12,7 @@ How good predicted received powers are, beside what free space and the nearest t
 
 import dataclasses
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 import jax
@@ -142,7 +142,7 @@ def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int
     if truth is None:
         return None
     heard = truth > NOT_HEARD_DB
-    if dataset.kind != "power" and not heard.any():
+    if dataset.has_spectra and not heard.any():
         return None
     return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
 
@@ -208,8 +208,9 @@ def evaluate(
     power = None if said is None else power_figures(said, others_know, index)
     if said is not None and power and trained.power_confidence and tested:  # how sure it is, the validation part has told
         power |= {"confidence_db": calibrate_power(trained.power_confidence, said, dataset, index)}
-    if dataset.kind == "power":
-        return report | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
+    own = own_scores(seen, dataset, index)
+    if not dataset.has_spectra:
+        return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
     truth, known = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
     figures = metrics.figures(np.asarray(seen.pas), truth, normal)
@@ -220,9 +221,7 @@ def evaluate(
         report["as_observed"] = {"median_ssim": float(np.median(alike)), "mean_ssim": float(np.mean(alike))}
     repeats = repeatability(dataset.name, np.unique(known[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
-    if seen.snapshots is not None and dataset.snapshots is not None:
-        report |= score_snapshots(np.asarray(seen.snapshots), dataset.snapshots[index])
-    report |= {"power": power} if power else {}
+    report |= own | ({"power": power} if power else {})
     sure = trained.confidence
     if tested and sure is not None and (expected := expectations(sure, dataset, index, np.asarray(seen.pas), said)):
         report["confidence"] = calibration(expected, alike, float(sure.level))  # as it was learned
@@ -270,8 +269,10 @@ def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | N
     Raises:
         UserError: the data know power alone, and the field nothing of it.
     """
-    if seen.power_db is None and dataset.kind == "power":
-        raise UserError(f"{dataset.name} holds received powers, of which this field knows nothing; choose another field")
+    if seen.power_db is None and not dataset.has_spectra:
+        raise UserError(
+            f"{dataset.name} holds {dataset.observed.words}, of which this field knows nothing; choose another field"
+        )
     return None if seen.power_db is None else np.asarray(seen.power_db)
 
 
@@ -289,11 +290,24 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
     }
 
 
+SCORES: dict[str, Callable[[Observation, np.ndarray], dict[str, float]]] = {
+    "snapshots": lambda seen, truth: {} if seen.snapshots is None else score_snapshots(np.asarray(seen.snapshots), truth),
+}
+"""Figures of some kinds of observation, beside those of spectra and of received power: (what a field says of n links, what was
+observed on them) -> figures, none if it says nothing that could be compared."""
+
+
+def own_scores(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
+    """Returns the figures (`SCORES`) of what was observed on some links."""
+    kinds = [name for name in dataset.observations if name in SCORES]
+    return {key: value for name in kinds for key, value in SCORES[name](seen, dataset.observations[name][index]).items()}
+
+
 def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     said = power_of(seen, dataset)
-    if dataset.kind == "power" and said is not None and (report := score_heard(said, dataset, index)):
+    if not dataset.has_spectra and said is not None and (report := score_heard(said, dataset, index)):
         return {"held_out_power_error_db": report["power_error_db"]}
     noisy = as_observed(field, params, np.asarray(seen.pas))
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}

@@ -23,7 +23,8 @@ from wbgs_jax._util.devices import over_all_links
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import from_leaves, replaced
 from wbgs_jax.config import PRESETS, Settings
-from wbgs_jax.fields.losses import image_loss
+from wbgs_jax.fields.losses import LOSSES, image_loss
+from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
 from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene
 
@@ -377,17 +378,25 @@ def heard_alone(batch: Batch, seen: Observation) -> Batch:
     if batch.pas is None:
         return batch
     black = jnp.max(batch.pas, (1, 2), keepdims=True) == 0
-    return dataclasses.replace(batch, pas=jnp.where(black, jax.lax.stop_gradient(seen.pas), batch.pas))
+    spectra = jnp.where(black, jax.lax.stop_gradient(seen.pas), batch.pas)
+    return batch.with_observations(**batch.observations | {"pas": spectra})
 
 
 def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stride: int = 1) -> tuple[Float[Array, ""], Aux]:
-    """Returns the image loss (paper, equation 5) of observed spectra, or the mean squared error in dB of received power."""
+    """Returns the image loss (paper, equation 5) of observed spectra, or the loss of a kind that has none (`LOSSES`).
+
+    It is that of received power where the kind has no other, or the field says nothing else.
+    """
     if batch.pas is not None:
         loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight, ssim_stride)
         return loss, Aux({"batch_ssim": similarity})
-    if seen.power_db is None or batch.power_db is None:
-        raise UserError("these data are received powers, of which this field knows nothing; choose another field")
-    return jnp.mean((seen.power_db - batch.power_db) ** 2), Aux({})
+    kind = only_kind(batch.observations, "the batch")
+    error = LOSSES[kind.name](seen, batch.observations[kind.name]) if kind.name in LOSSES else None
+    if error is None:  # the power that follows from what was observed
+        error = LOSSES["power_db"](seen, batch.received_db)
+    if error is None:
+        raise UserError(f"these data are {kind.words}, of which this field knows nothing; choose another field")
+    return error, Aux({})
 
 
 def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:

@@ -135,7 +135,7 @@ class HybridField(Field):
         coherent = self.wave.render(params.wave, plan.wave, links)
         pas, power_db, told = self._said(params, plan, links.query, coherent)
         spectra, power = mixed(params.trust.spectra, told, pas), mixed(params.trust.power, told, power_db)
-        return Observation(spectra, coherent.snapshots, power, paths=coherent.paths)
+        return coherent._replace(pas=spectra, power_db=power, covariance=None)  # which is that of the coherent field alone
 
     def opinions(
         self, params: HybridParams, plan: HybridPlan, links: Query | Links

@@ -1,7 +1,8 @@
 """Training losses on PAS images: L = (1 - lambda) L1 + lambda (1 - SSIM)  (paper, equation 5)."""
 
 import functools
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -121,3 +122,13 @@ def pixel_loss(predicted: Float[Array, "*n"], truth: Float[Array, "*n"], kind: L
     """Returns the mean absolute or squared error, for pixels that make no image."""
     error = predicted - truth
     return jnp.mean(jnp.abs(error) if kind == "l1" else error**2)
+
+
+def power_loss(seen: Any, power_db: Float[Array, " n"]) -> Float[Array, ""] | None:
+    """Returns the mean squared error in dB of the power that a field says (`Observation`); None if it says none."""
+    return None if seen.power_db is None else jnp.mean((seen.power_db - power_db) ** 2)
+
+
+LOSSES: dict[str, Callable[[Any, Any], Float[Array, ""] | None]] = {"power_db": power_loss}
+"""By kind of observation that has no spectra: (what a field says, an `Observation`; what was observed) -> loss of the batch;
+None if the field says nothing that could be compared. A kind that is not here is learned by the power that follows from it."""

@@ -60,9 +60,10 @@ def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> 
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field learned nothing of spectra."""
-    if dataset.kind == "power" and "paths" not in outputs_of(field):
+    if not dataset.has_spectra and "paths" not in outputs_of(field):
         raise UserError(
-            f"{dataset.name} holds received powers, from which the {field.name} field learned no spectra; ask for --what power"
+            f"{dataset.name} holds {dataset.observed.words}, from which the {field.name} field learned no spectra; "
+            "ask for --what power"
         )
 
 
@@ -70,7 +71,7 @@ def check_power(field: Field, dataset: Dataset) -> None:
     """Raises a `UserError` where a field cannot say what power a receiver gets."""
     if "power" not in outputs_of(field):
         raise UserError(f"the {field.name} field has no power, only spectra; train another field")
-    if dataset.kind == "pas" and "paths" not in outputs_of(field):
+    if not dataset.has_scale and "paths" not in outputs_of(field):
         raise UserError(
             f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
         )

@@ -23,7 +23,8 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import Settings, limit_steps
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.radio.array import cbf, normalise, pas_directions, snapshot_to_pas, steering_vector
+from wbgs_jax.observation_kinds import KINDS, Observations, Observed, spectra_of
+from wbgs_jax.radio.array import pas_directions, steering_vector
 from wbgs_jax.types import Batch, Links, Query, Receiver
 
 FAR_M = 500.0
@@ -31,17 +32,16 @@ FAR_M = 500.0
 
 
 @pytree
-class TrainingData:
-    """All links, and what was observed on them: exactly one kind is not None."""
+class TrainingData(Observed):
+    """All links, and what was observed on them."""
 
     receivers: Receiver
     """With a leading axis."""
     links: Links
-    snapshots: Complex[Array, "n elements"] | None
+    observations: Observations
+    """By kind; beside virtual links the spectra of all links, too."""
     steering: Complex[Array, "90 360 elements"] | None
-    """Of the only receiver, if its array scales with the frequency: made once."""
-    images: UInt8[Array, "n 90 360"] | None
-    power_db: Float[Array, " n"] | None
+    """Of the only receiver, if its array scales with the frequency and spectra depend on it: made once."""
 
     def receiver_of(self, index: Int[Array, " b"]) -> Receiver:
         """Returns the receiver of some links, all of which have the same."""
@@ -51,26 +51,22 @@ class TrainingData:
         return jax.tree.map(lambda leaf: leaf[number], self.receivers)
 
     def pas(self, index: Int[Array, " b"]) -> Float[Array, "b 90 360"] | None:
-        """Returns the observed spectra of some links of one receiver; None where only powers are known."""
-        if self.images is not None:
-            return self.images[index].astype(jnp.float32) / 255
-        if self.snapshots is None:
-            return None
-        if self.steering is not None:
-            return normalise(cbf(self.snapshots[index], self.steering))
-        elements = self.receiver_of(index).element_wavelengths(self.links.query.frequency_hz[index])
-        return snapshot_to_pas(self.snapshots[index], elements)
+        """Returns the observed spectra of some links of one receiver; None where there are none."""
+        return self._spectra(self._rows(index), index)
 
     def batch(self, index: Int[Array, " b"], key: Key[Array, ""]) -> Batch:
         """Returns some links of one receiver with everything that was observed on them."""
-        return Batch(
-            links=jax.tree.map(lambda leaf: leaf[index], self.links),
-            receiver=self.receiver_of(index),
-            pas=self.pas(index),
-            snapshots=None if self.snapshots is None else self.snapshots[index],
-            power_db=None if self.power_db is None else self.power_db[index],
-            key=key,
-        )
+        observed = self._rows(index)
+        if (spectra := self._spectra(observed, index)) is not None:
+            observed["pas"] = spectra
+        return Batch(jax.tree.map(lambda leaf: leaf[index], self.links), self.receiver_of(index), observed, key)
+
+    def _rows(self, index: Int[Array, " b"]) -> Observations:
+        return {name: values[index] for name, values in self.observations.items()}
+
+    def _spectra(self, observed: Observations, index: Int[Array, " b"]) -> Float[Array, "b 90 360"] | None:
+        elements = self.receiver_of(index).element_wavelengths(self.links.query.frequency_hz[index])
+        return spectra_of(observed, elements, self.steering)
 
 
 def batches_of_one_receiver(
@@ -86,15 +82,13 @@ def batches_of_one_receiver(
 def training_data(dataset: Dataset) -> TrainingData:
     """Returns a dataset on the device."""
     receivers, steering = dataset.receivers, None
-    if dataset.snapshots is not None and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
+    if dataset.observed.needs_array and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
         steering = steering_vector(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
     return TrainingData(
         receivers=receivers,
         links=dataset.links(np.arange(len(dataset))),
-        snapshots=None if dataset.snapshots is None else jnp.asarray(dataset.snapshots, jnp.complex64),
+        observations={name: jnp.asarray(values, KINDS[name].dtype) for name, values in dataset.observations.items()},
         steering=steering,
-        images=None if dataset.images is None else jnp.asarray(dataset.images),
-        power_db=None if dataset.power_db is None else jnp.asarray(dataset.power_db, jnp.float32),
     )
 
 
@@ -120,11 +114,9 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
             "mesh, transmitters and receivers",
             stacklevel=1,  # of this line, whoever checks: it is said once
         )
-    if dataset.kind == "power" and "power" not in field.outputs:
-        able = ", ".join(name for name in field_names() if "power" in get_field(name).outputs)
-        raise UserError(
-            f"{dataset.name} holds received powers, of which the {field.name} field knows nothing; choose one of: {able}"
-        )
+    if not dataset.has_spectra and "power" not in field.outputs:
+        able, words = ", ".join(name for name in field_names() if "power" in get_field(name).outputs), dataset.observed.words
+        raise UserError(f"{dataset.name} holds {words}, of which the {field.name} field knows nothing; choose one of: {able}")
 
 
 FEW = 128
@@ -154,7 +146,7 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
     train = dataset.train
     positions = dataset.tx_positions[train]
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    if len(train) >= FEW or extent == 0 or dataset.kind == "power":
+    if len(train) >= FEW or extent == 0 or not dataset.has_spectra:
         return None
     rng = np.random.default_rng([seed, 7])
     count = min(COUNT[0] * len(train), COUNT[1])
@@ -212,9 +204,11 @@ def with_virtual(data: TrainingData, virtual: VirtualLinks, observed: UInt8[np.n
         jnp.asarray(virtual.receiver_index, jnp.int32),
         jnp.arange(count, dtype=jnp.int32) + 1 + jnp.max(data.links.tx_index),
     )
-    snapshots = None
-    if data.snapshots is not None:  # of silence, from which no power is learned
-        snapshots = jnp.concatenate([data.snapshots, jnp.zeros((count, data.snapshots.shape[1]), data.snapshots.dtype)])
+    silent = {
+        name: jnp.concatenate([values, jnp.full((count, *values.shape[1:]), KINDS[name].silence, values.dtype)])
+        for name, values in data.observations.items()
+        if name != "pas"
+    }
     links = jax.tree.map(lambda *parts: jnp.concatenate(parts), data.links, more)
     images = jnp.asarray(np.concatenate([observed, virtual.images]))
-    return dataclasses.replace(data, links=links, snapshots=snapshots, images=images)
+    return dataclasses.replace(data, links=links, observations=silent | {"pas": images})

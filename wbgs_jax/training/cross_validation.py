@@ -157,7 +157,7 @@ class Few(NamedTuple):
 def is_few(dataset: Dataset) -> bool:
     """Returns whether a data set's spectra are so few that simple methods are members of the answer."""
     validation = np.unique(dataset.tx_index[dataset.validation])
-    return dataset.kind != "power" and dataset.n_receivers == 1 and len(validation) < ENOUGH
+    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < ENOUGH
 
 
 def learn_few(field: Field, params: Any, dataset: Dataset, training: Training, say: Say) -> Few:

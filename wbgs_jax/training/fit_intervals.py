@@ -64,7 +64,7 @@ def learn_confidence(
 def _of_spectra(
     field: Field, params: Any, seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
 ) -> Confidence | None:
-    if dataset.kind == "power":
+    if not dataset.has_spectra:
         return None
     query = dataset.query(index)
     pas = np.asarray(correct(neighbours, jnp.asarray(seen.pas), query))

@@ -66,7 +66,7 @@ def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
     none.
     """
     links = training_links(dataset)
-    if dataset.kind == "power":
+    if not dataset.has_spectra:
         return Learned()
     if why := _why_not(dataset, len(links)):
         return Learned(line=f"neighbours are not asked: {why}")

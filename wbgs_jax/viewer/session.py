@@ -199,7 +199,7 @@ class Asker:
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
         """Returns the links of this receiver whose spectra are known."""
-        if self.dataset.kind == "power":
+        if not self.dataset.has_spectra:
             return np.zeros(0, int)
         places = np.asarray(self.dataset.receivers.position)
         away = np.linalg.norm(places - np.asarray(self.receiver.position), axis=1)

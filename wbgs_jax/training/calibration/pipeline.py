@@ -88,7 +88,7 @@ class Search(Hook):
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
         told = Told(field, prepared, data, spectra)
-        if data.power_db is not None:  # a number a link tells materials apart, but neither phases nor directions
+        if not data.has_spectra:  # a number a link tells materials apart, but neither phases nor directions
             say("search: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
             if config.rounds:
