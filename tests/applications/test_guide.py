@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mirrors import trained
-from untrained import make_run
+from builders.mirrors import trained
+from builders.untrained import make_run
 
 import wbgs_jax
 from experiments import downstream

@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene, tiny_settings
-from untrained import make_coherent_run, make_run
+from builders.synthetic import tiny_dataset, tiny_scene, tiny_settings
+from builders.untrained import make_coherent_run, make_run
 
 from experiments import frequency_account, neighbours_account, receivers_account
 from experiments.bench.main_job import measure

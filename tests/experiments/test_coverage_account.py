@@ -2,7 +2,7 @@
 
 import json
 
-from commands import call
+from builders.commands import call
 
 from experiments.coverage_account import main
 

@@ -1,7 +1,7 @@
 """What decisions by evidence rest on, and what is simulated of them."""
 
 import numpy as np
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
 from experiments import decisions_account as account
 from experiments.decisions_account import decisions, simulate, stored_gains, transmitters

@@ -3,7 +3,7 @@
 import importlib.util
 
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
 
 from experiments import mutation
 

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
-from untrained import make_coherent_run, make_run
+from builders.commands import assert_error_for_people, call
+from builders.untrained import make_coherent_run, make_run
 
 from experiments.viewer_pictures import chromium, drag, window
 from wbgs_jax.commands import view

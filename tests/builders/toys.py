@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from synthetic import tiny_settings
 
+from builders.synthetic import tiny_settings
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.config import PRESETS, LoopConfig, OptimConfig, Settings, changed
 from wbgs_jax.fields import Field, Group, Observation, base, register

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from by_mitsuba import sionna
-from entries import entries
 from scipy.spatial.transform import Rotation
 
+from builders.conformance.by_mitsuba import sionna
+from builders.conformance.entries import entries
 from wbgs_jax.interchange.ray_paths import read_paths
 from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
 from wbgs_jax.radio.array import SPEED_OF_LIGHT

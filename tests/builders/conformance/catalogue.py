@@ -1,17 +1,19 @@
 """All entries of the suite, by writer."""
 
-import by_blender
-import by_deepmimo
-import by_gltf_writers
-import by_mesh_libraries
-import by_mitsuba
-import by_other_programs
-import by_pictures
-import by_ply_writers
-import by_sionna
-import by_tables
-import by_trimesh
-from entries import Entry
+from builders.conformance import (
+    by_blender,
+    by_deepmimo,
+    by_gltf_writers,
+    by_mesh_libraries,
+    by_mitsuba,
+    by_other_programs,
+    by_pictures,
+    by_ply_writers,
+    by_sionna,
+    by_tables,
+    by_trimesh,
+)
+from builders.conformance.entries import Entry
 
 MODULES = (
     by_trimesh,

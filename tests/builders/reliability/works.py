@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from synthetic import FIELDS, tiny_scene, tiny_settings
-from untrained import make_coherent_run
 
 import wbgs_jax.commands.convert
 import wbgs_jax.commands.evaluate
@@ -15,6 +13,8 @@ import wbgs_jax.commands.map
 import wbgs_jax.commands.measure
 import wbgs_jax.commands.predict
 import wbgs_jax.commands.train
+from builders.synthetic import FIELDS, tiny_scene, tiny_settings
+from builders.untrained import make_coherent_run
 from data_gen import generate, jobs
 from data_gen.settings import ArraySettings, SolverSettings
 from wbgs_jax._util import files

@@ -13,8 +13,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import atheris
 
 with atheris.instrument_imports(include=["wbgs_jax.data", "wbgs_jax.interchange", "wbgs_jax.mesh", "wbgs_jax._util", "yaml"]):
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    from readables import READABLES
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+    from builders.reliability.readables import READABLES
 
 from wbgs_jax._util.errors import UserError
 

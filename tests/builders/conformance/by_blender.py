@@ -14,8 +14,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from entries import entries
-from shapes import Extent, Geometry
+
+from builders import PYTHONPATH
+from builders.conformance.entries import entries
+from builders.conformance.shapes import Extent, Geometry
 
 HERE = Path(__file__).parent
 
@@ -24,7 +26,7 @@ HERE = Path(__file__).parent
 def rooms() -> tempfile.TemporaryDirectory:
     """Returns the folder with all files, which goes when the process ends."""
     folder = tempfile.TemporaryDirectory(prefix="conformance-blender-")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])])}
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH}
     command = [sys.executable, str(HERE / "blender_room.py"), folder.name]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0 and (Path(folder.name) / "truth.json").exists(), done.stdout[-2000:] + done.stderr[-2000:]

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import Entry, entries
-from shapes import CABINET, Geometry, geometry
 
+from builders.conformance.entries import Entry, entries
+from builders.conformance.shapes import CABINET, Geometry, geometry
 from wbgs_jax.data import load_dataset
 
 

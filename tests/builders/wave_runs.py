@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rooms import box, mesh_of, room
-from synthetic import tiny_scene
 
+from builders.rooms import box, mesh_of, room
+from builders.synthetic import tiny_scene
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS

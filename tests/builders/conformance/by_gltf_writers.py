@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import entries
-from shapes import CABINET, RAMP, TURNED, Y_UP, Geometry, Shape, box, geometry
+
+from builders.conformance.entries import entries
+from builders.conformance.shapes import CABINET, RAMP, TURNED, Y_UP, Geometry, Shape, box, geometry
 
 INSIDE = box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
 

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import entries
-from shapes import CABINET, RAMP, WALL, Geometry, Shape, floor, geometry, mesh_of
+
+from builders.conformance.entries import entries
+from builders.conformance.shapes import CABINET, RAMP, WALL, Geometry, Shape, floor, geometry, mesh_of
 
 
 def vertices_of(shape: Shape, kind: str = "f4", order: str = "xyz") -> np.ndarray:

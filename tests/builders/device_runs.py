@@ -10,9 +10,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from synthetic import tiny_dataset, tiny_settings
-from toys import GROWING
 
+from builders.synthetic import tiny_dataset, tiny_settings
+from builders.toys import GROWING
 from wbgs_jax._util.devices import COORDINATOR, Devices, connect
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset

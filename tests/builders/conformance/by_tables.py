@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import entries
 
+from builders.conformance.entries import entries
 from wbgs_jax.data.rssi_folder import load_readings
 
 HEIGHT = 1.3

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import entries
-from shapes import CABINET, RAMP, WALL, Y_UP, Extent, Geometry, Shape, extent_of, floor, geometry, room
+
+from builders.conformance.entries import entries
+from builders.conformance.shapes import CABINET, RAMP, WALL, Y_UP, Extent, Geometry, Shape, extent_of, floor, geometry, room
 
 
 def by_meshio(name: str, shape: Shape = RAMP, **how: Any) -> Callable[[Path], Geometry]:

@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from synthetic import tiny_dataset, tiny_scene, tiny_settings
 
+from builders.synthetic import tiny_dataset, tiny_scene, tiny_settings
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.scene_file import save_scene

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import bpy
 import mathutils
-from shapes import Shape, floor, room
+
+from builders.conformance.shapes import Shape, floor, room
 
 
 def add(name: str, shape: Shape) -> bpy.types.Object:

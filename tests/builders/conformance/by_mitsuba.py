@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import Unavailable, entries
-from shapes import CABINET, RAMP, WALL, Extent, Geometry, Shape, extent_of, mesh_of, room
 
+from builders.conformance.entries import Unavailable, entries
+from builders.conformance.shapes import CABINET, RAMP, WALL, Extent, Geometry, Shape, extent_of, mesh_of, room
 from wbgs_jax._util.errors import UserError
 
 ROUND = 5e-3

@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from synthetic import tiny_dataset
 
+from builders.synthetic import tiny_dataset
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.propagation.paths import REFLECTED

@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 from plyfile import PlyData
 from scipy.io import savemat
-from synthetic import tiny_dataset, tiny_scene
-from untrained import make_run, make_trained
 
+from builders.synthetic import tiny_dataset, tiny_scene
+from builders.untrained import make_run, make_trained
 from data_gen import jobs as batches
 from data_gen.example.make_room import HERE as ROOM
 from data_gen.example.make_room import OBJECTS

@@ -15,7 +15,8 @@ import traceback
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from faults import Counter, Fault, install
+from builders import PYTHONPATH
+from builders.reliability.faults import Counter, Fault, install
 
 MOST_CPU_S, LONGEST_S = 300, 3600.0
 """Of a piece of work: processor time, and time on a busy machine."""
@@ -42,9 +43,12 @@ class Forks:
     """The other end: asks the process for work."""
 
     def __init__(self) -> None:
-        here = Path(__file__).parent
-        paths = os.pathsep.join(map(str, (here, here.parent, here.parents[1])))
-        environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": paths, "WBGS_CACHE": "", "TF_CPP_MIN_LOG_LEVEL": "3"}
+        environment = os.environ | {
+            "JAX_PLATFORMS": "cpu",
+            "PYTHONPATH": PYTHONPATH,
+            "WBGS_CACHE": "",
+            "TF_CPP_MIN_LOG_LEVEL": "3",
+        }
         command = [sys.executable, __file__]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
@@ -63,8 +67,7 @@ class Forks:
 
 
 def _child(work: str, folder: Path, fault: Fault, counter: Counter) -> None:
-    from works import WORKS
-
+    from builders.reliability.works import WORKS
     from wbgs_jax._util.cli import run_command
 
     os.setsid()
@@ -101,7 +104,7 @@ def _wait(child: int, fault: Fault, begin: float) -> int:
 
 def serve() -> None:
     """Answers until its input ends."""
-    import works
+    from builders.reliability import works
 
     works.warm()
     for line in sys.stdin:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from by_sionna import Setup, response, trace
-from entries import entries
 
+from builders.conformance.by_sionna import Setup, response, trace
+from builders.conformance.entries import entries
 from wbgs_jax.interchange.deepmimo import as_deepmimo, load_deepmimo, write_deepmimo
 from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, check_paths
 from wbgs_jax.radio.array import SPEED_OF_LIGHT

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from entries import entries
-from shapes import (
+
+from builders.conformance.entries import entries
+from builders.conformance.shapes import (
     CABINET,
     TURNED,
     WALL,

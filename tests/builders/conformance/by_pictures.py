@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entries import entries
 
+from builders.conformance.entries import entries
 from wbgs_jax.data import load_dataset
 from wbgs_jax.interchange.gaussian_ply import SH_CONSTANT, read_gaussians
 from wbgs_jax.radio.array import pas_directions
