@@ -16,10 +16,10 @@ import tyro
 from jaxtyping import Float
 
 from experiments.few import SHARED
-from experiments.results import FOLDER
+from experiments.results import FOLDER, read_rows
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax._util.files import write_json
 from wbgs_jax.config import SearchConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_validation
@@ -86,8 +86,8 @@ def transmitters(dataset: Dataset, decision: Decision) -> int:
 def stored_gains(rng: np.random.Generator, folder: Path = FOLDER) -> list[Float[np.ndarray, "2 tx"]]:
     """Returns scores by transmitter (means over frequencies) of pairs of trainings on the same test links."""
     groups: dict[Any, list[np.ndarray]] = {}
-    for path in sorted(folder.glob("*/*.json")):
-        values = read_json(path)
+    rows = (row for path in sorted(folder.glob("*.jsonl")) for row in read_rows(path).values())
+    for values in rows:
         if "ssim" in values and len(values["tx"]) >= FEWEST:
             key = values["job"]["scene"], tuple(values["tx"]), tuple(values["ssim"])
             groups.setdefault(key, []).append(np.mean(list(values["ssim"].values()), 0))

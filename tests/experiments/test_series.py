@@ -8,7 +8,7 @@ import pytest
 
 from experiments.catalogue import SERIES, unique_jobs
 from experiments.jobs import BASELINES, Job
-from experiments.results import FOLDER, Results
+from experiments.results import FOLDER, Results, read_lines
 from experiments.series import choices, robustness, tuning, wave_choices
 from experiments.settings import settings
 from experiments.tables import faults
@@ -83,9 +83,9 @@ def test_what_was_measured_before_the_runner_counts_as_run(job, median, mean):
 
 def test_no_result_of_a_series_is_lost():
     results, profiles = Results("quick"), ("choices", "choices_octaves4", "tuning")
-    found = {path for profile in profiles for path in (FOLDER / profile).iterdir()}
-    known = {results.path(job) for job in JOBS if job.profile in profiles and results.get(job)}
-    published = {path for path in found if path.name.startswith("example1_")}  # of 800 steps: in the table, and no job
+    found = {(profile, name) for profile in profiles for name in read_lines(FOLDER / f"{profile}.jsonl")}
+    known = {(job.profile, job.name) for job in JOBS if job.profile in profiles and results.get(job)}
+    published = {row for row in found if row[1].startswith("example1_")}  # of 800 steps: in the table, and no job
     assert len(published) == 15 and len(known) == 73
     assert found == known | published
 
