@@ -120,7 +120,7 @@ class Results:
         add_rows(self.path(job), {job.name: whole})
 
 
-def read_lines(path: Path) -> Mapping[str, str]:
+def read_lines(path: Path) -> dict[str, str]:
     """Returns the lines of a file of rows by name, in its order; none of a file that is not there."""
     if not path.exists():
         return {}
