@@ -85,9 +85,9 @@ RATES = Experiment(
     ),
 )
 CURVE = Experiment(
-    # One, five and ten times 8,000 spectra, on the held-out transmitters, by today's presets. WRF-GS as the paper has it, a model
-    # a frequency which shares that number with the others, and pooled: one model for all frequencies. Scene 4 has the whole
-    # curve, the other scenes its first point. The costliest points have one seed.
+    # One, five and ten times 8,000 spectra, on the held-out transmitters, by today's presets. WRF-GS as the paper has it, a
+    # model a frequency which shares that number with the others, and pooled: one model for all frequencies. Scene 4 has the
+    # whole curve, the other scenes its first point. The costliest points have one seed.
     "Spectra seen",
     (
         Series("Wideband", "wideband", ("", "long"), "quick", (SCENE_OF_CURVE,), seeds=SEEDS),

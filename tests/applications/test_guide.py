@@ -10,7 +10,7 @@ from builders.mirrors import trained
 from builders.untrained import make_run
 
 import wbgs_jax
-from experiments import downstream
+from experiments.studies import downstream
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "applications.md").read_text()
 

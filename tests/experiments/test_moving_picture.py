@@ -8,7 +8,7 @@ from builders.commands import call
 from builders.untrained import make_coherent_run
 from PIL import Image
 
-from experiments import moving_picture
+from experiments.studies import moving_picture
 from wbgs_jax.training.run_folder import load_trained
 
 

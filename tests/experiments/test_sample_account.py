@@ -3,7 +3,7 @@
 import numpy as np
 from builders.synthetic import tiny_scene
 
-from experiments.sample_account import by_group, directions_to_tx
+from experiments.studies.sample_account import by_group, directions_to_tx
 from wbgs_jax.data import scene_dataset
 
 

@@ -8,7 +8,7 @@ import pytest
 from builders.commands import assert_error_for_people, call
 from builders.untrained import make_coherent_run, make_run
 
-from experiments.viewer_pictures import chromium, drag, window
+from experiments.studies.viewer_pictures import chromium, drag, window
 from wbgs_jax.commands import view
 from wbgs_jax.inference.predictor import predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions

@@ -1,4 +1,4 @@
-"""Counts of what was tried, for `python -m experiments.reliability`: a line of JSON each, where it asks for them."""
+"""Counts of what was tried, for `python -m tools.qa.reliability`: a line of JSON each, where it asks for them."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What decisions by evidence rest on, and how often they take the harmful side: `python -m experiments.decisions_account`.
+"""What decisions by evidence rest on, how often they take the harmful side: `python -m experiments.studies.decisions_account`.
 
 Writes experiments/results/decisions.json: for every decision, how many transmitters it has in the data that are at hand; and,
 from stored scores of pairs of trainings on the same test transmitters, how often one of them is taken for better by n
@@ -140,7 +140,7 @@ class Command:
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.decisions_account")
+    command = tyro.cli(Command, prog="python -m experiments.studies.decisions_account")
     sources = [*"123456", *(str(SHARED / name) for name in ("wideband3dgs_example1", "wrfgs_rfid_40"))]
     data = {Path(source).name: hold_out_validation(load_dataset(source)) for source in sources}
     listed = [

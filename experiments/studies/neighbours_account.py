@@ -1,4 +1,4 @@
-"""What neighbours are worth beside a trained field: `python -m experiments.neighbours_account RUN [RUN ...]`.
+"""What neighbours are worth beside a trained field: `python -m experiments.studies.neighbours_account RUN [RUN ...]`.
 
 Every run folder is one of `wbgs-jax train` on data of one receiver. Its field is scored on the test alone and with its
 neighbours, beside the nearest transmitter. Writes experiments/results/neighbours.json; docs/inference.md quotes it.
@@ -33,7 +33,7 @@ class Command:
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.neighbours_account")
+    command = tyro.cli(Command, prog="python -m experiments.studies.neighbours_account")
     report: dict[str, Any] = {}
     for run in command.runs:
         trained = load_trained(run)

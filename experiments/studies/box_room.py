@@ -1,4 +1,4 @@
-"""A folder of meshes by material and `snapshots.npz` as a scene file: `python -m experiments.box_room FOLDER OUT.npz`.
+"""A folder of meshes by material and `snapshots.npz` as a scene file: `python -m experiments.studies.box_room FOLDER OUT.npz`.
 
 The folder's transmitters are in random order; the first four fifths train. Parts are materials of their own: what they are made
 of is not said, and their thickness (0.1 m) is.
@@ -47,7 +47,7 @@ def convert(folder: Path) -> SceneFile:
 def main() -> None:
     """Entry point."""
     if len(sys.argv) != 3:
-        raise UserError("usage: python -m experiments.box_room FOLDER OUT.npz")
+        raise UserError("usage: python -m experiments.studies.box_room FOLDER OUT.npz")
     save_scene(sys.argv[2], convert(Path(sys.argv[1])))
 
 

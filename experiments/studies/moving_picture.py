@@ -1,6 +1,6 @@
 """A moving picture of a trained field: a transmitter walks through the room, and frequencies sweep; truth beside prediction.
 
-python -m experiments.moving_picture --run runs/scene4-hybrid-cpu-seed0 [--out docs/images/walk_scene4.gif]
+python -m experiments.studies.moving_picture --run runs/scene4-hybrid-cpu-seed0 [--out docs/images/walk_scene4.gif]
 
 Only transmitters that the field has not seen in training are shown, so that there is a truth at every step.
 """
@@ -109,7 +109,7 @@ def as_image(figure: Figure) -> Image.Image:
 def main() -> None:
     """Entry point."""
     use_compilation_cache()
-    command = tyro.cli(Command, prog="python -m experiments.moving_picture")
+    command = tyro.cli(Command, prog="python -m experiments.studies.moving_picture")
     if command.out.suffix != ".gif":
         raise UserError(f"--out {command.out} does not end in .gif; rename it")
     trained = load_trained(command.run)

@@ -52,7 +52,7 @@ def account(report: dict[str, Any]) -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = tyro.cli(Command, args=arguments, prog="python -m experiments.coverage_account")
+    command = tyro.cli(Command, args=arguments, prog="python -m tools.qa.coverage_account")
     found = account(read_json(command.report))
     write_json(command.out / "coverage.json", found | {"environment": environment()})
     say(f"lines {found['lines']} %, branches {found['branches']} %: {command.out / 'coverage.json'}")

@@ -1,4 +1,4 @@
-"""One device, four devices and two processes train the same fields: `python -m experiments.devices`.
+"""One device, four devices and two processes train the same fields: `python -m experiments.studies.devices`.
 
 All are simulated on the processors of this machine. Every kind of run is a process of its own (or two) that trains on some of
 scene 1 for forty steps. Their curves, what their compiled programs exchange, and what the parts of a step take are written
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.devices_paper import on_paper
 from experiments.results import FOLDER
+from experiments.studies.devices_paper import on_paper
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.devices import COORDINATOR, COUNT, NUMBER
 from wbgs_jax._util.files import read_json, write_json
@@ -48,7 +48,7 @@ def start(kind: str, folder: Path, fields: tuple[str, ...], **told: str) -> subp
     # More devices than cores, and other work on the machine: XLA's own patience is too short.
     flags += " --xla_cpu_collective_call_terminate_timeout_seconds=1200 --xla_cpu_collective_timeout_seconds=1200"
     environ = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags} | told
-    return subprocess.Popen([sys.executable, "-m", "experiments.devices_part", kind, str(folder), *fields], env=environ)
+    return subprocess.Popen([sys.executable, "-m", "experiments.studies.devices_part", kind, str(folder), *fields], env=environ)
 
 
 def run(kind: str, folder: Path, fields: tuple[str, ...]) -> None:
@@ -97,12 +97,12 @@ def report_of(runs: dict[str, Any], exchanged: dict[str, Any], parts: dict[str, 
     differ = {field: {kind: furthest(of[kind], of["one"]) for kind in KINDS[1:]} for field, of in runs.items()}
     report = {"curves": runs, "last": last, "furthest_percent": differ, "exchanged": exchanged}
     report |= {"parts": {field: in_units(own) for field, own in parts.items()}, "paper": on_paper(parts)}
-    return report | {"provenance": environment() | {"command": "python -m experiments.devices"}}
+    return report | {"provenance": environment() | {"command": "python -m experiments.studies.devices"}}
 
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.devices")
+    command = tyro.cli(Command, prog="python -m experiments.studies.devices")
     with tempfile.TemporaryDirectory() as name:
         work = command.work or Path(name)
         for kind in KINDS:

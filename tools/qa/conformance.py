@@ -1,4 +1,4 @@
-"""What becomes of files that other programs write: `make conformance`, or `python -m experiments.conformance [--only Blender]`.
+"""What becomes of files that other programs write: `make conformance`, or `python -m tools.qa.conformance [--only Blender]`.
 
 Runs the conformance suite (tests/conformance), in which the programs make their files and this library reads them, and writes
 experiments/results/conformance.json: a row for each file, and counts by kind; docs/formats.md quotes it. A file that is neither
@@ -24,7 +24,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
 from wbgs_jax.evaluation.report import environment
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SUITE = ROOT / "tests" / "conformance"
 LEDGER = "WBGS_CONFORMANCE_LEDGER"
 """Environment variable that the suite knows: where it writes its rows."""
@@ -105,7 +105,7 @@ def table(rows: list[Row]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = tyro.cli(Command, args=arguments, prog="python -m experiments.conformance")
+    command = tyro.cli(Command, args=arguments, prog="python -m tools.qa.conformance")
     with tempfile.TemporaryDirectory() as folder:
         ledger = Path(folder) / "ledger.jsonl"
         words = [

@@ -1,4 +1,4 @@
-"""What the frequency can say of a spectrum to a law that is smooth in it: `python -m experiments.frequency_account`.
+"""What the frequency can say of a spectrum to a law that is smooth in it: `python -m experiments.studies.frequency_account`.
 
 Nothing is trained. Every spectrum of the validation transmitters is predicted from the *true* spectra of the same transmitter
 at the other frequencies: by their mean, which needs no frequency, by the four nearest and the four farthest, and pixel by pixel
@@ -41,7 +41,7 @@ class Command:
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.frequency_account")
+    command = tyro.cli(Command, prog="python -m experiments.studies.frequency_account")
     scenes = {}
     for name in command.data:
         dataset = hold_out_validation(load_dataset(name))

@@ -1,6 +1,6 @@
 """Pictures of the viewer for the documentation, and how fast it follows: a browser looks at a run and drags its transmitter.
 
-python -m experiments.viewer_pictures --run runs/scene4-hybrid-cpu-seed0 [--pictures docs/images] [--out results/viewer.json]
+python -m experiments.studies.viewer_pictures --run RUN [--pictures docs/images] [--out results/viewer.json]
 
 Needs Chromium and the extra `dev`.
 """
@@ -170,7 +170,7 @@ def take_pictures(viewer: Viewer, opened: Window, folder: Path) -> None:
 def main() -> None:
     """Entry point."""
     use_compilation_cache()
-    command = tyro.cli(Command, prog="python -m experiments.viewer_pictures")
+    command = tyro.cli(Command, prog="python -m experiments.studies.viewer_pictures")
     viewer = start(ViewCommand(command.run, port=0, ghz=28.0))
     viewer.wait()
     alone = updates_a_second(viewer)

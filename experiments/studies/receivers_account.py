@@ -1,4 +1,4 @@
-"""What a coherent field knows of receivers that it never heard: `python -m experiments.receivers_account RUN [RUN ...]`.
+"""What a coherent field knows of receivers that it never heard: `python -m experiments.studies.receivers_account RUN ...`.
 
 Every run folder is one of `wbgs-jax train --field wave` on a released scene; scenes traced for other receivers of the same room
 are `<scene>_rx<number>.npz` beside it. Transmitters that were trained or validated are left out at all of them. A run on
@@ -91,7 +91,7 @@ def _scores(spectra: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.receivers_account")
+    command = tyro.cli(Command, prog="python -m experiments.studies.receivers_account")
     path = command.out / "receivers.json"
     report: dict[str, Any] = read_json(path) if path.exists() else {}
     for run in command.runs:

@@ -1,4 +1,4 @@
-"""What the product was made to bear: `python -m experiments.reliability [--only kills]`.
+"""What the product was made to bear: `python -m tools.qa.reliability [--only kills]`.
 
 Runs the tests of faults (tests/reliability, the slow ones too) and counts what was tried and held: kills, disks that refuse
 writes, damaged files, careless command lines. Writes experiments/results/reliability.json; docs/reliability.md quotes it. What
@@ -23,7 +23,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import environment
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FAULTS = ROOT / "tests" / "reliability"
 LEDGER, SEED = "WBGS_FAULT_LEDGER", "WBGS_TEST_SEED"
 """Environment variables that the tests know: where they count, and the seed of what they draw."""
@@ -62,7 +62,7 @@ def account(before: Any, found: dict[str, dict[str, int]], run: dict[str, Any]) 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = tyro.cli(Command, args=arguments, prog="python -m experiments.reliability")
+    command = tyro.cli(Command, args=arguments, prog="python -m tools.qa.reliability")
     seed = int.from_bytes(os.urandom(4)) if command.seed is None else command.seed
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

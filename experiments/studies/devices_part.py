@@ -1,4 +1,4 @@
-"""A training of `experiments.devices` in a process of its own: `python -m experiments.devices_part KIND FOLDER FIELD ...`.
+"""A training of `experiments.studies.devices`: `python -m experiments.studies.devices_part KIND FOLDER FIELD ...`.
 
 One device also measures the parts of a step, and four look at what their compiled programs exchange.
 """

@@ -1,4 +1,4 @@
-"""What the coherent field explains of the published sample: `python -m experiments.sample_account FOLDER`.
+"""What the coherent field explains of the published sample: `python -m experiments.studies.sample_account FOLDER`.
 
 Nothing is trained: every surface is plasterboard of 0.1 m, paths are taken away one kind at a time. The array sees directions
 above its horizon; of a line of sight from below only side lobes are in the picture. Writes
@@ -53,7 +53,7 @@ class Command:
 
 def main() -> None:
     """Entry point."""
-    command = tyro.cli(Command, prog="python -m experiments.sample_account")
+    command = tyro.cli(Command, prog="python -m experiments.studies.sample_account")
     dataset = load_dataset(command.data)
     field = wave.make_field(make_mesh(dataset), CONFIG)
     prepared = field.prepare(dataset.links(np.arange(len(dataset))), dataset.receivers)

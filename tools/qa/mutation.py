@@ -1,4 +1,4 @@
-"""Whether tests notice wrong code: `python -m experiments.mutation [--only slab] [--number 20]` (needs the extra `mutation`).
+"""Whether tests notice wrong code: `python -m tools.qa.mutation [--only slab] [--number 20]` (needs the extra `mutation`).
 
 cosmic-ray writes every small error into a module that it knows (another operator, number, comparison); some of these mutants
 are drawn, one after the other goes into a copy of the tree, and the module's tests run. A mutant that they let pass is a
@@ -25,7 +25,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import environment
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MODULES = {
     "splat/composite": ("splat",),
     "splat/projection": ("splat",),
@@ -120,7 +120,7 @@ def account(tree: Path, module: str, number: int, seed: int) -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    command = tyro.cli(Command, args=arguments, prog="python -m experiments.mutation")
+    command = tyro.cli(Command, args=arguments, prog="python -m tools.qa.mutation")
     try:
         import cosmic_ray  # noqa: F401
     except ImportError:

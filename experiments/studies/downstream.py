@@ -1,4 +1,4 @@
-"""What fields are worth to who locates transmitters or chooses beams: `python -m experiments.downstream`.
+"""What fields are worth to who locates transmitters or chooses beams: `python -m experiments.studies.downstream`.
 
 For scenes 1, 2 and 4, and 10, 40, 160 and all training transmitters, a small coherent field is trained into
 runs/downstream/SCENE_txNUMBER (used where it is there, gone on with where it was cut) and asked
@@ -86,7 +86,7 @@ class Command:
 def main() -> None:
     """Entry point."""
     use_compilation_cache()
-    command = tyro.cli(Command, prog="python -m experiments.downstream")
+    command = tyro.cli(Command, prog="python -m experiments.studies.downstream")
     path = command.out / f"downstream{'' if command.part == 'test' else '_validation'}.json"
     if command.tables:
         print("\n\n".join([localisation_table(read_json(path)), beams_table(read_json(path))]))
