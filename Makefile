@@ -63,8 +63,8 @@ test: setup  ## run the tests: about five minutes on two cores
 test-heavy: setup  ## run the tests that compile, search or train for long; CI runs them too: about ten minutes
 	$(PY) -m pytest -n 2 --dist worksteal -m "heavy and not slow"
 
-test-slow: setup  ## run all tests in fully optimised code, among them larger cases of what the others check: hours
-	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
+test-slow: setup  ## run all tests in fully optimised code on fresh random inputs, larger cases of what the others check too: hours
+	WBGS_TEST_OPTIMISED=1 WBGS_TEST_SEED=$(or $(WBGS_TEST_SEED),fresh) $(PY) -m pytest -n 2 --dist worksteal
 
 test-faults: setup  ## run the tests of faults, count what was tried: make test-faults [ARGS="--only fuzz_readers --seed 1"]
 	$(PY) -m tools.qa.reliability $(ARGS)
