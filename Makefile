@@ -63,11 +63,11 @@ test: setup  ## run the tests: about five minutes on two cores
 test-heavy: setup  ## run the tests that compile, search or train for long; CI runs them too: about ten minutes
 	$(PY) -m pytest -n 2 --dist worksteal -m "heavy and not slow"
 
-test-slow: setup  ## run all tests in fully optimised code, among them larger cases of what the others check: hours
-	WBGS_TEST_OPTIMISED=1 $(PY) -m pytest -n 2 --dist worksteal
+test-slow: setup  ## run all tests in fully optimised code on fresh random inputs, larger cases of what the others check too: hours
+	WBGS_TEST_OPTIMISED=1 WBGS_TEST_SEED=$(or $(WBGS_TEST_SEED),fresh) $(PY) -m pytest -n 2 --dist worksteal
 
 test-faults: setup  ## run the tests of faults, count what was tried: make test-faults [ARGS="--only fuzz_readers --seed 1"]
-	$(PY) -m experiments.reliability $(ARGS)
+	$(PY) -m tools.qa.reliability $(ARGS)
 
 conformance: simulator  ## check files that other programs write: install these into .venv-conformance, read what they make, count it
 	@$(PY) -m venv $(WRITERS)
@@ -76,7 +76,7 @@ conformance: simulator  ## check files that other programs write: install these 
 	@grep -v '^#' tests/conformance/requirements.txt | while read -r wanted; do \
 		$(WRITERS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --only-binary :all: "$$wanted" || \
 			echo "conformance: $$wanted cannot be had here; its files are left out" >&2; done
-	$(WRITERS)/bin/python -m experiments.conformance $(ARGS)
+	$(WRITERS)/bin/python -m tools.qa.conformance $(ARGS)
 
 lowest:  ## run the tests with the lowest versions of the dependencies that pyproject.toml allows (needs uv)
 	$(call tested-with,lowest-direct)
@@ -102,7 +102,7 @@ locks:  ## write the locks anew, with the hashes of every file, after a change o
 
 coverage: setup  ## run the tests and report which lines of the library they reach (htmlcov/, experiments/results)
 	$(PY) -m pytest -n 2 --dist worksteal -m "not slow" --cov=wbgs_jax --cov-branch --cov-report=html --cov-report=json:coverage.json
-	$(PY) -m experiments.coverage_account
+	$(PY) -m tools.qa.coverage_account
 
 simulator: setup  ## also install Sionna RT, which only `make data` needs
 	@if command -v uv >/dev/null 2>&1; then \

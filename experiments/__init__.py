@@ -4,6 +4,7 @@
   what it changes, `settings.py` puts that together, `execute.py` trains and scores, `results.py` keeps what comes out.
 * `tables/`: a file a table or figure of the paper (`python -m experiments.tables`), which shows the results that there are.
 * `series/`: one change at a time (`--only choices`, `tuning`, `wave_choices`).
-* `results/`: a JSON file a job, and all of them as one table, `results.csv` (`result_table.py`).
-* `bench/`: this machine (`python -m experiments.bench`).
+* `studies/`: what one page quotes, a command each.
+* `results/`: a file of JSON lines a profile, a line a job; `result_table.py` makes one table of them.
+* `bench/`: this machine (`python -m experiments.bench`); `gpu_check/`: a GPU.
 """

@@ -4,20 +4,8 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from experiments.jobs import Job
-from experiments.series import (
-    choices,
-    curve,
-    fixed_array,
-    frequency,
-    outside,
-    paper_form,
-    rates,
-    robustness,
-    rooms,
-    schedules,
-    tuning,
-    wave_choices,
-)
+from experiments.series import comparisons, fixed_array, outside, robustness
+from experiments.series.series import Experiment
 from experiments.tables import baselines, figure4, figure6, figure7, figure8, headline, table1, table2, table3
 
 TABLES: dict[str, ModuleType] = {
@@ -32,21 +20,21 @@ TABLES: dict[str, ModuleType] = {
     "table2": table2,
     "baselines": baselines,
 }
-SERIES: dict[str, ModuleType] = {
-    "choices": choices,
-    "tuning": tuning,
-    "rates": rates,
-    "curve": curve,
-    "rooms": rooms,
-    "robustness": robustness,
-    "outside": outside,
-    "schedules": schedules,
-    "frequency": frequency,
-    "fixed_array": fixed_array,
-    "paper_form": paper_form,
-    "wave_choices": wave_choices,
+SERIES: dict[str, Experiment] = {
+    "choices": comparisons.CHOICES,
+    "tuning": comparisons.TUNING,
+    "rates": comparisons.RATES,
+    "curve": comparisons.CURVE,
+    "rooms": comparisons.ROOMS,
+    "robustness": robustness.EXPERIMENT,
+    "outside": outside.EXPERIMENT,
+    "schedules": comparisons.SCHEDULES,
+    "frequency": comparisons.FREQUENCY,
+    "fixed_array": fixed_array.EXPERIMENT,
+    "paper_form": comparisons.PAPER_FORM,
+    "wave_choices": comparisons.WAVE_CHOICES,
 }
-EXPERIMENTS = TABLES | SERIES
+EXPERIMENTS: dict[str, ModuleType | Experiment] = {**TABLES, **SERIES}
 
 
 def unique_jobs(names: Sequence[str] = ()) -> list[Job]:

@@ -2,6 +2,7 @@
 
 <!-- quality_example1_wave_cpu_cpu.json median_ssim -->0.528<!-- / -->       a value; its place in the file by dots
 <!-- quality_x.json baselines.nearest_tx.median_ssim 2 -->0.79<!-- / -->     ... with two decimals instead of three
+<!-- quick/scene1_wave_seed0.json median_ssim -->0.9<!-- / -->               ... of the row of that name in quick.jsonl
 <!-- series schedules -->                                                    all tables of a series, up to its
 <!-- / -->
 """
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.catalogue import SERIES
-from experiments.results import FOLDER, Results
+from experiments.results import FOLDER, Results, read_row
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json
 
@@ -49,9 +50,12 @@ def filled(text: str, folder: Path = FOLDER) -> str:
 
 def look_up(folder: Path, file: str, place: str) -> float:
     """Returns a number of a result file."""
-    if not (folder / file).exists():
+    profile, _, row = file.removesuffix(".json").rpartition("/")
+    rows = folder / f"{profile}.jsonl"
+    if (folder / file).exists():
+        found: Any = read_json(folder / file)
+    elif (found := read_row(rows, row)) is None:
         raise UserError(f"a page quotes {file}, which is not in {folder}; run what writes it, or mend the page")
-    found: Any = read_json(folder / file)
     for name in place.split("."):
         if not isinstance(found, dict) or name not in found:
             raise UserError(f"a page quotes {place} of {file}, which has no {name!r}; mend the page")

@@ -1,9 +1,9 @@
-"""What one command makes of few spectra, beside every simple method: `python -m experiments.few`, experiments/results/few/
+"""What one command makes of few spectra, beside every simple method: `python -m experiments.few`, experiments/results/few.jsonl
 and few.json.
 
 A case is a data set with some of its training transmitters, drawn at random or along a track; a row is a case and a seed,
 trained with the defaults and scored on the test transmitters of the data. Rows that are there are not made again. `--part 0/2`
-and `--part 1/2` share the rows between two processes.
+and `--part 1/2` share the rows between two processes. `--collect FOLDER` takes over rows that lie there as files.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from experiments.results import FOLDER
+from experiments.results import FOLDER, add_rows, read_lines, read_rows
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import read_json, write_json
@@ -40,7 +40,7 @@ from wbgs_jax.training.fit_mixture import HeldOut, Known, learn_members, predict
 from wbgs_jax.training.loop import train
 from wbgs_jax.training.run_folder import load_trained, write_config
 
-ROWS = FOLDER / "few"
+ROWS = FOLDER / "few.jsonl"
 SHARED = Path("..") / "shared" / "data"
 """Where published samples lie, beside the repository."""
 TESTED = 300
@@ -155,9 +155,9 @@ def kriged(dataset: Dataset, index: Int[np.ndarray, " n"], beside: Any) -> Float
     return spectra[:, 0]
 
 
-def rows_of(folder: Path = ROWS) -> list[Row]:
+def rows_of(path: Path = ROWS) -> list[Row]:
     """Returns the rows that are there, in the order of the cases."""
-    rows = [read_json(path) for path in folder.glob("*_seed*.json")]
+    rows = read_rows(path).values()
     order = {case.name: number for number, case in enumerate(cases())}
     return sorted((row for row in rows if row["case"] in order), key=lambda row: (order[row["case"]], row["seed"]))
 
@@ -228,6 +228,8 @@ class Command:
     part: str = "0/1"
     """Which share of the rows."""
     out: Path = ROWS
+    collect: Path | None = None
+    """Take over the rows of a folder, a file a row, instead."""
     stored: Path | None = None
     """Write there what the choice rests on in the first seed of the cases instead."""
     list: bool = False
@@ -246,14 +248,18 @@ def main() -> None:
     if command.stored is not None:
         write_json(command.stored, [stored(case, seed, runs) for case, seed in wanted if seed == 0])
         return
+    if command.collect is not None:
+        add_rows(command.out, {path.stem: read_json(path) for path in command.collect.glob("*_seed*.json")})
+        wanted = []
     for number, (case, seed) in enumerate(wanted):
-        path = command.out / f"{case.name}_seed{seed}.json"
+        name = f"{case.name}_seed{seed}"
+        there = name in read_lines(command.out)
         if command.list:
-            print(f"{case.name} seed {seed}: {'there' if path.exists() else 'missing'}")
-        if command.list or number % parts != part or path.exists():
+            print(f"{case.name} seed {seed}: {'there' if there else 'missing'}")
+        if command.list or number % parts != part or there:
             continue
         row = make_row(case, seed, runs)
-        write_json(path, row)
+        add_rows(command.out, {name: row})
         best = max(row["simple"].values())
         print(f"{case.name} seed {seed}: {row['median_ssim']:.3f}, best simple {best:.3f}", file=sys.stderr, flush=True)
     if not command.list and (rows := rows_of(command.out)):

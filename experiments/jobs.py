@@ -1,7 +1,7 @@
 """What is trained: a `Job` is one row of an experiment: data, field, frequencies, transmitters, change, size, seed.
 
-A job knows its data set; `settings.py` gives it its settings. Its name is that of its result file,
-experiments/results/<profile>/<name>.json.
+A job knows its data set; `settings.py` gives it its settings. Its name is that of its result, a line
+of experiments/results/<profile>.jsonl.
 """
 
 import dataclasses

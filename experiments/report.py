@@ -32,8 +32,8 @@ def main() -> None:
     """Entry point."""
     if quality := [read_json(path) for path in sorted(FOLDER.glob("quality_*.json"))]:
         print(quality_table(quality))
-    for module in SERIES.values():
-        print(f"\n## {module.TITLE}\n\n{module.render(Results('quick'))}")
+    for experiment in SERIES.values():
+        print(f"\n## {experiment.title}\n\n{experiment.render(Results('quick'))}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All results as one table, results.csv, which any table tool reads: a row a job and frequency.
+"""All results as one table, results.csv, which `make tables` writes and any table tool reads: a row a job and frequency.
 
     pandas.read_csv("experiments/results/results.csv").query("profile == 'quick' and current")
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from experiments.jobs import BASELINES, Job
 from experiments.profiles import PROFILES
-from experiments.results import FOLDER, Result
+from experiments.results import FOLDER, Result, read_rows
 from experiments.variants import VARIANTS
-from wbgs_jax._util.files import atomic_write, read_json
+from wbgs_jax._util.files import atomic_write
 
 NAME = "results.csv"
 OF_JOB = ("profile", "job", "scene", "field", "variant", "combination", "all_tx", "seed", "current")
@@ -29,24 +29,24 @@ OF_RUN = ("models", "steps", "samples", "gaussians", "training_seconds", "versio
 """Of the whole job."""
 COLUMNS = OF_JOB + OF_FREQUENCY + OF_RUN
 DIGITS = 4
-NO_JOBS = {"smoke", "gpu", "few"}
-"""Folders whose files are no results of jobs: what proves that everything works, what was measured on GPUs, few spectra."""
+NO_JOBS = {"smoke", "few"}
+"""Files of rows that are no results of jobs: what proves that everything works, few spectra."""
 
 
 def rows(folder: Path = FOLDER) -> Iterator[dict[str, Any]]:
     """Yields the rows of all results of jobs; what is not known is missing."""
-    for path in sorted(folder.glob("*/*.json")):
-        if path.parent.name not in NO_JOBS:
-            yield from rows_of(path)
+    for path in sorted(folder.glob("*.jsonl")):
+        if path.stem not in NO_JOBS:
+            for name, values in read_rows(path).items():
+                yield from rows_of(path.stem, name, values)
 
 
-def rows_of(path: Path) -> Iterator[dict[str, Any]]:
-    """Yields the rows of a result file."""
-    values = read_json(path)
-    known = values["job"] | {"profile": path.parent.name}
-    own = {name: value for name, value in known.items() if name in OF_JOB} | {"job": path.stem}
+def rows_of(profile: str, name: str, values: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yields the rows of a result."""
+    known = values["job"] | {"profile": profile}
+    own = {key: value for key, value in known.items() if key in OF_JOB} | {"job": name}
     own |= {"current": is_current(Result(values), Job(**known))}
-    run = {name: value for name, value in (values | values["environment"]).items() if name in OF_RUN}
+    run = {key: value for key, value in (values | values["environment"]).items() if key in OF_RUN}
     for scores in by_frequency(values):
         yield own | scores | run
 

@@ -1,9 +1,16 @@
-"""Result files: written by the runner, read by tables and series. One small JSON a job, with where it comes from."""
+"""Result files: written by the runner, read by tables and series. A file of JSON lines a profile, a line a job, with where it
+comes from.
 
+Several processes may add rows to one file: it is written anew with every row, whole, by one process at a time.
+"""
+
+import contextlib
 import dataclasses
+import fcntl
 import functools
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,12 +21,17 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from experiments.jobs import BASELINES, PICTURED_GHZ, Job
-from experiments.old_names import EDITION, todays
 from experiments.settings import differences, unlike_preset
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, read_json
+from wbgs_jax._util.files import atomic_write, read_text
 
 FOLDER = Path(__file__).parent / "results"
+EDITION = 3
+"""Of the presets that a row's settings are differences from. Who changes a preset raises it, and gives the settings of the rows
+that still count anew."""
+NAME = re.compile(r'\{"name": "([^"\\]+)"')
+"""How every line of a file of rows begins."""
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -58,7 +70,8 @@ class Result:
         scene = self.values.get("job", {}).get("scene", "")
         if not job.is_released and Path(scene).absolute() != Path(job.scene).absolute():
             return False
-        return unlike_preset(job, todays(self.values, job.field)) == differences(job)
+        own = unlike_preset(job, self.values.get("settings", {}))
+        return self.values.get("presets") == EDITION and own == differences(job)
 
 
 @dataclass(frozen=True)
@@ -69,19 +82,20 @@ class Results:
     folder: Path = FOLDER
 
     def path(self, job: Job) -> Path:
-        """Returns where a job's result is or will be."""
-        return self.folder / job.sized(self.profile).profile / f"{job.name}.json"
+        """Returns the file that a job's result is or will be a line of."""
+        return self.folder / f"{job.sized(self.profile).profile}.jsonl"
 
     def pictures_path(self, job: Job) -> Path:
         """Returns where its pictures are."""
-        return self.path(job).with_suffix(".png")
+        return self.path(job).with_suffix("") / f"{job.name}.png"
 
     def get(self, job: Job) -> Result | None:
         """Returns a job's result; None if it has not been run yet, or with other settings."""
         path = self.path(job)
-        if not path.exists():
+        line = read_lines(path).get(job.name)
+        if line is None:
             return None
-        result = _read(path, path.stat().st_mtime_ns)
+        result = _result(path, job.name, line)
         return result if result.belongs_to(job.sized(self.profile)) else None
 
     def all(self, jobs: list[Job]) -> list[Result]:
@@ -97,23 +111,75 @@ class Results:
             return np.asarray(image).reshape(len(PICTURED_GHZ), -1, image.width)
 
     def write(self, job: Job, values: dict[str, Any], pictures: UInt8[np.ndarray, "k 90 360"] | None = None) -> None:
-        """Keep a result; the JSON is written last, so that it stands for everything."""
+        """Keep a result; the row is written last, so that it stands for everything."""
         job = job.sized(self.profile)
         if pictures is not None:
             with atomic_write(self.pictures_path(job)) as stream:
                 Image.fromarray(pictures.reshape(-1, pictures.shape[-1])).save(stream, format="png", optimize=True)
         whole = {"job": dataclasses.asdict(job)} | values | {"presets": EDITION, "settings": differences(job)}
-        text = json.dumps(whole, indent=2, allow_nan=False)
-        with atomic_write(self.path(job)) as stream:
-            stream.write((one_line_lists(text) + "\n").encode())
+        add_rows(self.path(job), {job.name: whole})
+
+
+def read_lines(path: Path) -> dict[str, str]:
+    """Returns the lines of a file of rows by name, in its order; none of a file that is not there."""
+    if not path.exists():
+        return {}
+    known = path.stat()
+    return _lines(path, (known.st_ino, known.st_mtime_ns, known.st_size))
+
+
+def read_row(path: Path, name: str) -> Row | None:
+    """Returns a row of a file; None if there is none of that name."""
+    line = read_lines(path).get(name)
+    return None if line is None else _row(path, name, line)
+
+
+def read_rows(path: Path) -> dict[str, Row]:
+    """Returns the rows of a file by name.
+
+    Raises:
+        UserError: a line is no row.
+    """
+    return {name: _row(path, name, line) for name, line in read_lines(path).items()}
+
+
+def add_rows(path: Path, rows: Mapping[str, Row]) -> None:
+    """Adds rows to a file, or puts them in the place of those of the same names."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = {name: json.dumps({"name": name} | row, allow_nan=False) for name, row in rows.items()}
+    with path.with_suffix(".lock").open("a") as lock:
+        with contextlib.suppress(OSError):  # some clusters' file systems know no locks
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        whole = read_lines(path) | lines
+        with atomic_write(path) as stream:
+            stream.write("".join(f"{whole[name]}\n" for name in sorted(whole)).encode())
+
+
+@functools.lru_cache(maxsize=64)
+def _lines(path: Path, written: tuple[int, int, int]) -> dict[str, str]:
+    """Returns the lines of a file, read once for each time that it was written."""
+    found = {}
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        if (name := NAME.match(line)) is None:
+            raise UserError(f"{path}, line {number}: this is no row; remove the line, and the same command makes it again")
+        found[name[1]] = line
+    return found
+
+
+def _row(path: Path, name: str, line: str) -> Row:
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise UserError(
+            f"{path}: the row {name} is no JSON ({error}); remove it, and the same command makes it again"
+        ) from None
 
 
 @functools.lru_cache(maxsize=1000)
-def _read(path: Path, modified_ns: int) -> Result:
-    """Returns the content of a file, read once for each time that it was written; what is no result is a `UserError`."""
-    values = read_json(path)
+def _result(path: Path, name: str, line: str) -> Result:
+    values = _row(path, name, line)
     if not _is_result(values):
-        raise UserError(f"{path} is no result of an experiment; remove it, and the runner makes it again")
+        raise UserError(f"{path}: the row {name} is no result of an experiment; remove it, and the runner makes it again")
     return Result(values)
 
 
@@ -130,9 +196,3 @@ def _is_result(values: Any) -> bool:
         return np.array([*map(float, scores)]).shape == np.array([*scores.values()], float).shape[:1]
     except (TypeError, ValueError):
         return False
-
-
-def one_line_lists(text: str) -> str:
-    """Returns indented JSON with lists of plain values on one line each: a tenth of the size, and a line a frequency in a
-    diff."""
-    return re.sub(r"\[[^\[\]{}]*\]", lambda found: re.sub(r"\s+", " ", found[0]).replace("[ ", "[").replace(" ]", "]"), text)

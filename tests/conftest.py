@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests: a fresh, printed random seed and the optional folder of published data."""
+"""Fixtures shared by all tests: a printed random seed, fixed or drawn, and the optional folder of published data."""
 
 import gc
 import os
@@ -27,6 +27,8 @@ import pytest
 
 MOST_MAPS = 25_000
 SEED_VARIABLE, DATA_VARIABLE = "WBGS_TEST_SEED", "WBGS_SHARED"
+USUAL_SEED, FRESH = "2505", "fresh"
+"""The seed where the environment names none, and what it says to have another one drawn."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -47,7 +49,8 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder.name)
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # most of the time goes into small programs
     # In the environment, so that the workers of pytest-xdist draw the same.
-    os.environ[SEED_VARIABLE] = os.environ.get(SEED_VARIABLE) or str(np.random.SeedSequence().entropy % 2**32)
+    seed = os.environ.get(SEED_VARIABLE) or USUAL_SEED
+    os.environ[SEED_VARIABLE] = str(np.random.SeedSequence().entropy % 2**32) if seed == FRESH else seed
 
 
 def pytest_report_header(config: pytest.Config) -> str:
@@ -72,7 +75,7 @@ def few_programs_in_memory() -> Iterator[None]:
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    """Random numbers that differ by run and by test, and depend on nothing but the printed seed and the test's name."""
+    """Random numbers that differ by test, and depend on nothing but the printed seed and the test's name."""
     return np.random.default_rng([int(os.environ[SEED_VARIABLE]), zlib.crc32(request.node.name.encode())])
 
 

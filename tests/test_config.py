@@ -4,7 +4,7 @@ import dataclasses
 import json
 
 import pytest
-from synthetic import tiny_settings
+from builders.synthetic import tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS, changed, check, from_dict, from_sections, limit_steps, sections, to_dict

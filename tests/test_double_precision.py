@@ -26,7 +26,7 @@ from pathlib import Path
 import jax, numpy as np
 assert jax.config.jax_enable_x64
 sys.path.insert(0, "tests")
-from untrained import make_coherent_run, make_run
+from builders.untrained import make_coherent_run, make_run
 import wbgs_jax as wb
 for make in (make_run, make_coherent_run):
     predict = wb.predictor(wb.load_trained(make(Path(sys.argv[1]) / make.__name__)))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import tiny_scene
+from builders.synthetic import tiny_scene
 
 import wbgs_jax as wb
 from wbgs_jax.commands import train

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
-from synthetic import tiny_dataset, tiny_scene, tiny_settings
-from untrained import make_coherent_run
+from builders.commands import assert_error_for_people, call
+from builders.synthetic import tiny_dataset, tiny_scene, tiny_settings
+from builders.untrained import make_coherent_run
 
 from wbgs_jax._util import files
 from wbgs_jax._util.errors import UserError

@@ -14,7 +14,7 @@ def codespell(*arguments: str, folder: Path = ROOT) -> subprocess.CompletedProce
 
 def test_nothing_is_misspelt():
     documents = [str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("*.md"))]
-    found = codespell(*documents, "docs", "wbgs_jax", "data_gen", "experiments", "tests")
+    found = codespell(*documents, "docs", "wbgs_jax", "data_gen", "experiments", "tools", "tests")
     assert found.returncode == 0, found.stdout
 
 

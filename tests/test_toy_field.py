@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
+from builders.synthetic import FREQUENCIES_HZ, tiny_scene
+from builders.toys import metrics_of
 from jaxtyping import Array, Float
-from synthetic import FREQUENCIES_HZ, tiny_scene
-from toys import metrics_of
 
 import wbgs_jax as wb
 from wbgs_jax.commands import evaluate as eval_command

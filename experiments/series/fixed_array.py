@@ -1,14 +1,13 @@
 """An array of fixed size in metres, as receivers are built: its beams narrow with the frequency, and spectra change with it."""
 
-from experiments.jobs import FIXED_SCENE, GHZ_FIXED, SEEDS, Job
+from experiments.jobs import FIXED_SCENE, GHZ_FIXED, SEEDS
 from experiments.markdown import markdown
 from experiments.results import Results
-from experiments.series.series import Series, jobs_of_all
+from experiments.series.series import Experiment, Series
 from experiments.tables.cells import cell, median_cell, scores
 from wbgs_jax.data import released_scenes
 from wbgs_jax.data.scene_file import load_scene
 
-TITLE = "An array of fixed size"
 SERIES = (
     Series("wideband (ours)", "wideband", ("",), "quick", (FIXED_SCENE,), seeds=SEEDS),
     Series("wideband, not told the frequency", "wideband", ("pooled",), "quick", (FIXED_SCENE,), seeds=SEEDS),
@@ -21,11 +20,6 @@ NAMES_OF_BASELINES = {
     "inverse_distance": "1/d² weighting",
     "phase_blind": "phase-blind ceiling",
 }
-
-
-def jobs() -> list[Job]:
-    """Returns a job a model and seed."""
-    return jobs_of_all(SERIES)
 
 
 def render(results: Results) -> str:
@@ -42,3 +36,6 @@ def render(results: Results) -> str:
         rows.append([name, *map(cell, learned_nothing, [None] * len(GHZ_FIXED)), cell(average), ""])
     head = ["model", *(f"{f:g}" for f in GHZ_FIXED), "average", "seeds"]
     return f"Median SSIM of held-out transmitters by frequency (GHz), profile `{SERIES[0].profile}`:\n\n{markdown(head, rows)}"
+
+
+EXPERIMENT = Experiment("An array of fixed size", SERIES, tables=render)

@@ -5,9 +5,8 @@ import statistics
 from experiments.jobs import BASELINES, OUTSIDE_SCENES, Job
 from experiments.markdown import markdown
 from experiments.results import Results
-from experiments.series.series import NOT_RUN, Series, jobs_of_all
+from experiments.series.series import NOT_RUN, Experiment, Series
 
-TITLE = "Truths from outside"
 SERIES = tuple(
     Series(title, field, ("",), "robustness", OUTSIDE_SCENES)
     for title, field in (("hybrid", "hybrid"), ("coherent alone", "wave"), ("wideband alone", "wideband"))
@@ -17,11 +16,6 @@ NOTE = (
     " the mean over frequencies of the median SSIM:"
 )
 LEARN_NOTHING = {"nearest_tx": "nearest TX", "inverse_distance": "1/d² weighting"}
-
-
-def jobs() -> list[Job]:
-    """Returns a job a data set and model."""
-    return jobs_of_all(SERIES) + [_baselines(scene) for scene in OUTSIDE_SCENES]
 
 
 def render(results: Results) -> str:
@@ -43,3 +37,6 @@ def _baselines(scene: str) -> Job:
 def _scores(results: Results, job: Job) -> str:
     result = results.get(job)
     return f"{result.values['median_ssim']:.3f} / {result.values['mean_ssim']:.3f}" if result else NOT_RUN
+
+
+EXPERIMENT = Experiment("Truths from outside", SERIES, tuple(_baselines(scene) for scene in OUTSIDE_SCENES), tables=render)

@@ -2,13 +2,12 @@
 
 import statistics
 
-from experiments.jobs import BASELINES, Job
+from experiments.jobs import BASELINES
 from experiments.markdown import markdown
 from experiments.results import Result, Results
-from experiments.series.series import NOT_RUN, Series, jobs_of_all
+from experiments.series.series import NOT_RUN, Experiment, Series
 from experiments.variants import FAULTS, UNCORRECTED, uncorrected
 
-TITLE = "Faults"
 SCENES = ("4", "1", "2")
 OF_DATA = ("", "receiver_off", "array_off", "snr_30", "snr_20", "snr_10", "tx_20", "tx_100", "images")
 """Faults that a field without a look at the mesh's details notices too."""
@@ -34,11 +33,6 @@ WORST = (
     "The hybrid field's smallest lead over the best of the others, among the {count} faults with which all were run, is"
     " {ahead:+.3f}, with *{fault}*."
 )
-
-
-def jobs() -> list[Job]:
-    """Returns a job a scene and fault."""
-    return jobs_of_all(SERIES) + NOTHING.jobs()
 
 
 def render(results: Results) -> str:
@@ -106,3 +100,6 @@ def _averages(results: Results, series: Series, scene: str, variant: str) -> ByS
 
 def _known(results: Results, series: Series, scene: str, variant: str) -> dict[int, Result]:
     return {job.seed: found for job in series.jobs_of(scene, variant) if (found := results.get(job))}
+
+
+EXPERIMENT = Experiment("Faults", SERIES, tuple(NOTHING.jobs()), tables=render)

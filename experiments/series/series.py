@@ -2,6 +2,7 @@
 
 import dataclasses
 import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from experiments.jobs import Job
@@ -50,11 +51,21 @@ class Series:
         return f"{self.title} ({self.field}, {where}):\n\n{markdown(head, rows)}"
 
 
-def jobs_of_all(series: tuple[Series, ...]) -> list[Job]:
-    """Returns the jobs of several series."""
-    return [job for one in series for job in one.jobs()]
+@dataclass(frozen=True)
+class Experiment:
+    """Series that are shown together."""
 
+    title: str
+    series: tuple[Series, ...]
+    more_jobs: tuple[Job, ...] = ()
+    """What its tables need besides."""
+    tables: Callable[[Results], str] | None = None
+    """Tables of its own form; by default one a series."""
 
-def render_all(series: tuple[Series, ...], results: Results) -> str:
-    """Returns their tables."""
-    return "\n\n".join(one.render(results) for one in series)
+    def jobs(self) -> list[Job]:
+        """Returns a job a change, scene and seed."""
+        return [job for one in self.series for job in one.jobs()] + [*self.more_jobs]
+
+    def render(self, results: Results) -> str:
+        """Returns its tables."""
+        return self.tables(results) if self.tables else "\n\n".join(one.render(results) for one in self.series)

@@ -8,6 +8,7 @@ from experiments.jobs import BASELINES, Job
 from experiments.markdown import markdown
 from experiments.paper import GHZ_10, SCENES
 from experiments.results import Results
+from experiments.series.comparisons import SCENE_OF_CURVE
 from experiments.tables import table1
 from experiments.tables.cells import NAMES, ceiling, cell, median_cell, paired_cells, scores, truth_repeats
 
@@ -17,7 +18,7 @@ NAMES_OF_BASELINES = ("mean_image", "nearest_tx", "inverse_distance", "line_of_s
 
 def jobs() -> list[Job]:
     """Returns the volume in one scene, and the predictors that learn nothing."""
-    return [Job(table1.SCENE_OF_CURVE, "nerf2"), *(Job(scene, BASELINES) for scene in SCENES)]
+    return [Job(SCENE_OF_CURVE, "nerf2"), *(Job(scene, BASELINES) for scene in SCENES)]
 
 
 def best_baseline(results: Results, scene: str) -> float | None:
@@ -55,7 +56,7 @@ def without_learning(results: Results) -> str:
 
 def volume(results: Results) -> str:
     """All models with their first seed, and a paired test of ours against the volume."""
-    fields, scene = ("wideband", "wrfgs", "wave", "nerf2"), table1.SCENE_OF_CURVE
+    fields, scene = ("wideband", "wrfgs", "wave", "nerf2"), SCENE_OF_CURVE
     values = {name: scores(results, [Job(scene, name)], GHZ_10) for name in fields}
     better, _, p = paired_cells(values["wideband"], values["nerf2"])
     row = [scene, *(median_cell(v) for v in values.values()), better, p]

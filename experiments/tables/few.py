@@ -22,7 +22,7 @@ HEAD = ["case", "spectra", "seeds", "worst", "median", "field alone", *OTHERS, "
 
 def render(results: Results, images: Path) -> str:
     """One table, and what it comes to."""
-    rows = rows_of(results.folder / "few")
+    rows = rows_of(results.folder / "few.jsonl")
     if not rows:
         return f"{NOTE}\n\n{NOT_RUN}"
     names = list(dict.fromkeys(row["case"] for row in rows))

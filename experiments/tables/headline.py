@@ -11,7 +11,8 @@ from experiments.jobs import Job
 from experiments.markdown import markdown
 from experiments.paper import COMBINATIONS, GAIN, GHZ_10, GHZ_21, SCENES, TABLE_1_OVERALL, ZERO_SHOT_DROP
 from experiments.results import Results
-from experiments.series import curve
+from experiments.series.comparisons import CURVE as CURVE_JOBS
+from experiments.series.comparisons import SCENE_OF_CURVE
 from experiments.statistics import gain, level
 from experiments.tables import figure7, figure8, table1, table3
 from experiments.tables.baselines import best_baseline
@@ -58,12 +59,12 @@ UNSEEN_NOTE = (
 
 def jobs() -> list[Job]:
     """Returns the jobs of the curve."""
-    return curve.jobs()
+    return CURVE_JOBS.jobs()
 
 
 def render(results: Results, images: Path) -> str:
     """A picture, a table of six scenes, the curve of one, and what unseen frequencies cost."""
-    parts = [NOTE, by_scene(results), CURVE_NOTE.format(scene=curve.SCENE), against_spectra(results)]
+    parts = [NOTE, by_scene(results), CURVE_NOTE.format(scene=SCENE_OF_CURVE), against_spectra(results)]
     parts += [UNSEEN_NOTE, zero_shot_drop(results)]
     bars = {m: [scores(results, table1.jobs_of(scene, *m), GHZ_10) for scene in SCENES] for m in table1.MODELS}
     if any(v is not None for values in bars.values() for v in values):
@@ -121,7 +122,7 @@ def against_spectra(results: Results) -> str:
     """A row a model, a column a number of spectra."""
     rows, known = [], {}
     for name, (field, variants) in CURVE.items():
-        known[name] = [found(results, curve.SCENE, field, variant) for variant in variants]
+        known[name] = [found(results, SCENE_OF_CURVE, field, variant) for variant in variants]
         cells = [_with_seeds(values) for values in known[name]]
         rows.append([name, *cells, *[""] * (3 - len(cells))])
     pairs = zip(known["wideband"], known["WRF-GS, a model a frequency"], strict=True)

@@ -97,6 +97,6 @@ def provenance(results: Results) -> str:
     commits = sorted({str(r.values["environment"]["commit"]) for r in found})
     return (
         f"{len(found)} of {len(jobs)} jobs have been run ({devices}; {seconds / 3600:.1f} hours of training and evaluation;"
-        f" code {', '.join(f'`{c}`' for c in commits)}). Each is a file in `experiments/results/{results.profile}/`, with its"
-        " settings; results of other settings count as not run."
+        f" code {', '.join(f'`{c}`' for c in commits)}). Each is a line of `experiments/results/{results.profile}.jsonl`, with"
+        " its settings; results of other settings count as not run."
     )

@@ -28,7 +28,7 @@ def summary(results: Results) -> dict[str, Any]:
     ours, theirs = known["wideband"], known["wrfgs"]
     known["gain_percent"] = None if ours is None or theirs is None else 100 * (ours / theirs - 1)
     for name, variant in (("5x", "long"), ("10x", "longest")):
-        pair = (headline.found(results, headline.curve.SCENE, field, variant) for field in ("wideband", "wrfgs"))
+        pair = (headline.found(results, headline.SCENE_OF_CURVE, field, variant) for field in ("wideband", "wrfgs"))
         ratio = gain(*pair)
         known[f"gain_percent_{name}"] = None if ratio is None else 100 * ratio
     return {name: round(value, 4) for name, value in known.items() if value is not None}

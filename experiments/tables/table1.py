@@ -6,6 +6,7 @@ from experiments.jobs import BASELINES, SEEDS, Job
 from experiments.markdown import markdown
 from experiments.paper import GHZ_10, SCENES, TABLE_1, TABLE_1_AVERAGE
 from experiments.results import Results
+from experiments.series.comparisons import SCENE_OF_CURVE
 from experiments.tables.cells import NAMES, SUMMARY, ceiling, cell, median_cell, scores, summary_cells, truth_repeats
 
 TITLE = "Table 1: six scenes, ten frequencies, held-out transmitters"
@@ -15,8 +16,8 @@ MODELS = (
     ("wrfgs", ""),
     ("wave", ""),
 )
-CONTROLS, SCENE_OF_CURVE = (("wideband", "pooled"),), "4"
-"""Models that have several seeds in this scene alone, that of the curve (`series.curve`)."""
+CONTROLS = (("wideband", "pooled"),)
+"""Models that have several seeds in this scene alone, that of the curve (`comparisons.CURVE`)."""
 
 
 def jobs() -> list[Job]:

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
-from untrained import make_field, make_params
+from builders.rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
+from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile

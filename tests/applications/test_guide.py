@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mirrors import trained
-from untrained import make_run
+from builders.mirrors import trained
+from builders.untrained import make_run
 
 import wbgs_jax
-from experiments import downstream
+from experiments.studies import downstream
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "applications.md").read_text()
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mirrors import MirrorsField, Trained, trained
-from rooms import METAL, field_of, rectangle
-from synthetic import RX
+from builders.mirrors import MirrorsField, Trained, trained
+from builders.rooms import METAL, field_of, rectangle
+from builders.synthetic import RX
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree

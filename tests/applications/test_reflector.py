@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mirrors import Blind
-from rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
+from builders.mirrors import Blind
+from builders.rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import power_at_users

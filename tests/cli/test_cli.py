@@ -3,9 +3,9 @@
 import re
 
 import pytest
-from commands import assert_error_for_people, call, in_a_process
-from synthetic import tiny_scene
-from toys import RippleField, registered
+from builders.commands import assert_error_for_people, call, in_a_process
+from builders.synthetic import tiny_scene
+from builders.toys import RippleField, registered
 
 import wbgs_jax
 from wbgs_jax.commands import main as cli

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from commands import assert_error_for_people, call
-from untrained import make_coherent_run, make_run
+from builders.commands import assert_error_for_people, call
+from builders.untrained import make_coherent_run, make_run
 
 from wbgs_jax.commands import convert as convert_command
 from wbgs_jax.data.load import load_dataset

@@ -5,10 +5,10 @@ import math
 
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
+from builders.synthetic import tiny_dataset
+from builders.untrained import make_coherent_run, make_run
 from PIL import Image
-from synthetic import tiny_dataset
-from untrained import make_coherent_run, make_run
 
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command

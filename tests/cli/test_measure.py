@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from commands import assert_error_for_people, call
-from flats import LAW, folder, powers
+from builders.commands import assert_error_for_people, call
+from builders.flats import LAW, folder, powers
 
 from wbgs_jax.commands.measure import main
 

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import call
+from builders.commands import call
+from builders.synthetic import tiny_scene
+from builders.toys import RippleConfig, RippleField, registered, toy_settings
+from builders.untrained import SETTINGS, State, make_coherent_run, make_run
 from PIL import Image
-from synthetic import tiny_scene
-from toys import RippleConfig, RippleField, registered, toy_settings
-from untrained import SETTINGS, State, make_coherent_run, make_run
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.commands import map as map_command

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
-from untrained import make_run, make_trained
+from builders.synthetic import tiny_dataset
+from builders.untrained import make_run, make_trained
 
 from wbgs_jax._util import compilation
 from wbgs_jax.inference.predictor import predictor

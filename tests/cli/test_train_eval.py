@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call, in_a_process
+from builders.commands import assert_error_for_people, call, in_a_process
+from builders.synthetic import tiny_dataset, tiny_scene
+from builders.toys import RippleField, registered
 from PIL import Image
-from synthetic import tiny_dataset, tiny_scene
-from toys import RippleField, registered
 
 import wbgs_jax
 from wbgs_jax.commands import evaluate as eval_command

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from by_trimesh import FILES
-from catalogue import catalogue
-from entries import Entry, Unavailable, check
-from shapes import CABINET, Geometry, extent_of
+from builders.conformance.by_trimesh import FILES
+from builders.conformance.catalogue import catalogue
+from builders.conformance.entries import Entry, Unavailable, check
+from builders.conformance.shapes import CABINET, Geometry, extent_of
 
 from wbgs_jax._util.errors import UserError
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
+from builders.synthetic import tiny_scene
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from synthetic import tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import train as train_command

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FIXED_ARRAY_HZ, FREQUENCIES_HZ, RECEIVERS, tiny_dataset
+from builders.synthetic import FIXED_ARRAY_HZ, FREQUENCIES_HZ, RECEIVERS, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import select_receivers

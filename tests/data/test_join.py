@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene
+from builders.synthetic import tiny_dataset, tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, save_scene

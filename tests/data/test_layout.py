@@ -9,8 +9,8 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
+from builders.synthetic import tiny_scene
 from PIL import Image
-from synthetic import tiny_scene
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, scene_dataset

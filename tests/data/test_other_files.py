@@ -1,7 +1,7 @@
 """Files of other programs are refused by what they are, with the way from there."""
 
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import convert as convert_command

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
 from wbgs_jax.data.scene import closed_bodies
 from wbgs_jax.inference.domain import Domain

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from synthetic import RX, tiny_dataset
+from builders.synthetic import RX, tiny_dataset
 
 from wbgs_jax.data import scene
 from wbgs_jax.data.scene import in_sight

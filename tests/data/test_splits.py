@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from builders.synthetic import FREQUENCIES_HZ, RECEIVERS, tiny_dataset
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from synthetic import FREQUENCIES_HZ, RECEIVERS, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from synthetic import RECEIVERS, ROOM, tiny_dataset
+from builders.synthetic import RECEIVERS, ROOM, tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset, Materials

@@ -10,7 +10,21 @@ import numpy as np
 import pytest
 import trimesh
 import tyro
-from own_room import FREQUENCIES, GRID, ROOM, RX, TOML, load, meshes, refused, shape, toml, with_object, write_obj, write_xml
+from builders.own_room import (
+    FREQUENCIES,
+    GRID,
+    ROOM,
+    RX,
+    TOML,
+    load,
+    meshes,
+    refused,
+    shape,
+    toml,
+    with_object,
+    write_obj,
+    write_xml,
+)
 
 from data_gen.example.make_room import OBJECTS, obj
 from data_gen.own_scene import describe, own_scene

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import tiny_scene
+from builders.synthetic import tiny_scene
 
 from data_gen import ceilings, report, samples, statistics
 from data_gen.convergence import settings

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import trimesh
-from own_room import WRITERS, Y_UP, load, meshes, refused, toml, write_glb, write_xml
+from builders.own_room import WRITERS, Y_UP, load, meshes, refused, toml, write_glb, write_xml
 
 from data_gen.example.make_room import OBJECTS, obj
 from wbgs_jax.mesh.importers import read_objects

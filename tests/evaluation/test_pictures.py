@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from builders.synthetic import tiny_dataset
 from matplotlib import pyplot as plt
 from PIL import Image
-from synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, select_frequencies
 from wbgs_jax.metrics import score

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset

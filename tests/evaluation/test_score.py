@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FREQUENCIES_HZ, tiny_dataset
-from toys import NoisyField, RippleConfig, RippleField
+from builders.synthetic import FREQUENCIES_HZ, tiny_dataset
+from builders.toys import NoisyField, RippleConfig, RippleField
 
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError

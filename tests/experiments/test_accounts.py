@@ -5,12 +5,12 @@ import json
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene, tiny_settings
-from untrained import make_coherent_run, make_run
+from builders.synthetic import tiny_dataset, tiny_scene, tiny_settings
+from builders.untrained import make_coherent_run, make_run
 
-from experiments import frequency_account, neighbours_account, receivers_account
 from experiments.bench.main_job import measure
-from experiments.frequency_account import LAWS, polynomial
+from experiments.studies import frequency_account, neighbours_account, receivers_account
+from experiments.studies.frequency_account import LAWS, polynomial
 from wbgs_jax.config import changed
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.data.splits import hold_out_validation

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_settings
+from builders.synthetic import tiny_dataset, tiny_settings
 
 from experiments.bench import __main__ as command_line
 from experiments.bench import quality, queries, renderer, timing, training

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
 from experiments.bench import rays, timing, tracers
 from experiments.bench.tracers import Found, compare

@@ -11,7 +11,7 @@ import time
 import cloudpickle
 import numpy as np
 import pytest
-import synthetic
+from builders import synthetic
 
 from experiments import runner
 from experiments.jobs import Job

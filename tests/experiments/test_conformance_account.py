@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.conformance import account, collect, kind_of, summary, table
+from tools.qa.conformance import account, collect, kind_of, summary, table
 
 ROW = {
     "writer": "Blender", "version": "5.0.1", "form": "glb", "varies": "a room", "expected": "right", "outcome": "right",

@@ -2,9 +2,9 @@
 
 import json
 
-from commands import call
+from builders.commands import call
 
-from experiments.coverage_account import main
+from tools.qa.coverage_account import main
 
 
 def test_shares_are_of_all_lines_of_a_room(tmp_path):

@@ -1,10 +1,10 @@
 """What decisions by evidence rest on, and what is simulated of them."""
 
 import numpy as np
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
-from experiments import decisions_account as account
-from experiments.decisions_account import decisions, simulate, stored_gains, transmitters
+from experiments.studies import decisions_account as account
+from experiments.studies.decisions_account import decisions, simulate, stored_gains, transmitters
 from wbgs_jax.data.splits import hold_out_validation
 
 

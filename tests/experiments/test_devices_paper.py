@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.devices_paper import DEVICES, LINKS, on_paper, scaling, step_s
+from experiments.studies.devices_paper import DEVICES, LINKS, on_paper, scaling, step_s
 
 PARTS = {"shared_s": 0.01, "spectrum_s": 0.004, "gradient_bytes": 400_000}
 

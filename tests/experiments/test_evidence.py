@@ -51,7 +51,7 @@ def test_tables_of_a_series_are_put_in_whole(folder):
     page = "before\n<!-- series schedules -->\nold\n<!-- / -->\nafter\n"
     new = filled(page, folder)
     assert new.startswith("before\n") and new.endswith("\nafter\n") and "old" not in new
-    assert SERIES["schedules"].SERIES[0].title in new and filled(new, folder) == new
+    assert SERIES["schedules"].series[0].title in new and filled(new, folder) == new
 
 
 def test_only_what_changes_is_written(folder):

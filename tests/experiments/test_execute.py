@@ -9,9 +9,9 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import synthetic
-from synthetic import tiny_dataset
-from toys import RippleField, registered
+from builders import synthetic
+from builders.synthetic import tiny_dataset
+from builders.toys import RippleField, registered
 
 from experiments import execute, profiles, runner
 from experiments.jobs import Job

@@ -2,7 +2,7 @@
 
 import json
 
-from experiments.reliability import account, collect
+from tools.qa.reliability import account, collect
 
 
 def test_counts_are_added_and_replace_older_ones_of_the_same_name(tmp_path):

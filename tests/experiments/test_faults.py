@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from rooms import box, mesh_of, room
-from synthetic import tiny_scene
+from builders.rooms import box, mesh_of, room
+from builders.synthetic import tiny_scene
 
 from experiments.faults import Fault, faulty, parts_of
 from experiments.variants import FAULTS

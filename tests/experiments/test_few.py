@@ -7,7 +7,7 @@ import pytest
 
 from experiments import few
 from experiments.few import SIMPLE, along_a_track, below, cases, coverage, data_of, rows_of, summary
-from experiments.results import FOLDER, Results
+from experiments.results import FOLDER, Results, add_rows
 from experiments.tables import few as table
 from wbgs_jax.data import load_dataset
 from wbgs_jax.data.splits import training_links
@@ -55,18 +55,28 @@ def test_rows_below_the_best_simple_method_are_counted():
 
 
 def test_the_table_has_a_line_a_case(tmp_path):
-    (tmp_path / "few").mkdir()
-    for number, one in enumerate([row(seed=0), row(seed=1, score=0.7), row("rfid_10_track", score=0.5, best=0.4, level=0.75)]):
-        (tmp_path / "few" / f"{one['case']}_seed{number}.json").write_text(json.dumps(one))
-    assert [own["case"] for own in rows_of(tmp_path / "few")] == ["rfid_32", "rfid_32", "rfid_10_track"]
+    made = [row(seed=0), row(seed=1, score=0.7), row("rfid_10_track", score=0.5, best=0.4, level=0.75)]
+    add_rows(tmp_path / "few.jsonl", {f"{one['case']}_seed{number}": one for number, one in enumerate(made)})
+    assert [own["case"] for own in rows_of(tmp_path / "few.jsonl")] == ["rfid_32", "rfid_32", "rfid_10_track"]
     text = table.render(Results("quick", tmp_path), tmp_path)
     assert "1 of 3 rows are below" in text and "| rfid 32 | 32 | 2 | 0.700 | 0.750 |" in text
     assert "90 % intervals hold 100 %" in text
     assert "not run" in table.render(Results("quick", tmp_path / "nothing"), tmp_path).lower()
 
 
+def test_rows_of_another_folder_are_taken_over(tmp_path, monkeypatch):
+    folder, out = tmp_path / "elsewhere", tmp_path / "few.jsonl"
+    folder.mkdir()
+    add_rows(out, {"rfid_32_seed0": row(), "rfid_32_seed1": row(seed=1)})
+    (folder / "rfid_32_seed1.json").write_text(json.dumps(row(seed=1, score=0.7)))
+    monkeypatch.setattr("sys.argv", ["few", "--collect", str(folder), "--out", str(out)])
+    few.main()
+    assert [own["median_ssim"] for own in rows_of(out)] == [row()["median_ssim"], 0.7]
+    assert json.loads((tmp_path / "few.json").read_text())["rows"] == 2
+
+
 def test_what_pages_quote_is_that_of_the_rows():
-    rows = rows_of(FOLDER / "few")
+    rows = rows_of(FOLDER / "few.jsonl")
     if not rows:
         pytest.skip("no row has been made")
     quoted = json.loads((FOLDER / "few.json").read_text())

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import tiny_scene
+from builders.synthetic import tiny_scene
 
 from experiments import paper
 from experiments.catalogue import EXPERIMENTS, unique_jobs

@@ -4,11 +4,11 @@ import sys
 
 import numpy as np
 import pytest
-from commands import call
+from builders.commands import call
+from builders.untrained import make_coherent_run
 from PIL import Image
-from untrained import make_coherent_run
 
-from experiments import moving_picture
+from experiments.studies import moving_picture
 from wbgs_jax.training.run_folder import load_trained
 
 

@@ -3,9 +3,9 @@
 import importlib.util
 
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
 
-from experiments import mutation
+from tools.qa import mutation
 
 
 def test_a_changed_line_is_shown_as_it_was_and_as_it_is():

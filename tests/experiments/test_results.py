@@ -1,19 +1,19 @@
-"""Result files and the table of all of them: results of the first version count as run, and a table tool reads them."""
+"""Result files and the table of all of them: rows of several processes, what counts as run, what a table tool reads."""
 
 import csv
 import dataclasses
-import json
-import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from experiments import result_table
 from experiments.catalogue import EXPERIMENTS, unique_jobs
+from experiments.faults import Fault
 from experiments.jobs import BASELINES, Job
-from experiments.old_names import BEFORE_MUON, EDITION, MOVED, todays
-from experiments.results import FOLDER, Results
+from experiments.results import EDITION, FOLDER, Results, add_rows, read_lines, read_row, read_rows
 from experiments.settings import differences
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import to_dict
 from wbgs_jax.fields import get_field
 
@@ -23,8 +23,17 @@ VALUES |= {"tx": [1], "ssim": {"1": [0.5]}}
 
 
 @pytest.fixture(scope="module")
-def table():
-    with (FOLDER / result_table.NAME).open(newline="") as stream:
+def file(tmp_path_factory):
+    """The table of the stored results."""
+    folder = tmp_path_factory.mktemp("table")
+    for path in FOLDER.glob("*.jsonl"):
+        (folder / path.name).symlink_to(path)
+    return result_table.write(folder)
+
+
+@pytest.fixture(scope="module")
+def table(file):
+    with file.open(newline="") as stream:
         return list(csv.DictReader(stream))
 
 
@@ -40,49 +49,55 @@ def test_results_of_the_first_version_count_as_run():
     assert {job.name for job in unique_jobs() if paper.get(job)} == {f"scene{scene}_wave_seed0" for scene in range(1, 7)}
 
 
-def test_settings_that_have_moved_are_found_under_todays_names():
-    old = {"optim.network_lr": 0.016, "optim.steps": 100, "loop.checkpoint_every": 200, "density.every": 75}
-    wrfgs = {"wrfgs.network_lr": 0.016, "optim.steps": 100, "density.every": 75}
-    assert todays({"settings": old, "presets": EDITION}, "wrfgs") == wrfgs
-    adam = {"nerf2.network_optimizer": "adam", "nerf2.network_lr": 0.016, "optim.steps": 100}
-    assert todays({"settings": old}, "nerf2") == adam == todays({"settings": old, "presets": 2}, "nerf2")
-    old = {
-        "wave.survival": 0.5,
-        "optim.residual_lr": 0.1,
-        "optim.snapshot_weight": 0.2,
-        "density.start": 75,
-        "search.rounds": 0,
-    }
-    new = {"wave.excess_amplitude": 0.5, "wave.corrections_lr": 0.1, "wave.correlation_weight": 0.2, "search.rounds": 0}
-    assert todays({"settings": old}, "wave") == new
-    assert todays({"settings": new}, "wave") == new
+def test_results_of_other_presets_count_as_not_run(tmp_path):
+    """A row's settings are differences from the presets of its time."""
+    results = Results("quick", tmp_path)
+    results.write(JOB, VALUES)
+    written = read_row(results.path(JOB), JOB.name)
+    add_rows(results.path(JOB), {JOB.name: written | {"presets": EDITION - 1}})
+    assert results.get(JOB) is None
 
 
-def test_results_of_before_muon_say_so():
-    adam = BEFORE_MUON["wrfgs"]
-    assert adam["wrfgs.network_optimizer"] == "adam" and adam["wrfgs.network_lr"] == 4e-3
-    slower = {"optim.network_lr": 1e-3, "optim.steps": 100}
-    assert todays({"settings": slower}, "wrfgs") == adam | {"wrfgs.network_lr": 1e-3, "optim.steps": 100}
-    assert todays({"settings": slower, "preset": "paper"}, "wrfgs") == {"wrfgs.network_lr": 1e-3, "optim.steps": 100}
-    assert todays({"presets": EDITION}, "wrfgs") == {}
+def test_settings_of_stored_results_are_settings_that_there_are():
+    for path in FOLDER.glob("*.jsonl"):
+        for name, row in read_rows(path).items():
+            known = {"mesh.displacement"} | {f"fault.{field.name}" for field in dataclasses.fields(Fault)}
+            if (field := row.get("job", {}).get("field", BASELINES)) != BASELINES:
+                sections = to_dict(get_field(field).presets["cpu"], field)
+                known |= {f"{section}.{key}" for section, values in sections.items() for key in values}
+            assert row.get("settings", {}).keys() <= known, (path, name)
 
 
-def test_moved_settings_exist_under_their_new_names():
-    known = set()
-    for field in ("wideband", "nerf2", "wave"):
-        sections = to_dict(get_field(field).presets["cpu"], field)
-        known |= {f"{section}.{name}" for section, values in sections.items() for name in values}
-    for old, new in MOVED.items():
-        assert old not in known and known & {new.format(field=field) for field in ("wideband", "nerf2", "wave")}, old
+def test_rows_of_two_writers_are_all_kept(tmp_path):
+    """Each writes the file anew: one at a time, or rows of the others would be lost."""
+    path = tmp_path / "rows.jsonl"
+
+    def write(name):
+        for i in range(20):
+            add_rows(path, {f"{name}{i:02}": {"i": i}})
+
+    with ThreadPoolExecutor(2) as both:
+        list(both.map(write, "ab"))
+    assert list(read_lines(path)) == [f"{name}{i:02}" for name in "ab" for i in range(20)]
+    assert read_row(path, "b19") == {"name": "b19", "i": 19}
+
+
+@pytest.mark.parametrize("line", ['{"name": "b"', '{"i": 0}', '{"name": "b", "i": 1}}', "<<<<<<< HEAD"])
+def test_a_line_that_is_no_row_is_named(line, tmp_path):
+    path = tmp_path / "rows.jsonl"
+    add_rows(path, {"a": {"i": 0}})
+    path.write_text(path.read_text() + line)
+    with pytest.raises(UserError, match=r"rows\.jsonl.*remove"):
+        read_rows(path)
 
 
 def test_a_setting_that_matters_makes_a_result_another_one(tmp_path):
     results = Results("quick", tmp_path)
     results.write(JOB, VALUES)
     path = results.path(JOB)
-    written = json.loads(path.read_text())
+    written = read_row(path, JOB.name)
     for name, counts in {"loop.keep_checkpoints": True, "wideband.width": False, "optim.min_steps": False}.items():
-        path.write_text(json.dumps(written | {"settings": written["settings"] | {name: 7}}))
+        add_rows(path, {JOB.name: written | {"settings": written["settings"] | {name: 7}}})
         assert (results.get(JOB) is not None) == counts, name
 
 
@@ -109,16 +124,13 @@ def test_what_was_moved_is_part_of_what_makes_a_result():
 # The table
 
 
-def test_the_table_is_that_of_the_results(table, tmp_path):
-    shutil.copytree(FOLDER, tmp_path / "results", ignore=shutil.ignore_patterns("*.png", "*.csv", "smoke"))
-    written = result_table.write(tmp_path / "results")
-    assert written.read_bytes() == (FOLDER / result_table.NAME).read_bytes(), "write it again: make tables"
+def test_the_table_has_all_columns(table):
     assert tuple(table[0]) == result_table.COLUMNS
 
 
 def test_a_row_is_a_job_and_a_frequency(table):
     rows = [row for row in table if (row["profile"], row["job"]) == ("quick", "scene4_wrfgs_long_seed2")]
-    values = json.loads((FOLDER / "quick" / "scene4_wrfgs_long_seed2.json").read_text())
+    values = read_row(FOLDER / "quick.jsonl", "scene4_wrfgs_long_seed2")
     assert [float(row["ghz"]) for row in rows] == [float(f) for f in values["ssim"]]
     for row, (ghz, ssim) in zip(rows, values["ssim"].items(), strict=True):
         assert (float(row["median_ssim"]), float(row["mean_ssim"])) == pytest.approx((np.median(ssim), np.mean(ssim)), abs=6e-5)
@@ -148,8 +160,8 @@ def test_what_was_kept_without_frequencies_is_one_row(table):
 
 
 def test_every_result_is_in_the_table_and_says_whether_it_counts(table):
-    files = {(path.parent.name, path.stem) for path in FOLDER.glob("*/*.json") if path.parent.name not in result_table.NO_JOBS}
-    assert {(row["profile"], row["job"]) for row in table} == files
+    files = [path for path in FOLDER.glob("*.jsonl") if path.stem not in result_table.NO_JOBS]
+    assert {(row["profile"], row["job"]) for row in table} == {(path.stem, name) for path in files for name in read_lines(path)}
     results = Results("quick")
     jobs = {(job.profile, job.name): results.get(job) for job in unique_jobs(tuple(EXPERIMENTS))}
     for row in table:
@@ -161,14 +173,13 @@ def test_every_result_is_in_the_table_and_says_whether_it_counts(table):
 def test_files_that_are_no_results_of_jobs_are_no_rows(tmp_path):
     for profile in ("smoke", "quick"):
         Results(profile, tmp_path).write(JOB, VALUES | {"tx": [1], "ssim": {"1": [0.5]}, "psnr_db": {"1": 3.0}})
-    (tmp_path / "gpu").mkdir()
-    (tmp_path / "gpu" / "parity_h100.json").write_text('{"environment": {}}')
+    add_rows(tmp_path / "few.jsonl", {"rfid_32_seed0": {"case": "rfid_32"}})
     assert [row["profile"] for row in result_table.rows(tmp_path)] == ["quick"]
 
 
-def test_a_table_tool_reads_it():
+def test_a_table_tool_reads_it(file):
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
-    table = pandas.read_csv(FOLDER / result_table.NAME)
+    table = pandas.read_csv(file)
     ours = table.query("profile == 'quick' and current and scene == '1' and field == 'wideband' and variant.isna()")
     ours = ours[ours.combination.isna() & ~ours.all_tx]
     assert len(ours) == 30 and ours.ghz.dtype == ours.median_ssim.dtype == np.float64

@@ -1,7 +1,6 @@
 """The runner: what is done is skipped, what was cut goes on, no job is done twice, no failure stops the others."""
 
 import dataclasses
-import json
 import signal
 import subprocess
 import sys
@@ -123,13 +122,6 @@ def test_a_signal_from_outside_stops_everything(command, monkeypatch):
     with pytest.raises(runner.TimeIsUp):
         runner.run([JOB], command)
     assert signal.getsignal(signal.SIGTERM) == before
-
-
-def test_a_list_of_numbers_is_one_line(command):
-    results = Results(command.profile, command.results)
-    results.write(JOB, VALUES | {"ssim": {"1": [0.5] * 200}})
-    text = results.path(JOB).read_text()
-    assert len(text.splitlines()) < 50 and json.loads(text)["ssim"]["1"] == [0.5] * 200
 
 
 def test_jobs_come_in_the_order_of_importance():

@@ -1,9 +1,9 @@
 """Helpers of the account of the published sample, on a scene where the answers are plain."""
 
 import numpy as np
-from synthetic import tiny_scene
+from builders.synthetic import tiny_scene
 
-from experiments.sample_account import by_group, directions_to_tx
+from experiments.studies.sample_account import by_group, directions_to_tx
 from wbgs_jax.data import scene_dataset
 
 

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import as_float64, box, mesh_of, rectangle, room
-from synthetic import FIELDS
+from builders.rooms import as_float64, box, mesh_of, rectangle, room
+from builders.synthetic import FIELDS
 
 from wbgs_jax import fields
 from wbgs_jax._util.pytree import replaced, with_leaves

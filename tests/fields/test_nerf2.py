@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FIELDS, tiny_dataset, tiny_scene, tiny_settings
+from builders.synthetic import FIELDS, tiny_dataset, tiny_scene, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import train as train_command

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box, field_of, mesh_of, rectangle, room
-from synthetic import FIELDS, tiny_dataset, tiny_scene
+from builders.rooms import box, field_of, mesh_of, rectangle, room
+from builders.synthetic import FIELDS, tiny_dataset, tiny_scene
 
 from wbgs_jax import fields
 from wbgs_jax._util.errors import UserError

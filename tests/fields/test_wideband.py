@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.synthetic import FIELDS
 from scipy.interpolate import RegularGridInterpolator
-from synthetic import FIELDS
 
 from wbgs_jax.data.scene import surface_from_points
 from wbgs_jax.fields import wideband

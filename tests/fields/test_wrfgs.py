@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from synthetic import FIELDS, tiny_dataset, tiny_settings
+from builders.synthetic import FIELDS, tiny_dataset, tiny_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene import DatasetScene

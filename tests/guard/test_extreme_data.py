@@ -8,8 +8,8 @@ import json
 
 import numpy as np
 import pytest
-from commands import call
-from synthetic import ROOM, RX, tiny_scene
+from builders.commands import call
+from builders.synthetic import ROOM, RX, tiny_scene
 
 from wbgs_jax.commands import evaluate as eval_command
 from wbgs_jax.commands import predict as predict_command

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equation_six import pixel
+from builders.equation_six import pixel
 
 from experiments.bench.scene import random_gaussians
 from wbgs_jax.splat import geometry_plan, measure_limits, project, render_dense, render_splats

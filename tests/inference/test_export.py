@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FREQUENCIES_HZ, RX, tiny_dataset
-from toys import RippleConfig, RippleField
-from untrained import STEP, make_field, make_params, make_run, make_trained
+from builders.synthetic import FREQUENCIES_HZ, RX, tiny_dataset
+from builders.toys import RippleConfig, RippleField
+from builders.untrained import STEP, make_field, make_params, make_run, make_trained
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError

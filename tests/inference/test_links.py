@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, RX, places, run_in
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
 from wbgs_jax.data.tables import read_table

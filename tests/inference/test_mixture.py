@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import RX, tiny_dataset
+from builders.synthetic import RX, tiny_dataset
 
 from wbgs_jax.evaluation.baselines import line_of_sight, nearest_tx
 from wbgs_jax.inference.kriging import correct, for_receiver, read_neighbours, without_asked, write_neighbours

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene, tiny_settings
+from builders.untrained import make_trained
 from jax.extend.core import jaxprs_in_params
-from synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene, tiny_settings
-from untrained import make_trained
 
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawn_paths import draw_paths
+from builders.drawn_paths import draw_paths
 from scipy.io import savemat
 
 from wbgs_jax._util.errors import UserError

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drawn_paths import draw_paths
+from builders.drawn_paths import draw_paths
 from jaxtyping import TypeCheckError
 
 from wbgs_jax._util.errors import UserError

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flats import RECEIVERS, WALL, places, walls_between, write_table
+from builders.flats import RECEIVERS, WALL, places, walls_between, write_table
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import NO_WALLS, ON_WALL, Walls, crossings, extruded, load_walls

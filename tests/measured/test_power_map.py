@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flats import LAW, RECEIVERS, WALL, places, powers, walls_between
+from builders.flats import LAW, RECEIVERS, WALL, places, powers, walls_between
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls

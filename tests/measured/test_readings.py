@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flats import HEIGHT, RECEIVERS, folder, places, powers, write_table
+from builders.flats import HEIGHT, RECEIVERS, folder, places, powers, write_table
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings

@@ -5,7 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rooms import box, facets_of, room, search_of, trace
+from builders.rooms import box, facets_of, room, search_of, trace
 
 from wbgs_jax.mesh.facets import Facets, outline_of
 from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of, planes_of

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from rooms import box, edges_of, facets_of, mesh_of, rectangle, room
+from builders.rooms import box, edges_of, facets_of, mesh_of, rectangle, room
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.mesh.edges import edges_of_facets

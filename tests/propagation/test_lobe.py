@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import METAL, SPEED_OF_LIGHT, arrivals_of, box, search_of, slabs_of, trace
+from builders.rooms import METAL, SPEED_OF_LIGHT, arrivals_of, box, search_of, slabs_of, trace
 from scipy.special import fresnel
 
 from wbgs_jax.types import make_receiver

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.rooms import box, facets_of, room, search_of, trace
 from jax.flatten_util import ravel_pytree
-from rooms import box, facets_of, room, search_of, trace
 
 from wbgs_jax.mesh.edges import edges_of_facets
 from wbgs_jax.mesh.facets import moved

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from rooms import box, edges_of, facets_of, mesh_of, room, trace
+from builders.rooms import box, edges_of, facets_of, mesh_of, room, trace
 
 from wbgs_jax.fields.coherent import WaveConfig, make_field
 from wbgs_jax.mesh.edges import edges_of_facets, padded_edges, padded_size

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box, edges_of, facets_of, rectangle, room, search_of, trace
+from builders.rooms import box, edges_of, facets_of, rectangle, room, search_of, trace
 
 from wbgs_jax.mesh.facets import areas
 from wbgs_jax.propagation import image_method

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
-from rooms import box, mesh_of, rectangle
+from builders.rooms import box, mesh_of, rectangle
 
 from wbgs_jax.mesh import simplification
 from wbgs_jax.mesh.facets import areas, facets_from_mesh

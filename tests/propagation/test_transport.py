@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import (
+from builders.rooms import (
     METAL,
     SPEED_OF_LIGHT,
     arrivals_of,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from forking import Ended, Forks
+from builders.reliability.forking import Ended, Forks
 
 from wbgs_jax.training import checkpoint
 

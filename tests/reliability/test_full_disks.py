@@ -6,10 +6,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from builders.reliability.faults import ERRORS, Fault
+from builders.reliability.forking import Ended
+from builders.reliability.ledger import count
 from conftest import outcome
-from faults import ERRORS, Fault
-from forking import Ended
-from ledger import count
 
 WRITERS = (
     "generate data",

@@ -8,13 +8,13 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from commands import call
-from damage import WORDS as DAMAGED
+from builders.commands import call
+from builders.reliability.damage import WORDS as DAMAGED
+from builders.reliability.ledger import count
+from builders.untrained import make_coherent_run
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from ledger import count
 from test_fuzz_readers import bounded
-from untrained import make_coherent_run
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import convert, map, measure, predict, train, view

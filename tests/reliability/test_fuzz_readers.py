@@ -12,11 +12,11 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from damage import damage
+from builders.reliability.damage import damage
+from builders.reliability.ledger import count
+from builders.reliability.readables import READABLES
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from ledger import count
-from readables import READABLES
 
 from wbgs_jax._util.errors import UserError
 

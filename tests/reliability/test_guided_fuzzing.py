@@ -9,7 +9,8 @@ import zlib
 from pathlib import Path
 
 import pytest
-from ledger import count
+from builders import PYTHONPATH
+from builders.reliability.ledger import count
 
 PARSERS = (
     "binary PLY mesh", "text PLY mesh", "Gaussians in PLY", "DeepMIMO in MATLAB's format", "YAML", "JSON", "queries", "walls",
@@ -26,14 +27,14 @@ def test_no_bytes_break_a_parser(name, tmp_path):
     seed = (int(os.environ["WBGS_TEST_SEED"]) ^ zlib.crc32(name.encode())) % 2**31 + 1
     words = [
         sys.executable,
-        Path(__file__).with_name("guided.py"),
+        Path(PYTHONPATH.split(os.pathsep)[0]) / "builders" / "reliability" / "guided.py",
         name,
         f"-max_total_time={SECONDS}",
         f"-seed={seed}",
         *LIMITS,
     ]
-    tree = {"PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=os.environ | tree)
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH}
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
     tried = re.search(r"Done (\d+) runs", done.stderr)
     assert tried and int(tried[1]) > 1000, done.stderr[-500:]

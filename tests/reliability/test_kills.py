@@ -5,10 +5,10 @@ import dataclasses
 import signal
 
 import pytest
+from builders.reliability.faults import Fault
+from builders.reliability.ledger import count
+from builders.synthetic import FIELDS
 from conftest import outcome
-from faults import Fault
-from ledger import count
-from synthetic import FIELDS
 
 KILLS = {
     **{f"train {field}": 3 for field in FIELDS},

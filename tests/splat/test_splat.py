@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from equation_six import pixel
+from builders.equation_six import pixel
 
 from wbgs_jax.radio.geometry import (
     AZIMUTH_PERIOD,

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rooms import box
-from synthetic import tiny_settings
-from wave_runs import PARTS, heard_in, of_concrete, places, run_in
+from builders.rooms import box
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax.training.calibration.objective import Told
 from wbgs_jax.training.calibration.obstacles import absent_movers, search_absent

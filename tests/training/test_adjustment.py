@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import wave_runs
+from builders import wave_runs
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, RX, places, run_in
 from jax.flatten_util import ravel_pytree
-from synthetic import tiny_settings
-from wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax.fields.losses import GOOD_MATCH, log_decorrelation
 from wbgs_jax.propagation.displacement import Motion, length_changes, length_terms

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import FREQUENCIES_HZ, tiny_settings
-from wave_runs import PARTS, places, run_in, snapshots
+from builders.synthetic import FREQUENCIES_HZ, tiny_settings
+from builders.wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.radio.antenna import Antenna, antenna_field, upright
 from wbgs_jax.training.calibration.antennas import antenna_candidates, gains_much, search_antennas

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, heard_in, of_concrete, places, run_in
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields.base import paths_of

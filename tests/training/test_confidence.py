@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
-from toys import NoisyField, RippleConfig, RippleField
-from untrained import make_field, make_params
+from builders.synthetic import tiny_dataset
+from builders.toys import NoisyField, RippleConfig, RippleField
+from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
-from toys import RippleConfig, RippleField, metrics_of, registered, toy_settings
+from builders.synthetic import tiny_dataset
+from builders.toys import RippleConfig, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.config import DensityConfig, SearchConfig

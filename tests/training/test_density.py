@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.synthetic import tiny_dataset
+from builders.toys import GROWING, RippleConfig, RippleField
 from scipy.spatial.transform import Rotation
-from synthetic import tiny_dataset
-from toys import GROWING, RippleConfig, RippleField
 
 from wbgs_jax.config import DensityConfig
 from wbgs_jax.fields.wideband import WidebandField, WidebandParams

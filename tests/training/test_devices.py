@@ -6,12 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import device_runs
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import RippleField, registered, toy_settings
+from builders import PYTHONPATH, device_runs
+from builders.toys import RippleField, registered, toy_settings
 
 from wbgs_jax._util.devices import (
     COORDINATOR,
@@ -44,7 +44,8 @@ def started(folder: Path, names: tuple[str, ...], devices: int = 1, **environmen
     # Devices that are more than the cores wait for each other: longer than XLA has patience, on a machine that is busy.
     flags = f"--xla_force_host_platform_device_count={devices} --xla_cpu_collective_call_terminate_timeout_seconds=600"
     flags += " --xla_cpu_collective_timeout_seconds=600"
-    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}"} | environment
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": PYTHONPATH} | environment
     command = [sys.executable, str(SCRIPT), str(folder), *names]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
-from toys import RippleField, registered, toy_settings
+from builders.synthetic import tiny_dataset
+from builders.toys import RippleField, registered, toy_settings
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.training import cross_validation

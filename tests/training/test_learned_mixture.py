@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
+from builders.synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.fields.mixture import SHARES

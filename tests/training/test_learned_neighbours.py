@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset
-from toys import NoisyField, RippleConfig, RippleField
+from builders.synthetic import tiny_dataset
+from builders.toys import NoisyField, RippleConfig, RippleField
 
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.inference.kriging import correct

@@ -8,8 +8,8 @@ import signal
 import jax
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_settings
-from toys import GROWING, RippleField, metrics_of, registered, toy_settings
+from builders.synthetic import tiny_dataset, tiny_settings
+from builders.toys import GROWING, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene import DatasetScene

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, THICKNESS, places, run_in, snapshots
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, THICKNESS, places, run_in, snapshots
 
 from wbgs_jax.config import changed
 from wbgs_jax.fields import coherent

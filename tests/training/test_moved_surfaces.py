@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
 
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration import alignment, pipeline

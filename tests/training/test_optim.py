@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from synthetic import tiny_dataset, tiny_settings
+from builders.synthetic import tiny_dataset, tiny_settings
 
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.scene import DatasetScene

@@ -6,8 +6,8 @@ import json
 import jax
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from untrained import STEP, make_field, make_params, make_run
+from builders.synthetic import tiny_settings
+from builders.untrained import STEP, make_field, make_params, make_run
 
 import wbgs_jax
 from wbgs_jax._util.errors import UserError

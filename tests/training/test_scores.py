@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_scene, tiny_settings
-from wave_runs import PARTS, places, run_in
+from builders.synthetic import tiny_scene, tiny_settings
+from builders.wave_runs import PARTS, places, run_in
 
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.training.calibration import objective

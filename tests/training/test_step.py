@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene
-from toys import GROWING, CuspField, RippleField, Room, SwellingField, registered, toy_settings
+from builders.synthetic import tiny_dataset, tiny_scene
+from builders.toys import GROWING, CuspField, RippleField, Room, SwellingField, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import scene_dataset

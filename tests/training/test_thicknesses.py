@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, places, run_in, snapshots
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
 from wbgs_jax.training.calibration.objective import Told

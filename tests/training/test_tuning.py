@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_settings
-from wave_runs import PARTS, places, run_in
+from builders.synthetic import tiny_settings
+from builders.wave_runs import PARTS, places, run_in
 
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_settings
-from toys import RippleField, registered, toy_settings
+from builders.synthetic import tiny_dataset, tiny_settings
+from builders.toys import RippleField, registered, toy_settings
 
 from wbgs_jax.config import limit_steps
 from wbgs_jax.data.scene import DatasetScene

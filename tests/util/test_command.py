@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from commands import assert_error_for_people, call
+from builders.commands import assert_error_for_people, call
 
 from wbgs_jax._util.cli import option_value, run_command, say
 from wbgs_jax._util.errors import UserError

@@ -5,10 +5,10 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import assert_error_for_people, call
-from untrained import make_coherent_run, make_run
+from builders.commands import assert_error_for_people, call
+from builders.untrained import make_coherent_run, make_run
 
-from experiments.viewer_pictures import chromium, drag, window
+from experiments.studies.viewer_pictures import chromium, drag, window
 from wbgs_jax.commands import view
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.predictor import predictor

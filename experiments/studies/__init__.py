@@ -1,0 +1,1 @@
+"""Measurements that one page quotes: each a command of its own, with a result file of its name."""
