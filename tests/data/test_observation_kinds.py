@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import tiny_dataset, tiny_scene
-from toys import RippleField, registered, toy_settings
+from builders.synthetic import tiny_dataset, tiny_scene
+from builders.toys import RippleField, registered, toy_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree

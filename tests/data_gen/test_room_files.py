@@ -82,7 +82,7 @@ def test_objects_without_triangles_are_dropped(faces, tmp_path):
     (found,) = read_objects(tmp_path / "a.obj")
     assert (found.name, len(found.mesh.faces)) == ("floor", 1)
     (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 4 0 0\no empty\n{faces}")
-    refused("a.obj.*(holds no triangles|export it again)", tmp_path / "a.obj")
+    refused("a.obj.*(has no triangles|export it again)", tmp_path / "a.obj")
 
 
 def test_a_scene_xml_brings_its_materials(tmp_path):
@@ -110,7 +110,7 @@ def test_a_scene_xml_moves_its_shapes(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"hello", b"\xff\xfe\x00" * 50, b"ply\nformat ascii 1.0\n"])
 def test_a_damaged_file(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
-    refused(f"{name}.*(export it again|holds no triangles)", tmp_path / name)
+    refused(f"{name}.*(export it again|has no triangles)", tmp_path / name)
 
 
 def test_a_truncated_file(tmp_path):
@@ -121,12 +121,12 @@ def test_a_truncated_file(tmp_path):
 
 def test_vertices_that_are_not_numbers(tmp_path):
     (tmp_path / "room.obj").write_text(obj(OBJECTS).replace("v 6 4.5 2.7", "v 6 nan 2.7"))
-    refused("not numbers", tmp_path / "room.obj")
+    refused("not finite", tmp_path / "room.obj")
 
 
 def test_a_scene_xml_that_cannot_be_used(tmp_path):
     file = write_xml(tmp_path, kind="hair")
-    refused("is of type 'hair'; export it as ply or obj", file, None)
+    refused("has the unsupported type 'hair'; export it as ply or obj", file, None)
     file = write_xml(tmp_path, transform='<transform name="to_world"><lookat origin="0,0,0"/></transform>')
     refused("is moved by <lookat>", file, None)
     file = write_xml(tmp_path, bsdf={"floor": "paint", "door": "missing"})

@@ -76,7 +76,7 @@ def test_arrays_of_other_units(rng, tmp_path, name):
     write_deepmimo(tmp_path, {**arrays, name: other}, 3.5e9)
     with pytest.raises(UserError, match=rf"{name} in .* is .* to .*; give (decibels|degrees)"):
         load_deepmimo(tmp_path)
-    with pytest.raises(UserError, match=r"cannot read .*nowhere: there is no such scenario; check the path"):
+    with pytest.raises(UserError, match=r"cannot read .*nowhere: the scenario does not exist; check the path"):
         load_deepmimo(tmp_path / "nowhere", 3.5e9)
 
 
@@ -124,7 +124,7 @@ def test_the_frequency_and_the_users_are_those_of_the_parameters(rng, tmp_path):
     rays, channel = two_rays(rng)
     write_deepmimo(tmp_path, as_deepmimo(rays), 3.5e9)
     np.testing.assert_allclose(load_deepmimo(tmp_path).channel()[:, 0], channel, rtol=2e-3, atol=1e-5)
-    with pytest.raises(UserError, match=r"is of 3\.5 GHz, not of 28; leave out --ghz"):
+    with pytest.raises(UserError, match=r"is for 3\.5 GHz, not 28; leave out --ghz"):
         load_deepmimo(tmp_path, 28e9)
     stations = {name: values[:3] if name != "tx_pos" else values for name, values in as_deepmimo(rays).items()}
     for name, values in stations.items():  # base stations among themselves, the same set as the transmitter's
@@ -132,7 +132,7 @@ def test_the_frequency_and_the_users_are_those_of_the_parameters(rng, tmp_path):
     with pytest.warns(UserWarning, match="users of set 0, transmitters of set 1; others: --rx-set 1"):
         assert len(load_deepmimo(tmp_path).targets) == 30
     assert len(load_deepmimo(tmp_path, rx_set=1).targets) == 3
-    with pytest.raises(UserError, match="holds no such transmitter and users; it holds t001_tx000_r000, t001_tx000_r001"):
+    with pytest.raises(UserError, match="has no such transmitter and users; it has t001_tx000_r000, t001_tx000_r001"):
         load_deepmimo(tmp_path, tx=4)
     (tmp_path / "params.json").unlink()
     with pytest.raises(UserError, match="does not record its frequency"):

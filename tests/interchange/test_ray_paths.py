@@ -113,7 +113,7 @@ def test_what_is_measured_twice_at_a_place_is_on_one_side_of_the_split(rng):
     tested = {tuple(place) for place in places[scene.split == TEST]}
     assert len(tested) == 1 and (scene.split == TEST).sum() == 3
     few = places[:1] + np.array([[0], [0], [1], [2], [3]])
-    with pytest.raises(UserError, match="4 transmitters, and a training needs 5"):
+    with pytest.raises(UserError, match="4 transmitters, but training needs 5"):
         scene_of_snapshots(measured[:5], few, np.array([2e9]), *where, elements, "few")
 
 

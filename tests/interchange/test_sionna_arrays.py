@@ -132,15 +132,15 @@ def test_the_other_side(rng):
     [
         (lambda arrays: {"tau": 1e9 * arrays["tau"]}, "give delays in seconds"),
         (lambda arrays: {"tau": arrays["tau"] - arrays["tau"].min(-1, keepdims=True)}, "normalize_delays=False"),
-        (lambda arrays: {"theta_r": np.degrees(arrays["theta_r"])}, "theta_r is .*; give radians, no degrees"),
-        (lambda arrays: {"phi_t": np.degrees(arrays["phi_t"])}, "phi_t is .*; give radians, no degrees"),
-        (lambda arrays: {"a": 20 * np.log10(np.abs(arrays["a"])) + 0j}, "give amplitudes, no decibels"),
-        (lambda arrays: {"a": arrays["a"][..., None]}, "6 axes, time among them"),
-        (lambda arrays: {"a": arrays["a"][:, :7]}, "have 7 antennas|fit no"),
+        (lambda arrays: {"theta_r": np.degrees(arrays["theta_r"])}, "theta_r is .*; give radians, not degrees"),
+        (lambda arrays: {"phi_t": np.degrees(arrays["phi_t"])}, "phi_t is .*; give radians, not degrees"),
+        (lambda arrays: {"a": 20 * np.log10(np.abs(arrays["a"])) + 0j}, "give amplitudes, not decibels"),
+        (lambda arrays: {"a": arrays["a"][..., None]}, "6 axes, including time"),
+        (lambda arrays: {"a": arrays["a"][:, :7]}, "have 7 antennas|do not fit"),
         (lambda arrays: {"sources": 1e3 * arrays["sources"]}, "positions in metres"),
         (lambda arrays: {"theta_t": np.abs(np.pi / 2 - arrays["theta_t"])}, "theta_t, phi_t of lines of sight"),
-        (lambda arrays: {"sources": arrays["sources"][:, [0, 2, 1]]}, "are .* apart|degrees beside the other end"),
-        (lambda arrays: {"a": arrays["a"][:, [*range(8), *range(15, 7, -1)]]}, "fit no 4x4 array"),
+        (lambda arrays: {"sources": arrays["sources"][:, [0, 2, 1]]}, "are .* apart|degrees from the other end"),
+        (lambda arrays: {"a": arrays["a"][:, [*range(8), *range(15, 7, -1)]]}, "do not fit a 4x4 array"),
     ],
 )
 def test_contradictions_are_refused(rng, change, words):
@@ -157,7 +157,7 @@ def test_lines_of_sight_have_the_length_of_the_line(rng):
     known = arrays | {"interactions": met, "vertices": np.full((*met.shape, 3), np.nan)}
     assert len(scene_of_sionna(known, "street").tx_positions) == COUNT
     nearer = {"sources": RX + 0.8 * (arrays["sources"] - RX)}
-    with pytest.raises(UserError, match=r"a path from transmitter 1 to receiver 1 is .* m long, and .* m through its vertices"):
+    with pytest.raises(UserError, match=r"a path from transmitter 1 to receiver 1 is .* m long, but .* m through its vertices"):
         scene_of_sionna(known | nearer, "street")
     del known["frequency_hz"]
     with pytest.raises(UserError, match="street does not record its frequency; give --ghz"):

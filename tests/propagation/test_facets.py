@@ -172,10 +172,13 @@ def flipped(faces, which):
 @pytest.mark.parametrize(
     "wrong, said",
     [
-        (lambda faces, rng: np.concatenate([faces, faces]), "is there twice"),
-        (lambda faces, rng: np.concatenate([faces, faces[:, ::-1]])[rng.permutation(2 * len(faces))], "is there twice"),
-        (lambda faces, rng: flipped(faces, rng.permutation(len(faces))[: rng.integers(1, len(faces))]), "face both ways"),
-        (lambda faces, rng: flipped(faces, np.arange(0, len(faces), 2)), "face both ways"),
+        (lambda faces, rng: np.concatenate([faces, faces]), "every triangle twice"),
+        (lambda faces, rng: np.concatenate([faces, faces[:, ::-1]])[rng.permutation(2 * len(faces))], "every triangle twice"),
+        (
+            lambda faces, rng: flipped(faces, rng.permutation(len(faces))[: rng.integers(1, len(faces))]),
+            "inconsistent triangle orientations",
+        ),
+        (lambda faces, rng: flipped(faces, np.arange(0, len(faces), 2)), "inconsistent triangle orientations"),
     ],
 )
 def test_careless_exports_are_mended(wrong, said, rng):

@@ -128,7 +128,7 @@ def test_devices_that_do_not_divide_a_batch_stay_idle(monkeypatch):
     monkeypatch.setattr(jax, "local_device_count", lambda: 6)
     devices, idle = devices_for(8)
     assert devices.mesh is None  # this process has one of them only
-    assert idle == "a batch of 8 links is shared by 4 of 6 devices; with --optim.batch 12 by all"
+    assert idle == "a batch of 8 links uses 4 of 6 devices; --optim.batch 12 would use all"
     assert devices_for(8, 4)[1] == devices_for(12)[1] == ""
 
 
@@ -154,7 +154,7 @@ def test_an_error_of_the_first_process_stops_all(monkeypatch):
         by_first(fails)
     monkeypatch.setattr("wbgs_jax._util.devices.is_first", lambda: False)
     monkeypatch.setattr("wbgs_jax._util.devices.any_process", lambda flag: True)
-    with pytest.raises(UserError, match="the first one could not go on"):
+    with pytest.raises(UserError, match="stops because the first one failed"):
         by_first(fails)
 
 
@@ -167,5 +167,5 @@ def test_processes_that_differ_are_told_so(monkeypatch):
 
 def test_nobody_to_connect_to_is_an_error_for_people(monkeypatch):
     monkeypatch.setenv(COORDINATOR, "")
-    with pytest.raises(UserError, match="--distributed: the processes do not find each other"):
+    with pytest.raises(UserError, match="--distributed: the processes cannot connect"):
         connect()

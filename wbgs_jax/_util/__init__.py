@@ -1,1 +1,1 @@
-"""Small tools of the whole library: errors, files, checks, pytrees, compilation, command lines."""
+"""Utilities of the whole library: errors, files, checks, pytrees, compilation, command lines."""

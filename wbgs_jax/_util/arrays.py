@@ -1,4 +1,4 @@
-"""A pytree of arrays as one file of a run folder: a compressed .npz, written whole or not at all."""
+"""Storage of a pytree of arrays as one file of a run folder: a compressed .npz, written atomically."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -13,11 +13,11 @@ from wbgs_jax._util.files import atomic_write, read_arrays, told
 
 T = TypeVar("T")
 SMALL = (np.uint8, np.float16)
-"""Types that stay as they are: pictures."""
+"""Types that are kept as stored: images."""
 
 
 def write_tree(path: Path, tree: Any) -> None:
-    """Writes the arrays of a pytree by the names of its fields; None removes the file."""
+    """Writes the arrays of a pytree under the names of its fields; None removes the file."""
     if tree is None:
         path.unlink(missing_ok=True)
         return
@@ -27,13 +27,14 @@ def write_tree(path: Path, tree: Any) -> None:
 
 
 def read_tree(path: Path, classes: Sequence[type[T]], without: str, before: Mapping[str, Any] | None = None) -> T | None:
-    """Returns the pytree of a file, in single precision or as small as it was written; None if there is no file.
+    """Returns the pytree stored in a file, in single precision or in the smaller type it was written in; None if there is no
+    file.
 
     Args:
         path: of the file.
-        classes: that it may be of; it is of the first whose fields it has, else damaged.
-        without: what removing the file means.
-        before: arrays that earlier files lack.
+        classes: possible classes; the first one with the file's fields is used.
+        without: what removing the file means, for the message.
+        before: values of arrays that older files lack.
 
     Raises:
         UserError: the file is damaged.

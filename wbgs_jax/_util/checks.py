@@ -1,6 +1,6 @@
-"""Checks at the public door: wrong shapes, dtypes and units raise an error that says what was expected.
+"""Checks of arguments of the public interface: wrong shapes, dtypes and units raise an error that states what was expected.
 
-Shapes and dtypes are checked also under jit, vmap and grad (they are static there); values only where they are concrete.
+Shapes and dtypes are also checked under jit, vmap and grad, where they are static; values only where they are concrete.
 """
 
 from typing import Any
@@ -11,11 +11,16 @@ import numpy as np
 
 
 def check_array(name: str, value: Any, shape: tuple[Any, ...]) -> None:
-    """Raises unless `value` is a real floating-point array of a shape; strings in `shape` name free axes."""
+    """Raises an error unless `value` is a real floating-point array of the given shape; strings in `shape` are free axes.
+
+    Raises:
+        TypeError: not an array, or of another dtype.
+        ValueError: of another shape.
+    """
     if not hasattr(value, "shape") or not hasattr(value, "dtype"):
-        raise TypeError(f"{name} is a {type(value).__name__}; give an array of shape {_text(shape)}")
+        raise TypeError(f"{name} is a {type(value).__name__}; pass an array of shape {_text(shape)}")
     if not jnp.issubdtype(value.dtype, jnp.floating):
-        raise TypeError(f"{name} has dtype {value.dtype}; give a real floating-point array, such as float32")
+        raise TypeError(f"{name} has dtype {value.dtype}; pass a real floating-point array, such as float32")
     fits = len(value.shape) == len(shape) and all(isinstance(s, str) or s == n for s, n in zip(shape, value.shape, strict=True))
     if not fits:
         raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {_text(shape)}")

@@ -1,4 +1,4 @@
-"""What all command lines share: how errors become one line and an exit code, and lines for people."""
+"""Shared parts of all command lines: conversion of errors to one line and an exit code, and output for users."""
 
 import os
 import sys
@@ -11,14 +11,16 @@ from jaxtyping import Float
 from wbgs_jax._util.errors import UserError
 
 FURTHEST = 1e5
-"""Metres, or metres a second: farther is a mistake, and beyond single precision soon."""
-_as_python_has_it = warnings.formatwarning
+"""Metres, or metres per second: larger values are mistakes, and soon exceed single precision."""
+_default_format = warnings.formatwarning
 
 
 def run_command(main: Callable[[], None]) -> None:
-    """Runs a command line's `main`: a `UserError`, or what the operating system says of a file, becomes one line on stderr and
-    exit code 2, Ctrl-C exit code 130, a reader that has gone (`| head`) exit code 141, and a `UserWarning` a line that begins
-    with "note:"."""
+    """Runs the `main` function of a command line.
+
+    A `UserError`, or an error of the operating system about a file, is printed as one line on stderr with exit code 2. Ctrl-C
+    gives exit code 130, a closed pipe (`| head`) exit code 141. A `UserWarning` is printed as a line that begins with "note:".
+    """
     warnings.formatwarning = _note
     try:
         main()
@@ -28,10 +30,10 @@ def run_command(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(130) from None
-    except BrokenPipeError:  # `| head` has seen enough
+    except BrokenPipeError:  # the reader, such as `| head`, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
-    except OSError as error:  # of a place that nobody has looked at: a name too long, a disk that went away
+    except OSError as error:  # not handled where it occurred: a name too long, a disk that has failed
         if error.filename is None:
             raise
         where = UserError(f"{error.strerror}: {error.filename}; check the path, its permissions and the space on its disk")
@@ -40,19 +42,19 @@ def run_command(main: Callable[[], None]) -> None:
 
 
 def _note(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
-    """Returns what is printed of a warning."""
+    """Returns the printed form of a warning."""
     if category is UserWarning:
         return f"note: {message}\n"
-    return _as_python_has_it(message, category, filename, lineno, line)
+    return _default_format(message, category, filename, lineno, line)
 
 
 def say(line: str) -> None:
-    """Prints a line for people, on stderr: stdout is for results."""
+    """Prints a line for the user on stderr; stdout is for results."""
     print(line, file=sys.stderr, flush=True)
 
 
 def option_value(arguments: Sequence[str], name: str, default: str) -> str:
-    """Returns what follows an option on the command line, or the default; the last one counts."""
+    """Returns the value of an option on the command line, or the default; the last occurrence counts."""
     value = default
     for i, argument in enumerate(arguments):
         if argument == name:
@@ -63,19 +65,27 @@ def option_value(arguments: Sequence[str], name: str, default: str) -> str:
 
 
 def parse_positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
-    """Returns positions in metres from "x,y,z" each; anything else is a `UserError`."""
+    """Returns positions (metres) parsed from strings "x,y,z".
+
+    Raises:
+        UserError: a string is not of this form, or a coordinate is too large.
+    """
     unit = "metres, such as --tx 1.0,2.5,1.5"
     return np.array([parse_vector(word, "--tx", "position", unit) for word in words]).reshape(-1, 3)
 
 
-def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "metres a second") -> Float[np.ndarray, "3"]:
-    """Returns three numbers from "x,y,z"; anything else is a `UserError`."""
+def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "metres per second") -> Float[np.ndarray, "3"]:
+    """Returns three numbers parsed from "x,y,z".
+
+    Raises:
+        UserError: the string is not of this form, or a number is too large.
+    """
     try:
         values = np.array([float(part) for part in word.split(",")])
     except ValueError:
         values = np.zeros(0)
     if len(values) != 3 or not (np.abs(values) <= FURTHEST).all():
-        raise UserError(f"{option} {word[:60]} is no {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
+        raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
     return values
 
 

@@ -1,6 +1,6 @@
-"""Compiled programs that outlive a process: what one command has traced and compiled, the next one loads.
+"""Persistent cache of compiled programs: what one command has traced and compiled, the next one loads.
 
-The library never switches this on by itself; other JAX pipelines have their own caches.
+The library never enables it by itself, since other JAX programs have their own caches.
 """
 
 import contextlib
@@ -14,41 +14,40 @@ from pathlib import Path
 from typing import Any
 
 VARIABLE = "WBGS_CACHE"
-"""Environment variable: folder of the cache; empty switches it off."""
+"""Environment variable with the folder of the cache; an empty value disables it."""
 MIN_SECONDS = 0.5
-"""What compiles faster is not kept."""
+"""Compile time in seconds below which programs are not kept."""
 MOST_BYTES = 2e9
-"""Of the cache; beyond it the oldest files go."""
+"""Maximum size of the cache; beyond it the least recently used files are removed."""
 SOURCES = Path(__file__).parents[1]
 KERNEL_CALL = "__gpu$xla.gpu.triton"
-"""What calls the renderer's kernels on a GPU: nothing that JAX promises to keep."""
+"""Custom call of the renderer's GPU kernels, whose stability JAX does not guarantee."""
 PROGRAMS = "programs"
-"""Folder of traced programs in the cache."""
+"""Subfolder of the cache for traced programs."""
 
 
 def cache_folder() -> Path | None:
-    """Returns the folder that commands keep programs in, `WBGS_CACHE` (~/.cache/wbgs-jax unless set); None where there is
-    none."""
+    """Returns the folder in which commands keep programs, `WBGS_CACHE` (default ~/.cache/wbgs-jax); None if there is none."""
     try:
         wanted = os.environ.get(VARIABLE) if VARIABLE in os.environ else str(Path.home() / ".cache" / "wbgs-jax")
-    except RuntimeError:  # a user without a home
+    except RuntimeError:  # no home directory
         wanted = None
     if not wanted:
         return None
     folder = Path(wanted) / _machine()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # a home that cannot be written costs compile time, not the run
+    except OSError:  # without a writable home, programs are compiled again
         return None
     return folder
 
 
 def use_compilation_cache() -> Path | None:
-    """Lets XLA keep compiled programs in `cache_folder`; returns the folder, or None where there is none.
+    """Makes XLA keep compiled programs in `cache_folder`; returns the folder in use, or None.
 
-    JAX's own setting (`JAX_COMPILATION_CACHE_DIR`) goes first.
+    JAX's own setting (`JAX_COMPILATION_CACHE_DIR`) takes precedence.
     """
-    import jax  # here: `cache_folder` is asked by what has no need of JAX
+    import jax  # imported here because `cache_folder` is used by code that does not need JAX
 
     if own := getattr(jax.config, "jax_compilation_cache_dir", None):
         return Path(own)
@@ -60,15 +59,15 @@ def use_compilation_cache() -> Path | None:
 
 
 def limit_size(folder: Path, most: float | int = MOST_BYTES) -> None:
-    """Removes the files of a cache that nobody has asked for longest, until the others are small enough."""
-    known = []
+    """Removes the least recently used files of a cache until the others have at most `most` bytes."""
+    entries = []
     for path in folder.rglob("*"):
-        with contextlib.suppress(OSError):  # another process may be as tidy
+        with contextlib.suppress(OSError):  # another process may be removing files too
             if path.is_file():
                 there = path.stat()
-                known.append((max(there.st_atime, there.st_mtime), there.st_size, path))
+                entries.append((max(there.st_atime, there.st_mtime), there.st_size, path))
     total = 0
-    for _, size, path in sorted(known, reverse=True):
+    for _, size, path in sorted(entries, reverse=True):
         total += size
         if total > most:
             with contextlib.suppress(OSError):
@@ -76,13 +75,14 @@ def limit_size(folder: Path, most: float | int = MOST_BYTES) -> None:
 
 
 def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[Any], structure: str) -> str:
-    """Traces a function of arrays (positional) for arguments of some shapes, keeps the program and returns its name.
+    """Traces a function of positional arrays, stores the program and returns its name.
 
     Args:
         folder: the cache.
-        function: of arrays, to arrays in lists and dictionaries.
+        function: from arrays to arrays in lists and dictionaries.
         shapes: of the arguments, `jax.ShapeDtypeStruct`.
-        structure: what else the program follows from, beside the source of this package: settings, the structure of trees.
+        structure: everything else that determines the program, besides the source of this package: settings and the structure
+            of trees.
     """
     import jax
     import jax.export
@@ -93,7 +93,7 @@ def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[A
     name = hashlib.sha256("\n".join(words).encode()).hexdigest()[:32]
     path = folder / PROGRAMS / f"{name}.bin"
     if not path.exists():
-        kernels = jax.export.DisabledSafetyCheck.custom_call(KERNEL_CALL)  # this file is of one version of JAX
+        kernels = jax.export.DisabledSafetyCheck.custom_call(KERNEL_CALL)  # the file is used by one version of JAX only
         exported = jax.export.export(jax.jit(function), disabled_checks=[kernels])(*shapes)
         with atomic_write(path) as stream:
             stream.write(exported.serialize())
@@ -101,7 +101,7 @@ def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[A
 
 
 def load_program(folder: Path, name: str) -> Callable[..., Any]:
-    """Returns a program that `trace_program` kept."""
+    """Returns a program stored by `trace_program`."""
     import jax
     import jax.export
 
@@ -118,7 +118,7 @@ def source_digest() -> str:
 
 
 def _machine() -> str:
-    """Returns a name for this kind of processor: compiled CPU code must not move to one that lacks its instructions."""
+    """Returns a key for this kind of processor: compiled CPU code must not run on one that lacks its instructions."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
@@ -126,8 +126,8 @@ def _machine() -> str:
 
 
 def give_back() -> None:
-    """Returns what was freed to the operating system. glibc keeps it, in pieces that large arrays do not fit into: gigabytes
-    after a search. Other C libraries do without."""
+    """Returns freed memory to the operating system. glibc keeps it in fragments too small for large arrays: gigabytes after a
+    calibration. With other C libraries this does nothing."""
     try:
         trim = ctypes.CDLL(None).malloc_trim
     except (AttributeError, OSError, TypeError):  # not glibc

@@ -1,7 +1,7 @@
-"""Complex functions in real arithmetic, for arguments that waves have.
+"""Complex functions in real arithmetic, restricted to the arguments that occur here.
 
-XLA's own hold for all arguments, do not become vector instructions on a CPU, and are computed again for every result that they
-are part of: four times as much time for the coefficients of a slab.
+XLA's own functions cover all arguments, are not vectorised on a CPU, and are recomputed for every result that depends on them:
+four times as slow for the coefficients of a slab.
 """
 
 import math
@@ -13,12 +13,12 @@ from jaxtyping import Array, Complex, Float
 _SINE = tuple((-1) ** (power // 2) * (2 * math.pi) ** power / math.factorial(power) for power in range(1, 13, 2))
 """Taylor series of sin(2 pi y) in y, y^3, ..., y^11: enough for single precision up to a quarter of a turn."""
 SMALLEST = 1e-12
-"""Size of complex numbers that stand for 0."""
+"""Magnitude below which complex numbers count as 0."""
 
 
 @jax.custom_jvp
 def phasor(turns: Float[Array, "*n"]) -> Complex[Array, "*n"]:
-    """Returns exp(2 pi j turns)."""
+    """Returns exp(2 pi j turns); `turns` is the phase in cycles."""
     if turns.dtype != jnp.float32:
         return jnp.exp(2j * jnp.pi * turns)
     turns = turns - jnp.round(turns)
@@ -42,14 +42,14 @@ def _sine(quarter: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def quotient(a: Complex[Array, "*#n"], b: Complex[Array, "*#n"]) -> Complex[Array, "*#n"]:
-    """Returns a / b, where |b|^2 is a number that single precision knows."""
+    """Returns a / b, for |b|^2 within the range of single precision."""
     size = 1 / (b.real * b.real + b.imag * b.imag)
     return a * jax.lax.complex(b.real * size, -b.imag * size)
 
 
 def root(z: Complex[Array, "*n"]) -> Complex[Array, "*n"]:
-    """Returns the square root of numbers whose real part is not negative, and whose |z|^2 single precision knows; finite at 0,
-    with its gradient."""
+    """Returns the square root of numbers with a non-negative real part and |z|^2 within the range of single precision. Value
+    and gradient are finite at 0."""
     size = jnp.sqrt(jnp.maximum(z.real * z.real + z.imag * z.imag, SMALLEST**2))
     real = jnp.sqrt(0.5 * (size + jnp.maximum(z.real, 0)))
     return jax.lax.complex(real, 0.5 * z.imag / real)

@@ -1,4 +1,4 @@
-"""Work in several processes, here or on other machines, by Dask: it queues, sends, and repeats what a killed worker leaves."""
+"""Runs tasks in several processes, on this or other machines, with Dask, which repeats the tasks of killed workers."""
 
 import contextlib
 import logging
@@ -8,14 +8,14 @@ from typing import Any, TypeVar
 from wbgs_jax._util.errors import UserError
 
 LOCAL = "local"
-"""In the place of a scheduler's address: processes on this machine."""
+"""Value in place of a scheduler's address that starts processes on this machine."""
 CONNECT_S = "30s"
 CLOSE_S = 30.0
 SETTINGS: dict[str, Any] = {
-    # Dask would give its processes one thread for linear algebra each: then a serial run might differ in the last bit.
+    # By default Dask limits linear algebra to one thread per process, and serial runs might then differ in the last bit.
     "distributed.nanny.pre-spawn-environ": {},
     "distributed.comm.timeouts.connect": CONNECT_S,
-    # A worker that compiles for minutes is busy, not dead.
+    # A worker that compiles for minutes is busy, not lost.
     "distributed.scheduler.worker-ttl": None,
 }
 Task = TypeVar("Task")
@@ -23,10 +23,14 @@ Task = TypeVar("Task")
 
 @contextlib.contextmanager
 def connected(where: str, workers: int) -> Iterator[Any]:
-    """Yields a Dask client: of `workers` processes of one thread each on this machine, or of a scheduler by its address.
+    """Yields a Dask client: for `workers` single-threaded processes on this machine, or for a scheduler at an address.
+
+    Args:
+        where: `LOCAL` or the scheduler's address.
+        workers: number of local processes.
 
     Raises:
-        UserError: Dask is not installed, or nobody answers at the address.
+        UserError: Dask is not installed, or no scheduler answers at the address.
     """
     try:
         import dask
@@ -36,7 +40,7 @@ def connected(where: str, workers: int) -> Iterator[Any]:
     with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
         cluster: Any = where
         if where == LOCAL:
-            # No limit of memory: Dask would end processes that JAX has good use for. One that the kernel ends is started anew.
+            # No memory limit: Dask would end processes whose memory JAX needs. Processes ended by the kernel are restarted.
             wanted = {"n_workers": workers, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
             cluster = distributed.LocalCluster(**wanted, silence_logs=logging.ERROR)
             stack.callback(_close, cluster)
@@ -49,7 +53,7 @@ def connected(where: str, workers: int) -> Iterator[Any]:
 
 
 def _close(cluster: Any) -> None:
-    """Ends local workers. One that does not end in time is no reason to lose what all have done: it ends with this process."""
+    """Closes local workers. If one does not end in time, results are kept all the same; it ends with this process."""
     with contextlib.suppress(TimeoutError, OSError):
         cluster.close(timeout=CLOSE_S)
 
@@ -57,12 +61,12 @@ def _close(cluster: Any) -> None:
 def finished(
     client: Any, function: Callable[..., Any], tasks: Sequence[Task], *common: Any, seconds: float | None = None
 ) -> Iterator[tuple[Task, Any, Exception | None]]:
-    """Yields every task when it is done: itself, what `function(task, *common)` returned, and what it raised.
+    """Yields, for every task when it is done: the task, the result of `function(task, *common)`, and its exception.
 
-    Tasks begin in their order. One whose worker is killed is sent to another; one that kills several fails.
+    Tasks begin in order. If a worker is killed, its task is sent to another one; a task that kills several workers fails.
 
     Raises:
-        TimeoutError: not all were done within so many seconds. What waits is not begun then.
+        TimeoutError: not all were done within `seconds`. Waiting tasks are cancelled.
     """
     import distributed
 

@@ -1,13 +1,12 @@
-"""Several devices that share a batch: every one has all parameters and data, and works on its own part of the links.
+"""Data parallelism over several devices and processes.
 
-The parts are made by `shard_map` in a jitted program, over the one axis (`AXIS`) of a mesh: left to itself, XLA divides the
-splatting renderer as well, but exchanges something between the devices for every tile (docs/scaling.md). With one device there
-is no mesh, and every function here returns what it was given.
+Every device holds all parameters and data, and works on its own part of the links. The parts are made by `shard_map` in a
+jitted program, over the single axis (`AXIS`) of a mesh. XLA's automatic partitioning would divide the splatting renderer as
+well, but with communication between the devices for every tile (docs/scaling.md). With one device there is no mesh, and the
+functions here return their arguments unchanged.
 
-Several processes that train one field, on one machine or on many: who writes, and how they stay together.
-
-All of them do the same steps on the host and hold the same parameters; the first one alone writes files and prints. With one
-process every function here costs nothing.
+Several processes, on one machine or on many, can train one field. All of them take the same steps on the host and hold the same
+parameters; only the first one writes files and prints. With one process the functions here cost nothing.
 """
 
 import hashlib
@@ -24,12 +23,12 @@ from jaxtyping import Array, Num
 from wbgs_jax._util.errors import UserError
 
 AXIS = "links"
-"""Of the mesh: the links of a batch, or the queries of a map, are divided along it."""
+"""Axis of the mesh along which the links of a batch, or the queries of a map, are divided."""
 EVERYWHERE, DIVIDED = PartitionSpec(), PartitionSpec(AXIS)
 
 
 class Devices:
-    """Some devices, and what is on all of them. `mesh` is None for a single one."""
+    """A set of devices and the data replicated on all of them. `mesh` is None for a single device."""
 
     def __init__(self, mesh: Mesh | None = None):
         self.mesh = mesh
@@ -37,11 +36,11 @@ class Devices:
 
     @property
     def count(self) -> int:
-        """How many there are, those of other processes included."""
+        """Number of devices, including those of other processes."""
         return 1 if self.mesh is None else self.mesh.size
 
     def replicated(self, tree: Any) -> Any:
-        """Returns a tree of arrays with a copy on every device; every process gives the same one."""
+        """Returns a tree of arrays with a copy on every device; every process must pass the same tree."""
         if self.mesh is None:
             return tree
         everywhere, here = NamedSharding(self.mesh, EVERYWHERE), self.mesh.local_devices
@@ -53,7 +52,7 @@ class Devices:
         return jax.tree.map(copies, tree)
 
     def kept(self, *trees: Any) -> Any:
-        """Returns `replicated` trees; those of the call before, where they are the same objects."""
+        """Returns `replicated` trees; copies from the previous call are reused if the trees are the same objects."""
         if self.mesh is None:
             return trees
         before, placed = self._kept
@@ -63,46 +62,48 @@ class Devices:
         return placed
 
     def own(self, tree: Any) -> Any:
-        """Returns the copy of the first device of this process of a replicated tree, for work on the host."""
+        """Returns the copy of a replicated tree on this process's first device, for work on the host."""
         return tree if self.mesh is None else jax.tree.map(lambda leaf: leaf.addressable_data(0), tree)
 
 
 def devices_for(batch: int, wanted: int = 0) -> tuple[Devices, str]:
-    """Returns as many devices as can share a batch of links evenly, and one line where some stay idle, else an empty one.
+    """Returns as many devices as can share a batch of links evenly, and a line of text if some stay idle, else an empty one.
 
     Args:
         batch: number of links.
-        wanted: devices a process, at most; 0: all that it has.
+        wanted: maximum number of devices per process; 0 for all.
 
     Raises:
-        UserError: there are not so many devices, or the processes themselves cannot share the batch evenly.
+        UserError: there are fewer devices, or the processes cannot share the batch evenly.
     """
     processes, have = jax.process_count(), jax.local_device_count()
     if not 0 <= wanted <= have:
-        raise UserError(f"--devices is {wanted}, and this process has {have}; give 1 to {have}, or 0 for all")
+        raise UserError(f"--devices is {wanted}, but this process has {have}; give 1 to {have}, or 0 for all")
     if batch % processes:
         raise UserError(f"{processes} processes cannot share a batch of {batch} links evenly; set --optim.batch to a multiple")
-    asked = wanted or have
-    used = max(count for count in range(1, asked + 1) if batch // processes % count == 0)
-    idle = f"a batch of {batch} links is shared by {used} of {asked} devices; with --optim.batch {batch // used * asked} by all"
-    return Devices(_mesh(jax.devices(), used)), idle if used < asked else ""
+    requested = wanted or have
+    used = max(count for count in range(1, requested + 1) if batch // processes % count == 0)
+    idle = (
+        f"a batch of {batch} links uses {used} of {requested} devices; --optim.batch {batch // used * requested} would use all"
+    )
+    return Devices(_mesh(jax.devices(), used)), idle if used < requested else ""
 
 
 def own_devices() -> Devices:
-    """Returns all devices of this process, for work that no other process takes part in."""
+    """Returns all devices of this process, for work in which no other process takes part."""
     return Devices(_mesh(jax.local_devices(), jax.local_device_count()))
 
 
 def _mesh(devices: list[Any], each: int) -> Mesh | None:
-    """Returns a mesh of the first so many devices of every process; None of a single device."""
+    """Returns a mesh of the first `each` devices of every process; None for a single device."""
     owners = sorted({device.process_index for device in devices})
     chosen = [device for owner in owners for device in [d for d in devices if d.process_index == owner][:each]]
     return None if len(chosen) == 1 else Mesh(np.array(chosen), (AXIS,))
 
 
 def averaged(function: Callable[..., Any], mesh: Mesh | None, divided: int) -> Callable[..., Any]:
-    """Returns a function that every device evaluates on its part of the positional argument number `divided` (of its leading
-    axis) and on the whole of all others. All devices get the same results: means of floats, maxima of integers and booleans."""
+    """Returns a function that every device evaluates on its part (along the leading axis) of positional argument `divided` and
+    on all of the other arguments. All devices get the same results: means of floats, maxima of integers and booleans."""
     if mesh is None:
         return function
 
@@ -118,67 +119,67 @@ def averaged(function: Callable[..., Any], mesh: Mesh | None, divided: int) -> C
 
 
 def spread(function: Callable[..., Any], mesh: Mesh | None, divided: int) -> Callable[..., Any]:
-    """Returns a function whose positional argument number `divided` and results have a common leading axis, which the devices
-    divide; each has the whole of all other arguments."""
+    """Returns a function whose positional argument `divided` and whose results share a leading axis, which is divided between
+    the devices; each device gets all of the other arguments."""
     return function if mesh is None else _shared_out(function, mesh, divided, DIVIDED)
 
 
 def _shared_out(function: Callable[..., Any], mesh: Mesh, divided: int, out: PartitionSpec) -> Callable[..., Any]:
     def shared(*arguments: Any) -> Any:
         specs = tuple(DIVIDED if number == divided else EVERYWHERE for number in range(len(arguments)))
-        # No check of what differs between devices: the loops of the renderers begin with zeros that are alike on all.
+        # The check of varying values is off: the renderers' loops start from zeros that are the same on all devices.
         return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False)(*arguments)
 
     return shared
 
 
 def over_all_links(total: Num[Array, "*n"]) -> Num[Array, "*n"]:
-    """Returns a sum over the links of a device as that over the links of all: for losses that divide one sum by another. Where
-    the links are not divided it is what it was."""
+    """Returns the sum over all devices of a sum over a device's links, for losses that divide one sum by another. Unchanged if
+    the links are not divided."""
     divided = AXIS in jax.sharding.get_abstract_mesh().manual_axes
     return jax.lax.psum(total, AXIS) if divided else total
 
 
 COORDINATOR, COUNT, NUMBER = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
-"""Environment variables that say host:port of the first process, how many there are, and which this one is."""
+"""Environment variables with host:port of the first process, the number of processes, and the index of this one."""
 
 
 def connect() -> None:
-    """Joins the other processes, before anything else is done with JAX. Slurm, Open MPI and Kubernetes say themselves who they
-    are; elsewhere the environment does.
+    """Connects to the other processes; must be called before any other use of JAX. Slurm, Open MPI and Kubernetes provide the
+    settings themselves; otherwise they are taken from the environment.
 
     Raises:
-        UserError: nobody says so, or they cannot be reached.
+        UserError: the settings are missing, or the other processes cannot be reached.
     """
-    told = [os.environ.get(name) for name in (COORDINATOR, COUNT, NUMBER)]
+    settings = [os.environ.get(name) for name in (COORDINATOR, COUNT, NUMBER)]
     try:
-        if all(told):
-            jax.distributed.initialize(told[0], int(told[1] or 0), int(told[2] or 0))
+        if all(settings):
+            jax.distributed.initialize(settings[0], int(settings[1] or 0), int(settings[2] or 0))
         else:
             jax.distributed.initialize()
     except (ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(
-            f"--distributed: the processes do not find each other ({reason}); start them with srun or mpirun, "
+            f"--distributed: the processes cannot connect ({reason}); start them with srun or mpirun, "
             f"or set {COORDINATOR}, {COUNT} and {NUMBER}"
         ) from error
 
 
 def is_first() -> bool:
-    """Returns whether this process is the one that writes and prints."""
+    """Returns whether this process is the one that writes files and prints."""
     return jax.process_index() == 0
 
 
 def any_process(flag: bool) -> bool:
-    """Returns whether a flag is set in any process; all of them ask at the same time."""
+    """Returns whether a flag is set in any process; all processes must call this at the same time."""
     return flag if jax.process_count() == 1 else bool(_gathered(np.array([flag])).any())
 
 
 def by_first(action: Callable[[], Any]) -> None:
-    """Lets the first process do something, such as write a file, while all others wait.
+    """Runs an action, such as writing a file, in the first process while all others wait.
 
     Raises:
-        UserError: it could not; in the others the message says where to look.
+        UserError: the action failed; in the other processes the message refers to the first one.
     """
     failure = None
     try:
@@ -190,11 +191,16 @@ def by_first(action: Callable[[], Any]) -> None:
     if failure is not None:
         raise failure
     if failed:
-        raise UserError(f"process {jax.process_index()} stops, because the first one could not go on; its message says why")
+        raise UserError(f"process {jax.process_index()} stops because the first one failed; see its message")
 
 
 def check_alike(tree: Any, what: str) -> None:
-    """Raises a `UserError` in all processes unless they hold the same values, bit for bit."""
+    """Raises a `UserError` in all processes unless they hold the same values, bit for bit.
+
+    Args:
+        tree: of arrays.
+        what: name of the tree, for the message.
+    """
     if jax.process_count() == 1:
         return
     found = hashlib.sha256()
@@ -204,13 +210,13 @@ def check_alike(tree: Any, what: str) -> None:
     others = np.flatnonzero((digests != digests[0]).any(-1))
     if len(others):
         raise UserError(
-            f"{what} of process {others[0]} and of the first one differ; all need the same program, data and kind of machine, "
-            "and one folder for checkpoints that all can read"
+            f"{what} of process {others[0]} and of the first one differ; all processes need the same program, data and kind of "
+            "machine, and a checkpoint folder that all can read"
         )
 
 
 def _gathered(values: np.ndarray) -> np.ndarray:
-    """Returns the arrays of all processes, with a leading axis."""
+    """Returns the arrays of all processes, stacked along a leading axis."""
     from jax.experimental import multihost_utils
 
     return np.asarray(multihost_utils.process_allgather(values))

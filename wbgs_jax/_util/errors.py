@@ -1,13 +1,13 @@
-"""Errors for people: one line that says what is wrong, where, and what to do."""
+"""Errors shown to users: one line that states the problem, its location, and a remedy."""
 
 LONGEST, END = 1000, 200
-"""Characters of a message, and of its end: what is wrong with a file may be a word of five thousand digits."""
+"""Maximum length of a message, and of the end that is kept when it is shortened, characters: messages quote file contents."""
 
 
 class UserError(Exception):
-    """Something the user can mend. The message is one line: what, where, what to do. Command lines exit with code 2.
+    """A problem that the user can fix. Command lines exit with code 2.
 
-    Whatever it quotes, it stays one line, and one that can be read."""
+    The message states what is wrong, where, and what to do. It is always a single readable line, whatever it quotes."""
 
     def __init__(self, message: str = ""):
         line = " ".join(message.splitlines())

@@ -1,11 +1,12 @@
-"""Files that are either whole or absent: written under a temporary name beside the target, then renamed.
+"""Reading and writing of files.
 
-Archives of arrays (.npz) as they come from disk: damaged, from elsewhere, or no archives at all.
+Files are written under a temporary name in the same folder and then renamed, so that they are either complete or absent.
 
-Whatever NumPy, zipfile, zlib and Python's tokenizer make of damaged bytes, it is one `UserError` in words of our own. Python
-objects are never read: unpickling them would run whatever the file says.
+Array archives (.npz) may be damaged or not archives at all. Every error of NumPy, zipfile, zlib and Python's tokenizer about
+them becomes one `UserError`. Python objects are never unpickled, as this would run code from the file.
 
-Small YAML files that people write. What is no plain data is refused: aliases that unfold to gigabytes, endless nesting.
+YAML files are small and written by hand. Anything but plain data is rejected, such as aliases that expand to gigabytes or very
+deep nesting.
 """
 
 import contextlib
@@ -30,36 +31,40 @@ from wbgs_jax._util.errors import UserError
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where nothing is removed
+except ImportError:  # on Windows, where stale files are not removed
     fcntl = None  # type: ignore[assignment]
 
 STALE_S = 5.0
-"""Age of temporary files that may be nobody's."""
+"""Age in seconds from which temporary files may be left over from a killed process."""
 LONGEST_NAME = 100
-"""Characters: file systems take 255, and names get endings."""
+"""Characters: file systems allow 255, and endings are appended."""
 
 
 @contextlib.contextmanager
 def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
-    """Opens a temporary binary file that replaces `path` when the block ends well and vanishes when it does not."""
+    """Opens a temporary binary file that replaces `path` if the block succeeds and is removed otherwise.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_left(path)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}; choose another folder or mend its permissions") from error
+        raise UserError(f"cannot write {path}: {error.strerror}; choose another folder or fix its permissions") from error
     try:
         with os.fdopen(handle, "wb") as stream:
-            with contextlib.suppress(OSError, AttributeError):  # of a file system without locks, or without `fcntl`
+            with contextlib.suppress(OSError, AttributeError):  # file systems without locks, platforms without `fcntl`
                 fcntl.flock(stream, fcntl.LOCK_SH)
             yield stream
         umask = os.umask(0)
         os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes files that only their owner can read
+        Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes files readable only by their owner
         Path(temporary).replace(path)
     except BaseException as error:
-        with contextlib.suppress(OSError):  # of a disk that has become read-only
+        with contextlib.suppress(OSError):  # the disk may have become read-only
             Path(temporary).unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise UserError(
@@ -69,7 +74,7 @@ def atomic_write(path: Path | str) -> Iterator[IO[bytes]]:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Raises a `UserError` for a file that cannot be written, before the work that it is for."""
+    """Raises a `UserError` if a file cannot be written, before the work whose results it will hold."""
     for path in filter(None, paths):
         try:
             folder = next(parent for parent in path.absolute().parents if parent.exists())
@@ -77,16 +82,17 @@ def check_writable(*paths: Path | None) -> None:
             if path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
         except OSError as error:
-            raise UserError(f"cannot write {path}: {error.strerror}; choose another place or mend its permissions") from error
+            raise UserError(f"cannot write {path}: {error.strerror}; choose another place or fix its permissions") from error
 
 
 def left_by_killed(path: Path) -> list[Path]:
-    """Returns the temporary files beside a file, which a process that was killed while it wrote left there."""
+    """Returns temporary files beside a file that were left by processes killed while writing it."""
     return [*path.parent.glob(f".{glob.escape(path.name)}.????????")] if path.parent.is_dir() else []
 
 
 def _remove_left(path: Path) -> None:
-    """Removes what killed processes left of a file. Who still writes holds a lock; who has just begun may not hold it yet."""
+    """Removes files left by killed processes. A process that is still writing holds a lock; one that has just started may not
+    hold it yet."""
     for left in left_by_killed(path):
         with contextlib.suppress(OSError):
             if fcntl is not None and time.time() - left.stat().st_mtime >= STALE_S:
@@ -96,19 +102,23 @@ def _remove_left(path: Path) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Returns the content of a text file; anything else is a `UserError`, a pipe too, which nobody may ever write to."""
+    """Returns the content of a text file.
+
+    Raises:
+        UserError: anything else, including pipes, from which a read might never return.
+    """
     try:
         if path.exists() and not path.is_file():
             raise UserError(f"{path} is not a file; put one in its place")
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}; the folder must hold it") from error
+        raise UserError(f"cannot read {path}: {error.strerror}; the folder must contain it") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is not a text file ({error.reason}); copy it again") from error
 
 
 def safe_name(name: str) -> str:
-    """Returns a name, as data give it, that is no path: letters, digits, blanks and -+._ alone, and no dot at an end."""
+    """Returns a name from data as a safe file name: only letters, digits, blanks and -+._, without dots at the ends."""
     return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:LONGEST_NAME] or "data"
 
 
@@ -121,22 +131,26 @@ def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
 
 
 def write_json(path: Path | str, value: Any) -> None:
-    """Writes `value` as indented JSON, atomically. NaN is refused: a figure that is not a number is a mistake upstream."""
+    """Writes `value` as indented JSON, atomically. NaN is rejected, since it indicates an error in the computation."""
     with atomic_write(path) as stream:
         stream.write((json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path | str) -> Any:
-    """Returns the content of a JSON file; a missing or broken one is a `UserError`."""
+    """Returns the content of a JSON file.
+
+    Raises:
+        UserError: the file is missing or invalid.
+    """
     path = Path(path)
     try:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not valid JSON ({error}); it may be truncated: make it again") from error
+        raise UserError(f"{path} is not valid JSON ({error}); it may be truncated: create it again") from error
 
 
 MOST_BYTES = 8 * 2**30
-"""That a file may unfold to."""
+"""Maximum size of an uncompressed archive."""
 
 
 def read_arrays(path: Path, what: str, advice: str, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -144,12 +158,12 @@ def read_arrays(path: Path, what: str, advice: str, names: Collection[str] | Non
 
     Args:
         path: of the file.
-        what: it is, for the message, such as "scene file".
-        advice: what to do where it cannot be read.
-        names: of the arrays that are wanted, where they are there; by default all.
+        what: kind of file, for messages, such as "scene file".
+        advice: what to do if it cannot be read, for messages.
+        names: arrays to read, as far as they exist; by default all.
 
     Raises:
-        UserError: the file is missing, damaged, no archive of arrays, or unfolds to more than `MOST_BYTES`.
+        UserError: the file is missing, damaged, not an array archive, or expands to more than `MOST_BYTES`.
     """
     with opened_archive(path, what, advice) as archive:
         return {name: archive[name] for name in archive if names is None or name in names}
@@ -157,13 +171,13 @@ def read_arrays(path: Path, what: str, advice: str, names: Collection[str] | Non
 
 @contextlib.contextmanager
 def opened_archive(path: Path, what: str, advice: str) -> Iterator["Archive"]:
-    """Gives the arrays of an .npz file, each read when it is asked for; otherwise as `read_arrays`."""
+    """Yields the arrays of an .npz file, each of which is read on access; otherwise like `read_arrays`."""
     where = f"{what} {path}".strip()
     with told(where, advice):
         check_file(path, where, advice)
         with path.open("rb") as stream:
             if not zipfile.is_zipfile(stream):
-                raise UserError(f"{where} is damaged or no .npz archive; {advice}")
+                raise UserError(f"{where} is damaged or not an .npz archive; {advice}")
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as archive:
                 check_size(archive.zip, path)
@@ -171,7 +185,7 @@ def opened_archive(path: Path, what: str, advice: str) -> Iterator["Archive"]:
 
 
 class Archive(dict[str, np.ndarray]):
-    """Arrays by name; what is no array, or cannot be read, is a `UserError`."""
+    """Arrays by name; entries that are not arrays or cannot be read raise a `UserError`."""
 
     def __init__(self, archive: Any, where: str, advice: str):
         super().__init__(dict.fromkeys(archive.files))
@@ -181,26 +195,31 @@ class Archive(dict[str, np.ndarray]):
         with told(f"{self._where}: {name!r}", self._advice):
             value = self._archive[name]
             if not isinstance(value, np.ndarray):
-                raise UserError(f"{self._where} holds {name[:40]!r}, which is no array; {self._advice}")
+                raise UserError(f"{self._where} has the entry {name[:40]!r}, which is not an array; {self._advice}")
             return value
 
 
 def check_file(path: Path, where: str, advice: str) -> None:
-    """Raises a `UserError` for what is no file: a folder, or a pipe that nobody may ever write to."""
+    """Raises a `UserError` for anything that is not a regular file: a folder, or a pipe, which might never deliver data."""
     if path.exists() and not path.is_file():
         raise UserError(f"{where} is not a file; {advice}")
 
 
 def check_size(archive: zipfile.ZipFile, path: Path) -> None:
-    """Raises a `UserError` for an archive that would fill the memory: a few kilobytes can unfold to terabytes."""
-    unfolded = sum(entry.file_size for entry in archive.infolist())
-    if unfolded > MOST_BYTES:
-        raise UserError(f"{path} unfolds to {unfolded / 2**30:.1f} GiB, more than {MOST_BYTES / 2**30:g}; split it")
+    """Raises a `UserError` for an archive that would fill the memory: a few kilobytes can expand to terabytes."""
+    expanded = sum(entry.file_size for entry in archive.infolist())
+    if expanded > MOST_BYTES:
+        raise UserError(f"{path} expands to {expanded / 2**30:.1f} GiB, more than {MOST_BYTES / 2**30:g}; split it")
 
 
 @contextlib.contextmanager
 def told(where: str, advice: str) -> Iterator[None]:
-    """Turns whatever a parser of other people's files raises into a `UserError` of one line."""
+    """Converts any error of a parser to a `UserError` of one line.
+
+    Args:
+        where: description of the file, for the message.
+        advice: what to do, for the message.
+    """
     try:
         yield
     except UserError:
@@ -209,20 +228,20 @@ def told(where: str, advice: str) -> Iterator[None]:
         raise UserError(f"cannot read {where}: {error.strerror or 'it is damaged'}; {advice}") from error
     except MemoryError as error:
         raise UserError(f"{where} is damaged, or larger than the memory; {advice}") from error
-    except Exception as error:  # of many kinds, from a handful of libraries: none of them is a mistake of ours
+    except Exception as error:  # the parsers of several libraries raise many kinds of errors for damaged files
         raise UserError(f"{where} is damaged ({_reason(error)}); {advice}") from error
 
 
 def _reason(error: Exception) -> str:
-    """Returns what a library says, on one line and short; NumPy's advice to unpickle is nobody's."""
+    """Returns a library's error message, short and on one line. NumPy's advice to unpickle is replaced."""
     words = " ".join(str(error).split())
     if "pickle" in words or "Object arrays" in words:
-        return "it holds Python objects, which are never read"
+        return "it contains Python objects, which are never loaded"
     return words[:200] or type(error).__name__
 
 
 LARGEST, DEEPEST = 1_000_000, 20
-"""Characters, and levels of nesting: no file of positions comes near."""
+"""Maximum number of characters and of levels of nesting, far more than files of positions need."""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -231,7 +250,7 @@ class _PlainLoader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Returns a node; an alias or too deep a one is an error."""
+        """Returns a node; aliases and very deep nesting are errors."""
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.YAMLError("it has an alias (*name); write the values out")
         self.depth += 1
@@ -243,11 +262,15 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> Any:
-    """Returns the content of a YAML file; a missing, damaged or outlandish one is a `UserError`."""
+    """Returns the content of a YAML file.
+
+    Raises:
+        UserError: the file is missing, damaged, too large, or uses aliases or very deep nesting.
+    """
     text = read_text(path)
     if len(text) > LARGEST:
         raise UserError(f"{path} has {len(text):,} characters; a file of positions has far fewer than {LARGEST:,}")
     try:
         return yaml.load(text, _PlainLoader)
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:  # ValueError: an impossible date
-        raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); mend it") from error
+    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:  # ValueError: an invalid date
+        raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); correct it") from error

@@ -1,7 +1,7 @@
-"""Functions that are computed in another way on some platforms, as what lowers the code decides.
+"""Functions with platform-specific implementations, chosen when the code is lowered.
 
-`jax.lax.platform_dependent` decides as late, but traces every way for every platform: a CPU would wait for the kernels of a GPU
-to be traced, and for the import of the language that they are written in.
+`jax.lax.platform_dependent` decides equally late, but traces all implementations on every platform: a CPU would wait for GPU
+kernels to be traced and for the import of Pallas.
 """
 
 import contextlib
@@ -17,15 +17,15 @@ from jax.interpreters import batching, mlir
 def per_platform(
     name: str, shapes: Callable[..., Any], default: Callable[..., Any], **platforms: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Returns a function of trees of arrays, to a list of arrays: `default`, or that of the platform which it is lowered for.
+    """Returns a function from trees of arrays to a list of arrays: `default`, or the implementation for the target platform.
 
-    It has no derivative, and is mapped over one row after another.
+    It has no derivative, and `jax.vmap` maps it over one row after another.
 
     Args:
         name: shown in traced programs.
-        shapes: of arguments of such shapes, to a list of what has the results' `shape` and `dtype`.
+        shapes: returns, for arguments with shapes, a list of objects with the results' `shape` and `dtype`.
         default: computes the results.
-        platforms: the same by platform, such as cuda; traced only when code is lowered for it.
+        platforms: implementations by platform, such as cuda; traced only when code is lowered for it.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -39,7 +39,7 @@ def per_platform(
             return function(*jax.tree.unflatten(structure, leaves))
 
         def rule(context: Any, *operands: Any, **options: Any) -> Any:
-            with _some_gpu() if function in platforms.values() else contextlib.nullcontext():
+            with _abstract_gpu() if function in platforms.values() else contextlib.nullcontext():
                 return mlir.lower_fun(computed, multiple_results=True)(context, *operands, **options)
 
         return rule
@@ -68,9 +68,9 @@ def per_platform(
     return call
 
 
-def _some_gpu() -> contextlib.AbstractContextManager[Any]:
-    """Names a GPU to kernels that are lowered where there is none, as JAX asks from 0.11 on: code that is exported runs on any
-    that is not older."""
+def _abstract_gpu() -> contextlib.AbstractContextManager[Any]:
+    """Provides an abstract GPU for lowering kernels on a machine without one, as JAX requires from version 0.11 on. Exported
+    code runs on this and newer GPUs."""
     if jax.default_backend() == "gpu" or not hasattr(jax.sharding, "AbstractDevice"):
         return contextlib.nullcontext()
     device = jax.sharding.AbstractDevice(device_kind="NVIDIA A100", num_cores=108, platform="gpu")

@@ -1,4 +1,4 @@
-"""What a person sees of long work: a live bar on a terminal, a plain line now and then in a log."""
+"""Progress display of long work: a live bar on a terminal, a plain line at intervals in a log."""
 
 import sys
 import time
@@ -7,20 +7,20 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 LOG_INTERVAL = 20.0
-"""Seconds between two lines when the output is no terminal."""
+"""Seconds between two lines if the output is not a terminal."""
 
 
 class Bar(Progress):
-    """A live bar of which nothing is seen where it is disabled: older versions of rich end it by an empty line all the same."""
+    """A live bar that prints nothing if disabled; older versions of rich print an empty line at the end even then."""
 
     def stop(self) -> None:
-        """Ends it."""
+        """Ends the display."""
         if not self.disable:
             super().stop()
 
 
 class CountProgress:
-    """Shows how many of equal pieces of work are done and the time left, on stderr."""
+    """Shows on stderr how many of a number of equal steps are done, and the remaining time."""
 
     def __init__(self, label: str, total: int, done: int = 0):
         self.label, self.total, self.done, self.start_done = label, total, done, done
@@ -40,7 +40,7 @@ class CountProgress:
         self.bar.stop()
 
     def advance(self) -> None:
-        """Says that one more piece is done."""
+        """Records that one more step is done."""
         self.done += 1
         self.bar.update(self.task, completed=self.done)
         now = time.monotonic()

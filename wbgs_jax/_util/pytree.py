@@ -25,7 +25,7 @@ def pytree(cls: type[T]) -> type[T]:
     """Makes a class a frozen dataclass and a pytree.
 
     Unlike `jax.tree_util.register_dataclass`, rebuilding a tree does not call `__init__`: transformations put shapes, masks
-    and markers where the annotations promise arrays, and run-time type checks must not trip over them.
+    and markers into fields annotated as arrays, which run-time type checks must not reject.
     """
     cls = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
@@ -50,10 +50,10 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def from_leaves(cls: type[T], leaves: Mapping[str, Any], constants: Mapping[str, Any] | None = None, prefix: str = "") -> T:
-    """Returns a `pytree` from its leaves by `jax.tree_util.keystr`, such as {".frame.centre": array}.
+    """Returns a `pytree` built from its leaves by `jax.tree_util.keystr`, such as {".frame.centre": array}.
 
-    Its fields are arrays or other `pytree` classes, or None. Static fields come from `constants`, else from their defaults.
-    What has no leaf is None.
+    Fields are arrays, other `pytree` classes, or None. Static fields come from `constants`, or else from their defaults. Fields
+    without a leaf are None.
     """
     hints, values = typing.get_type_hints(cls), {}
     for f in dataclasses.fields(cls):  # type: ignore[arg-type]
@@ -73,12 +73,12 @@ def _class_in(hint: Any) -> Any:
 
 
 def with_leaves(tree: T, *leaves: Any) -> T:
-    """Returns the structure of a tree with other leaves, of any kind, in its order."""
+    """Returns a tree of the same structure with other leaves, of any kind, in order."""
     return jax.tree.unflatten(jax.tree.structure(tree), leaves)
 
 
 def replaced(tree: T, **values: Any) -> T:
-    """Returns a `pytree` with other values in some fields, as `dataclasses.replace` does, but of any kind: names, markers."""
+    """Returns a `pytree` with some fields replaced, like `dataclasses.replace`, but by values of any kind (names, markers)."""
     new = object.__new__(type(tree))
     for f in dataclasses.fields(tree):  # type: ignore[arg-type]
         object.__setattr__(new, f.name, values.get(f.name, getattr(tree, f.name)))
@@ -96,7 +96,7 @@ def same(a: Any, b: Any) -> bool:
 def to_device(tree: Any) -> Any:
     """Returns a tree of host arrays on the device: floating-point numbers as float32, integers and booleans as int32.
 
-    They are converted on the host, where that compiles nothing.
+    Conversion happens on the host, where it does not require compilation.
     """
 
     def leaf(a: Any) -> jax.Array:

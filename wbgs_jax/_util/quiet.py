@@ -1,8 +1,8 @@
-"""Silences XLA in the processes of our own command lines, and sets their precision; they import this before JAX is loaded.
+"""Silences XLA in the processes of the library's command lines and sets their precision; must be imported before JAX.
 
-XLA logs errors about tuning flags of cached programs, which are of no consequence, and reads its log level once, when it is
-loaded. Commands compute in single precision, whatever other programs of the user want (JAX_ENABLE_X64). In any other process
-nothing is changed.
+XLA logs harmless errors about tuning flags of cached programs, and reads its log level only once, when it is loaded. Commands
+compute in single precision, whatever the user has set for other programs (JAX_ENABLE_X64). In all other processes nothing is
+changed.
 """
 
 import itertools

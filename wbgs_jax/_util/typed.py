@@ -1,4 +1,4 @@
-"""Whether values that come from a file have the types that a dataclass declares."""
+"""Checks that values read from a file have the types that a dataclass declares."""
 
 import dataclasses
 import math
@@ -8,18 +8,18 @@ from typing import Any
 
 
 def misfit(value: Any) -> str:
-    """Returns which field of a dataclass holds what it does not declare, as "NAME is VALUE"; empty if none does. Fields of
-    dataclasses or of any type are left to others; numbers must be finite."""
+    """Returns the first field of a dataclass whose value does not have the declared type, as "NAME is VALUE"; empty if all do.
+    Fields that are dataclasses or of any type are not checked; numbers must be finite."""
     hints = typing.get_type_hints(type(value))
     for field in dataclasses.fields(value):
-        held = getattr(value, field.name)
-        if not fits(held, hints[field.name]):
-            return f"{field.name} is {repr(held)[:60]}"
+        content = getattr(value, field.name)
+        if not fits(content, hints[field.name]):
+            return f"{field.name} is {repr(content)[:60]}"
     return ""
 
 
 def fits(value: Any, declared: Any) -> bool:
-    """Returns whether a value is of a declared type: plain ones, tuples, literals, and unions of them."""
+    """Returns whether a value has a declared type: plain types, tuples, literals, and unions of these."""
     origin, arguments = typing.get_origin(declared), typing.get_args(declared)
     if declared is Any or dataclasses.is_dataclass(declared):
         return True

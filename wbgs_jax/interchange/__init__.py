@@ -1,1 +1,1 @@
-"""Files and objects of other programs, in and out: splat viewers, Sionna RT, DeepMIMO (docs/interchange.md)."""
+"""Import and export of other programs' files and objects: splat viewers, Sionna RT, DeepMIMO (docs/interchange.md)."""

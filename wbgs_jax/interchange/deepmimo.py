@@ -1,17 +1,16 @@
-"""Channels of DeepMIMO (version 4), in and out, without its package: one transmitter, N users, up to K paths each.
+"""Import and export of DeepMIMO channels (version 4) without its package: one transmitter, N users, up to K paths each.
 
 Arrays by name: `power` (dB) and `phase` (degrees) of every path, `delay` (seconds), `aod_az`, `aod_el`, `aoa_az`, `aoa_el`
-(degrees, el from +z), `inter` (the interactions as the digits of a number, from the transmitter on: 1 reflection,
+(degrees, el from +z), `inter` (the interactions as the digits of a number, starting at the transmitter: 1 reflection,
 2 diffraction, 3 scattering, 4 transmission, 0 none), `inter_pos`, `rx_pos` (N, 3), `tx_pos` (1, 3); NaN where a user has fewer
-paths. A scenario is a folder with a file each.
+paths.
 
-The channel at the carrier is the sum of sqrt(power) exp(j phase): phases hold the propagation. What DeepMIMO's converter makes
-of Sionna RT lacks it, as Sionna's coefficients do; lines of sight show which it is.
+The channel at the carrier is the sum of sqrt(power) exp(j phase): phases include the propagation. They do not in DeepMIMO's
+conversions of Sionna RT, as in Sionna's own coefficients; lines of sight reveal which is the case.
 
-Folders of DeepMIMO scenarios: which transmitters and users they hold, at which frequency, and their arrays.
-
-A file an array, such as power_t001_tx000_r000.npz (or .mat): set and number of the transmitter, set of the users; and
-params.json with the frequency and the sets. A set of users that are base stations too is taken if there is no other.
+A scenario is a folder with one file per array, such as power_t001_tx000_r000.npz (or .mat), named by the set and number of the
+transmitter and the set of users; params.json has the frequency and the sets. A set of users that are also base stations is used
+only if there is no other.
 """
 
 import re
@@ -30,11 +29,11 @@ from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTIO
 FILE = re.compile(r"(?P<name>[a-z_]+?)_t(?P<set>\d+)_tx(?P<tx>\d+)_r(?P<rx>\d+)\.(npz|mat)")
 PARAMETERS = "params.json"
 VERSION = "4.0.0"
-"""Of DeepMIMO, whose form this is."""
+"""Version of DeepMIMO that defines this format."""
 
 
 class Pair(NamedTuple):
-    """A transmitter and the users that it is about."""
+    """A transmitter and a set of users."""
 
     tx_set: int
     tx: int
@@ -42,7 +41,11 @@ class Pair(NamedTuple):
 
 
 def pairs_of(folder: Path, tx_set: int | None = None, tx: int | None = None, rx_set: int | None = None) -> list[Pair]:
-    """Returns the transmitters of one set of users, in order; a choice is by number, None leaves it open.
+    """Returns the transmitters of one set of users, in order.
+
+    Args:
+        folder: of the scenario.
+        tx_set, tx, rx_set: numbers to choose; None for any.
 
     Raises:
         UserError: there is none.
@@ -53,12 +56,12 @@ def pairs_of(folder: Path, tx_set: int | None = None, tx: int | None = None, rx_
     if not found:
         there = ", ".join(f"t{s:03}_tx{t:03}_r{r:03}" for s, t, r in sorted(every)[:4])
         raise UserError(
-            f"{folder} holds no such transmitter and users; it holds {there}" if every else
-            f"{folder} holds no files such as power_t001_tx000_r000.npz; give the folder of a DeepMIMO scenario"
+            f"{folder} has no such transmitter and users; it has {there}" if every else
+            f"{folder} has no files such as power_t001_tx000_r000.npz; give the folder of a DeepMIMO scenario"
         )  # fmt: skip
     first = {pair.rx_set: pair for pair in reversed(found)}
     users = sorted(first)
-    if len(users) > 1:  # sizes are read from files
+    if len(users) > 1:  # their sizes have to be read from files
         rank = {number: (_sends(folder, number, every), -_size(folder, pair)) for number, pair in first.items()}
         users.sort(key=lambda number: rank[number])
     sets = sorted({pair.tx_set for pair in found if pair.rx_set == users[0]})
@@ -81,12 +84,12 @@ def read_pair(folder: Path, pair: Pair) -> dict[str, np.ndarray]:
 
 
 def read_file(path: Path) -> dict[str, np.ndarray]:
-    """Returns the numbers of an .npz or .mat file by name."""
+    """Returns the numeric arrays of an .npz or .mat file by name."""
     return read_mat(path) if path.suffix == ".mat" else read_arrays(path, "", "check the path; give an .npz or a .mat file")
 
 
 def parameters(folder: Path) -> dict[str, Any]:
-    """Returns what params.json holds; nothing where there is none."""
+    """Returns the content of params.json; empty if there is none."""
     path = folder / PARAMETERS
     if not (folder.is_dir() and path.exists()):
         return {}
@@ -95,13 +98,13 @@ def parameters(folder: Path) -> dict[str, Any]:
 
 
 def write_pair(folder: Path, pair: Pair, arrays: dict[str, np.ndarray], frequency_hz: float) -> None:
-    """Writes the arrays of a transmitter and its users, and notes both in params.json."""
+    """Writes the arrays of a transmitter and its users, and records both in params.json."""
     for name, values in arrays.items():
         one: dict[str, Any] = {name: values}
         with atomic_write(folder / f"{name}_t{pair.tx_set:03}_tx{pair.tx:03}_r{pair.rx_set:03}.npz") as stream:
             np.savez_compressed(stream, **one)
-    known = parameters(folder)
-    sets = known.get("txrx_sets", {})
+    recorded = parameters(folder)
+    sets = recorded.get("txrx_sets", {})
     before = sets.get(f"txrx_set_{pair.tx_set}", {}).get("num_points", 0)
     active = int(np.isfinite(arrays["power"]).any(1).sum())
     sets |= {
@@ -135,14 +138,14 @@ def _matches(folder: Path) -> list[re.Match[str]]:
 
 
 def _sends(folder: Path, number: int, every: set[Pair]) -> bool:
-    """Returns whether a set of users is one of transmitters too."""
+    """Returns whether a set of users is also one of transmitters."""
     sets = parameters(folder).get("txrx_sets", {})
-    known = sets.get(f"txrx_set_{number}") if isinstance(sets, dict) else None
-    return bool(known.get("is_tx")) if isinstance(known, dict) else number in {pair.tx_set for pair in every}
+    entry = sets.get(f"txrx_set_{number}") if isinstance(sets, dict) else None
+    return bool(entry.get("is_tx")) if isinstance(entry, dict) else number in {pair.tx_set for pair in every}
 
 
 def _size(folder: Path, pair: Pair) -> int:
-    """Returns how many users there are."""
+    """Returns the number of users."""
     return len(read_pair(folder, pair).get("rx_pos", ()))
 
 
@@ -150,27 +153,28 @@ PATHS = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 NEEDED = (*PATHS, "rx_pos", "tx_pos")
 ANGLES = {"theta_t": "aod_el", "phi_t": "aod_az", "theta_r": "aoa_el", "phi_r": "aoa_az"}
 IN_DEGREES, MANY = ("phase", "aod_el", "aoa_el"), 8
-"""Arrays that do not stay within three degrees, and how many values of one show it."""
+"""Arrays whose values are not confined to three degrees, and how many different values are needed to test this."""
 DIGITS = {SPECULAR: 1, DIFFRACTION: 2, DIFFUSE: 3, REFRACTION: 4}
 MOST_INTERACTIONS = 10
 WITHOUT_PROPAGATION = ("sionna",)
-"""Ray tracers whose phases DeepMIMO's converters take over without the propagation."""
+"""Ray tracers whose phases DeepMIMO's converters copy without the propagation."""
 ALIKE, DIFFERENT, FEWEST = 0.99, 0.6, 5
-"""Lengths of the mean phasor of lines of sight that have one phase, and many; and how many it takes."""
+"""Length of the mean phasor of lines of sight above which their phases agree and below which they differ; and how many are
+needed."""
 
 
 def read_deepmimo(
     path: Path | str, tx_set: int | None = None, tx: int | None = None, rx_set: int | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of a scenario by name: of a folder with a file each, or of one .npz or .mat file that holds all.
+    """Returns the arrays of a scenario by name: of a folder with one file per array, or of a single .npz or .mat file.
 
     Args:
         path: folder or file.
-        tx_set, tx, rx_set: which of several pairs of a transmitter and a set of users; by default the first transmitter, and
-            the largest set of users that are no transmitters.
+        tx_set, tx, rx_set: choice among several pairs of a transmitter and a set of users; by default the first transmitter,
+            and the largest set of users that are not transmitters.
 
     Raises:
-        UserError: nothing is there, or an array is missing.
+        UserError: the scenario does not exist, or an array is missing.
     """
     path = Path(path)
     return _complete(path, read_pair(path, pairs_of(path, tx_set, tx, rx_set)[0]) if path.is_dir() else read_file(path))
@@ -183,26 +187,27 @@ def load_deepmimo(
     tx: int | None = None,
     rx_set: int | None = None,
 ) -> RayPaths:
-    """Returns the paths from all transmitters of a scenario's set to its users, or from one of them.
+    """Returns the paths from all transmitters of a scenario's set (or from a chosen one) to its users.
 
     Args:
         path: folder or file.
-        frequency_hz: where no params.json records it.
+        frequency_hz: needed if no params.json records it.
         tx_set, tx, rx_set: as in `read_deepmimo`.
 
     Raises:
-        UserError: nothing is there, an array is missing, or the frequency is not known, or another.
+        UserError: the scenario does not exist, an array is missing, or the frequency is unknown or contradicts the recorded
+            one.
     """
-    path, known = Path(path), parameters(Path(path)).get("rt_params", {})
+    path, entry = Path(path), parameters(Path(path)).get("rt_params", {})
     if not path.exists():
-        raise UserError(f"cannot read {path}: there is no such scenario; check the path")
-    tracing = known if isinstance(known, dict) else {}
+        raise UserError(f"cannot read {path}: the scenario does not exist; check the path")
+    tracing = entry if isinstance(entry, dict) else {}
     found = tracing.get("frequency")
     recorded = float(found) if isinstance(found, int | float) else None
     if frequency_hz is None and recorded is None:
         raise UserError(f"{path} does not record its frequency; give --ghz, as in the scenario's parameters")
     if frequency_hz is not None and recorded is not None and not np.isclose(recorded, frequency_hz, rtol=1e-3):
-        raise UserError(f"{path} is of {recorded / 1e9:g} GHz, not of {frequency_hz / 1e9:g}; leave out --ghz")
+        raise UserError(f"{path} is for {recorded / 1e9:g} GHz, not {frequency_hz / 1e9:g}; leave out --ghz")
     frequency = frequency_of(recorded if frequency_hz is None else frequency_hz)
     pairs = pairs_of(path, tx_set, tx, rx_set) if path.is_dir() else []
     found_arrays = [read_pair(path, pair) for pair in pairs] if pairs else [read_file(path)]
@@ -239,14 +244,14 @@ def joined(every: list[RayPaths]) -> RayPaths:
 
 def _complete(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if missing := [name for name in NEEDED if name not in arrays]:
-        raise UserError(f"{path} has no {missing[0]}; it must hold a DeepMIMO scenario: {', '.join(NEEDED)}")
+        raise UserError(f"{path} has no {missing[0]}; a DeepMIMO scenario needs {', '.join(NEEDED)}")
     _check_shapes(path, arrays)
     _check_units(path, arrays)
     return arrays
 
 
 def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raises a `UserError` for arrays that are no numbers, or do not fit each other."""
+    """Raises a `UserError` for arrays that are not numeric or whose shapes do not match."""
     shape = np.shape(arrays["power"])
     users, paths = (*shape, 0, 0)[:2]
     of_paths = dict.fromkeys((*PATHS, "inter"), ((users, paths),))
@@ -256,32 +261,34 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
             continue
         found = arrays[name]
         if found.dtype.kind not in "fiu":
-            raise UserError(f"{name} in {path} holds no numbers but {found.dtype}; write the scenario again")
+            raise UserError(f"{name} in {path} is not numeric but {found.dtype}; write the scenario again")
         if len(shape) != 2 or found.shape not in allowed:
             expected = " or ".join(map(str, allowed))
             raise UserError(f"{name} in {path} has shape {found.shape}; expected {expected}: users, paths, ...")
 
 
 def _check_units(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raises a `UserError` for powers that are no decibels, and for many phases or elevations that are all radians."""
-    known = {name: np.asarray(arrays[name], np.float64) for name in ("power", *IN_DEGREES)}
-    known = {name: values[np.isfinite(values)] for name, values in known.items()}
-    if len(known["power"]) and known["power"].min() >= 0:
-        low, high = known["power"].min(), known["power"].max()
-        raise UserError(f"power in {path} is {low:.3g} to {high:.3g}; give decibels, 10 log10 of it")
+    """Raises a `UserError` for powers that are not decibels, and for phases or elevations that are probably radians."""
+    finite = {name: np.asarray(arrays[name], np.float64) for name in ("power", *IN_DEGREES)}
+    finite = {name: values[np.isfinite(values)] for name, values in finite.items()}
+    if len(finite["power"]) and finite["power"].min() >= 0:
+        low, high = finite["power"].min(), finite["power"].max()
+        raise UserError(f"power in {path} is {low:.3g} to {high:.3g}; give decibels, 10 log10 of the power")
     for name in IN_DEGREES:
-        if len(np.unique(known[name])) >= MANY and np.abs(known[name]).max() <= np.pi + 1e-3:
-            raise UserError(f"{name} in {path} is {known[name].min():.3g} to {known[name].max():.3g}; give degrees, no radians")
+        if len(np.unique(finite[name])) >= MANY and np.abs(finite[name]).max() <= np.pi + 1e-3:
+            raise UserError(
+                f"{name} in {path} is {finite[name].min():.3g} to {finite[name].max():.3g}; give degrees, not radians"
+            )
 
 
 def _depth(arrays: dict[str, np.ndarray]) -> int:
-    """Returns how many interactions a scenario keeps the places of."""
+    """Returns the number of interactions whose positions a scenario stores."""
     places = arrays.get("inter_pos")
     return places.shape[2] if places is not None and places.ndim == 4 else 0
 
 
 def is_deepmimo(path: Path) -> bool:
-    """Returns whether a path is a scenario, and not an archive of Sionna's arrays."""
+    """Returns whether a path is a DeepMIMO scenario rather than an archive of Sionna's arrays."""
     if path.suffix != ".npz":
         return True
     return bool({"power", "phase"} & set(read_file(path)))
@@ -290,8 +297,8 @@ def is_deepmimo(path: Path) -> bool:
 def write_deepmimo(
     folder: Path | str, arrays: dict[str, np.ndarray], frequency_hz: float, tx_set: int = 1, tx: int = 0, rx_set: int = 0
 ) -> None:
-    """Writes arrays as a scenario's files, an .npz each, into a folder, which DeepMIMO loads; further transmitters of the same
-    users may follow."""
+    """Writes arrays as the .npz files of a scenario into a folder, which DeepMIMO loads; further transmitters of the same users
+    may be added."""
     write_pair(Path(folder), Pair(tx_set, tx, rx_set), arrays, frequency_hz)
 
 
@@ -300,15 +307,15 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagatio
 
     Args:
         arrays: of `read_deepmimo`.
-        frequency_hz: of the carrier, which stands in the scenario's parameters.
-        propagation: whether phases hold it, where lines of sight do not show it.
+        frequency_hz: of the carrier, recorded in the scenario's parameters.
+        propagation: whether phases include the propagation, if lines of sight do not reveal it.
     """
     power = np.asarray(arrays["power"], np.float64)
     valid = np.isfinite(power)
     amplitude = np.where(valid, 10 ** (np.where(valid, power, 0) / 20), 0)
     phase, tau = np.radians(_filled(arrays["phase"], valid)), _filled(arrays["delay"], valid)
     turns = 2 * np.pi * np.mod(frequency_hz * tau, 1)
-    if _holds_propagation(phase, turns, valid & (_filled(arrays.get("inter", power), valid) == 0), propagation):
+    if _includes_propagation(phase, turns, valid & (_filled(arrays.get("inter", power), valid) == 0), propagation):
         phase = phase + turns
     angles = {own: np.radians(_filled(arrays[name], valid))[:, None] for own, name in ANGLES.items()}
     met = _digits(_filled(arrays["inter"], valid)) if "inter" in arrays else np.zeros((0, *power.shape), np.int32)
@@ -329,10 +336,10 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagatio
     )
 
 
-def _holds_propagation(
+def _includes_propagation(
     phase: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "n k"], direct: Bool[np.ndarray, "n k"], otherwise: bool
 ) -> bool:
-    """Returns whether phases hold the propagation: without it, those of lines of sight are one."""
+    """Returns whether phases include the propagation; without it, those of lines of sight are all equal."""
     if direct.sum() < FEWEST:
         return otherwise
     without, with_it = (abs(np.exp(1j * own[direct]).mean()) for own in (phase, phase + turns))
@@ -342,7 +349,7 @@ def _holds_propagation(
 
 
 def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
-    """Returns the paths of one transmitter to all receivers as a scenario's arrays, of each receiver the strongest first."""
+    """Returns the paths of one transmitter to all receivers as a scenario's arrays, for each receiver the strongest first."""
     a = np.where(paths.valid, paths.a, 0)[:, transmitter]
     order = np.argsort(-np.abs(a), -1, kind="stable")
     valid = np.take_along_axis(paths.valid[:, transmitter], order, -1)
@@ -373,7 +380,7 @@ def _filled(values: Any, valid: np.ndarray) -> np.ndarray:
 
 
 def _digits(codes: np.ndarray) -> np.ndarray:
-    """Returns Sionna's interactions, a leading axis, of numbers whose digits are DeepMIMO's."""
+    """Returns Sionna's interactions along a leading axis from numbers whose digits are DeepMIMO's."""
     kinds = np.zeros(10, np.int32)
     for kind, digit in DIGITS.items():
         kinds[digit] = kind
@@ -388,7 +395,7 @@ def _digits(codes: np.ndarray) -> np.ndarray:
 
 
 def _number(digits: np.ndarray) -> np.ndarray:
-    """Returns numbers of their digits, leading axis; 0 stands for nothing."""
+    """Returns numbers from their digits (leading axis); digits of 0 are skipped."""
     total = np.zeros(digits.shape[1:], np.int64)
     for digit in digits:
         total = np.where(digit > 0, 10 * total + digit, total)

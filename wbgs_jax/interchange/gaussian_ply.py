@@ -1,8 +1,8 @@
-"""Gaussians as the PLY file of 3D Gaussian splatting (Kerbl et al. 2023), which splat viewers open, and back.
+"""Import and export of Gaussians as PLY files of 3D Gaussian splatting (Kerbl et al. 2023), which splat viewers open.
 
-A vertex a Gaussian, float32, binary little endian: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3. Opacity
-is kept before its sigmoid, scales as natural logarithms, the rotation as a unit quaternion w x y z; colours are the constant
-term of spherical harmonics. Radio has no colours: whoever writes says what they stand for.
+Each Gaussian is a vertex, float32, binary little endian: x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3.
+Opacity is stored before its sigmoid, scales as natural logarithms, the rotation as a unit quaternion w x y z; colours are the
+constant term of spherical harmonics. Radio signals have no colours: the caller decides what the colours represent.
 """
 
 from pathlib import Path
@@ -16,13 +16,13 @@ from wbgs_jax.mesh.ply import read_elements, write_elements
 from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814
-"""Y_0^0, of what a colour is 0.5 + SH_CONSTANT * f_dc."""
+"""Y_0^0; a colour is 0.5 + SH_CONSTANT * f_dc."""
 RESTS = 45
-"""Coefficients beyond the constant that viewers expect: three degrees, three colours."""
+"""Coefficients beyond the constant that viewers expect: three degrees for three colours."""
 SHORTEST = 1e-12
-"""Length of a quaternion that turns nothing."""
+"""Lower bound on the length of a quaternion."""
 MOST_CERTAIN = 1e-6
-"""Distance of opacities from 0 and 1."""
+"""Minimum distance of opacities from 0 and 1."""
 PLACE, COLOUR, SCALE, TURN = (
     ("x", "y", "z"),
     ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -38,13 +38,13 @@ def write_gaussians(
     colours: Float[np.ndarray, "n 3"] | None = None,
     opacity: Float[np.ndarray, " n"] | None = None,
 ) -> int:
-    """Writes the Gaussians that are alive, and returns how many they are.
+    """Writes the Gaussians that are alive and returns their number.
 
     Args:
         path: of the file.
         gaussians: in the world frame.
         colours: red, green, blue from 0 to 1; grey by default.
-        opacity: from 0 to 1; by default what the Gaussians themselves hold, `sigmoid(opacity_logits)`.
+        opacity: from 0 to 1; by default that of the Gaussians, `sigmoid(opacity_logits)`.
 
     Raises:
         UserError: the file cannot be written.
@@ -56,7 +56,7 @@ def write_gaussians(
         logits = np.log(share / (1 - share))
     rgb = np.full((len(alive), 3), 0.5) if colours is None else np.clip(colours, 0, 1)
     parts = {PLACE: gaussians.means, COLOUR: (rgb - 0.5) / SH_CONSTANT, ("opacity",): logits[:, None]}
-    length = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # some viewers take the quaternion as it stands
+    length = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # some viewers do not normalise quaternions
     parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats / np.maximum(length, SHORTEST)}
     rows = np.zeros(int(alive.sum()), [(name, "<f4") for name in NAMES])
     for names, values in parts.items():
@@ -70,18 +70,18 @@ def read_gaussians(path: Path | str) -> tuple[Gaussians, Float[np.ndarray, "n 3"
     """Returns the Gaussians of a splatting PLY file, and their colours from 0 to 1.
 
     Raises:
-        UserError: the file is missing, damaged, or holds no Gaussians.
+        UserError: the file is missing, damaged, or has no Gaussians.
     """
     rows = read_elements(path).get("vertex", {})
     missing = [name for name in NEEDED if not isinstance(rows.get(name), np.ndarray)]
     if missing:
-        raise UserError(f"{path} has no {missing[0]}: it holds points or a mesh, not Gaussians; export it as splats")
+        raise UserError(f"{path} has no {missing[0]}: it contains points or a mesh, not Gaussians; export it as splats")
     columns = {
         names: np.stack([np.asarray(rows[name], np.float32) for name in names], -1) for names in (PLACE, COLOUR, SCALE, TURN)
     }
     opacity = np.asarray(rows["opacity"], np.float32)
     if not all(np.isfinite(values).all() for values in (*columns.values(), opacity)):
-        raise UserError(f"{path} has NaN or infinity among its Gaussians; clean it and export it again")
+        raise UserError(f"{path} has NaN or infinite values in its Gaussians; clean it and export it again")
     place, scale, turn = (jnp.asarray(columns[names]) for names in (PLACE, SCALE, TURN))
     colours = np.clip(0.5 + SH_CONSTANT * columns[COLOUR], 0, 1)
     return Gaussians(place, scale, turn, jnp.asarray(opacity)), colours

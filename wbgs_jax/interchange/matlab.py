@@ -1,6 +1,6 @@
-"""Arrays of numbers from MATLAB's files (.mat of version 5, as SciPy and DeepMIMO write them), and nothing else from there.
+"""Reads numeric arrays from MATLAB files (.mat, version 5, as SciPy and DeepMIMO write them), and nothing else.
 
-SciPy's own reader follows damaged sizes out of its memory and takes the process with it; this one looks at every size first.
+SciPy's own reader crashes the process on files with damaged sizes; this one checks every size first.
 """
 
 import math
@@ -16,23 +16,23 @@ from wbgs_jax._util.files import MOST_BYTES, check_file, told
 
 HEADER, MATRIX, COMPRESSED = 128, 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-"""Types of elements."""
+"""NumPy types of data elements."""
 CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-"""Types of arrays; characters, cells and structures are left out."""
+"""NumPy types of arrays; characters, cells and structures are skipped."""
 COMPLEX = 0x08
 MOST_AXES = 16
 ADVICE = "give a .mat file of version 5 (MATLAB: save -v7), or an .npz file"
 
 
 class Element(NamedTuple):
-    """A piece of a file."""
+    """A data element of a file."""
 
     type: int
     content: memoryview
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of numbers of a .mat file by name.
+    """Returns the numeric arrays of a .mat file by name.
 
     Raises:
         UserError: the file is missing, damaged, or of another version.
@@ -42,28 +42,28 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
         whole = memoryview(path.read_bytes())
         order = {b"IM": "<", b"MI": ">"}.get(bytes(whole[126:HEADER]))
         if order is None:
-            raise ValueError("it is no .mat file of version 5")
+            raise ValueError("it is not a .mat file of version 5")
         return dict(_arrays(whole[HEADER:], order))
 
 
 def _arrays(content: memoryview, order: str) -> Iterator[tuple[str, np.ndarray]]:
     for element in _elements(content, order):
         if element.type == COMPRESSED:
-            yield from _arrays(_unfolded(element.content), order)
+            yield from _arrays(_decompressed(element.content), order)
         elif element.type == MATRIX and (found := _array(element.content, order)):
             yield found
 
 
-def _unfolded(content: memoryview) -> memoryview:
+def _decompressed(content: memoryview) -> memoryview:
     machine = zlib.decompressobj()
     found = machine.decompress(content, MOST_BYTES)
     if machine.unconsumed_tail:
-        raise ValueError("it unfolds to more than fits the memory")
+        raise ValueError("it expands to more than fits into memory")
     return memoryview(found)
 
 
 def _elements(content: memoryview, order: str) -> Iterator[Element]:
-    """Gives the elements of a piece: a type, a size and so many bytes; those of four bytes and fewer are packed."""
+    """Yields the data elements of a piece: a type, a size and the content; content of at most four bytes is packed."""
     place = 0
     while place + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, place)
@@ -71,14 +71,14 @@ def _elements(content: memoryview, order: str) -> Iterator[Element]:
         if kind >> 16:
             kind, size, start = kind & 0xFFFF, kind >> 16, place + 4
         if start + size > len(content) or (start == place + 4 and size > 4):
-            raise ValueError("it ends before its content does")
+            raise ValueError("it is truncated")
         yield Element(kind, content[start : start + size])
-        # Compressed elements follow each other without a gap, all others start at multiples of eight bytes.
+        # Compressed elements follow each other without padding; all others start at multiples of eight bytes.
         place = place + 8 if start == place + 4 else start + size + (0 if kind == COMPRESSED else -size % 8)
 
 
 def _array(content: memoryview, order: str) -> tuple[str, np.ndarray] | None:
-    """Returns name and values of an array of numbers, None of anything else."""
+    """Returns name and values of a numeric array, None for anything else."""
     flags, sizes, name, *parts = _elements(content, order)
     kind = struct.unpack_from(f"{order}I", flags.content)[0]
     dtype = CLASSES.get(kind & 0xFF)
@@ -94,8 +94,8 @@ def _array(content: memoryview, order: str) -> tuple[str, np.ndarray] | None:
 
 def _numbers(element: Element, order: str, dtype: str, shape: list[int]) -> np.ndarray:
     if element.type not in STORED:
-        raise ValueError(f"numbers in it are of the unknown type {element.type}")
+        raise ValueError(f"it contains the unknown number type {element.type}")
     found = np.frombuffer(element.content, order + STORED[element.type])
     if len(found) != math.prod(shape):
-        raise ValueError(f"an array in it has {len(found)} numbers, and should have {math.prod(shape)}")
+        raise ValueError(f"an array in it has {len(found)} numbers instead of {math.prod(shape)}")
     return found.astype(dtype).reshape(shape, order="F")

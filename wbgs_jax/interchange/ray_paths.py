@@ -1,11 +1,12 @@
-"""Propagation paths as Sionna RT has them (`sionna.rt.Paths`), in and out; the simulator itself is not needed.
+"""Import and export of propagation paths in the form of Sionna RT (`sionna.rt.Paths`); the simulator itself is not needed.
 
 Names, axes and conventions are Sionna's: R receivers, T transmitters, K paths, up to D interactions. Angles are radians in the
-world frame, theta from +z, phi from +x, at both ends outwards: where the wave leaves to, and where it comes from. Coefficients
-`a` lack the carrier phase of the delay: the channel at frequency f is the sum of a exp(-2 pi j f tau).
+world frame, theta from +z, phi from +x, pointing outwards at both ends: the directions of departure and towards the arriving
+wave. The coefficients `a` do not contain the carrier phase of the delay: the channel at frequency f is the sum of a exp(-2 pi j
+f tau).
 
-What paths can be: delays that fit the places, angles in radians, gains without amplification. What is otherwise is of
-another unit, and refused by name.
+Paths must be physically plausible: delays that fit the positions, angles in radians, gains without amplification. Otherwise
+they are probably in another unit, and the error names the array.
 """
 
 from collections.abc import Mapping
@@ -23,21 +24,21 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
 NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
-"""`sionna.rt.InteractionType`."""
+"""Values of `sionna.rt.InteractionType`."""
 INTERACTION = {TRANSMITTED: REFRACTION, REFLECTED: SPECULAR, DIFFRACTED: DIFFRACTION}
 NEEDED = ("a", "tau", "theta_t", "phi_t", "theta_r", "phi_r")
 OF_PATHS = (*NEEDED, "valid", "interactions", "vertices")
 SINGLE, ARRAYS = 3, 5
-"""Axes: receivers, transmitters, paths; and those of the antennas behind the first two, where they are told apart."""
+"""Number of axes: receivers, transmitters, paths; and with an axis of antennas after each of the first two."""
 
 
 @dataclass(frozen=True)
 class RayPaths:
-    """Paths between single antennas."""
+    """Paths between single antennas, radians and metres."""
 
     a: Complex[np.ndarray, "r t k"]
     tau: Float[np.ndarray, "r t k"]
-    """Seconds; -1 of what is no path."""
+    """Delay, seconds; -1 for padding."""
     theta_t: Float[np.ndarray, "r t k"]
     phi_t: Float[np.ndarray, "r t k"]
     theta_r: Float[np.ndarray, "r t k"]
@@ -45,18 +46,18 @@ class RayPaths:
     interactions: Int[np.ndarray, "d r t k"]
     """`NONE`, `SPECULAR`, `DIFFUSE`, `REFRACTION`, `DIFFRACTION`."""
     vertices: Float[np.ndarray, "d r t k 3"]
-    """Where they happen, metres; NaN where that is not known."""
+    """Points of interaction, metres; NaN if unknown."""
     valid: Bool[np.ndarray, "r t k"]
     sources: Float[np.ndarray, "t 3"]
     """Transmitters, metres."""
     targets: Float[np.ndarray, "r 3"]
-    """Receivers."""
+    """Receivers, metres."""
     frequency_hz: float
-    """At which the coefficients hold."""
+    """Carrier frequency of the coefficients."""
 
     def channel(self, frequency_hz: float | None = None) -> Complex[np.ndarray, "r t"]:
-        """Returns the channel between single antennas; at other frequencies than the paths' own phases follow the delays, and
-        the coefficients stay."""
+        """Returns the channel between single antennas. At another frequency than the paths' own, the phases follow the delays
+        and the coefficients are unchanged."""
         frequency = self.frequency_hz if frequency_hz is None else frequency_hz
         return np.where(self.valid, self.a * carrier(frequency, self.tau), 0).sum(-1)
 
@@ -93,25 +94,25 @@ class RayPaths:
 def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[int, int] | None = None) -> RayPaths:
     """Returns the paths of a `sionna.rt.Paths` object, or of a mapping with its arrays, between single antennas.
 
-    Of antenna arrays `sionna_arrays.scene_of_sionna` makes snapshots.
+    For snapshots of antenna arrays use `sionna_arrays.scene_of_sionna`.
 
     Args:
-        paths: whatever has `a`, `tau`, `theta_t`, `phi_t`, `theta_r`, `phi_r`, and perhaps `valid`, `interactions`, `vertices`,
-            `sources` and `targets`, as attributes or keys.
-        frequency_hz: of the carrier, which Sionna keeps in its scene; for what does not say it itself.
-        antennas: which of the receivers' and of the transmitters' antennas (0, 1, ...), where devices have several. With a
-            synthetic array the coefficients hold the phase of the antenna's place beside the device's.
+        paths: an object with `a`, `tau`, `theta_t`, `phi_t`, `theta_r`, `phi_r`, and optionally `valid`, `interactions`,
+            `vertices`, `sources` and `targets`, as attributes or keys.
+        frequency_hz: of the carrier, which Sionna keeps in its scene; needed if the paths do not record it.
+        antennas: indices of the receivers' and of the transmitters' antenna, if devices have several. With a synthetic array
+            the coefficients contain the phase of the antenna's offset from the device's position.
 
     Raises:
-        UserError: an array is missing, or has other axes; or devices have several antennas, and none is chosen.
+        UserError: an array is missing or has other axes, or devices have several antennas and none is chosen.
     """
     found = {name: values for name in OF_PATHS if (values := array_of(paths, name)) is not None}
     if "interactions" not in found:
-        found.pop("vertices", None)  # places of nobody knows what
+        found.pop("vertices", None)  # positions of unknown interactions
     check_arrays(found, "these paths")
     frequency = array_of(paths, "frequency_hz") if frequency_hz is None else frequency_hz
     if frequency is None:
-        raise UserError("these paths do not say their frequency; give it: that of the scene that they were traced in")
+        raise UserError("these paths do not record their frequency; give that of the scene that they were traced in")
     if found["a"].ndim == ARRAYS:
         several = found["a"].shape[1], found["a"].shape[3]
         if antennas is None and several != (1, 1):
@@ -133,13 +134,18 @@ def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[i
 
 
 def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
-    """Raises a `UserError` for arrays of `OF_PATHS` that are missing, hold no numbers, or are of other receivers, transmitters
-    and paths than `a`, with axes of antennas or without; `what` has them."""
+    """Raises a `UserError` for arrays of `OF_PATHS` that are missing, not numeric, or do not have the receivers, transmitters
+    and paths of `a`, with or without axes of antennas.
+
+    Args:
+        arrays: by name.
+        what: description of their source, for messages.
+    """
     if missing := [name for name in NEEDED if name not in arrays]:
         raise UserError(f"{what} have no {missing[0]}; give a sionna.rt.Paths object or its arrays by name")
     for name, values in arrays.items():
         if values.dtype.kind not in ("cfiu" if name == "a" else "fiub"):
-            raise UserError(f"{name} of {what} holds no numbers but {values.dtype}; write them again")
+            raise UserError(f"{name} of {what} is not numeric but {values.dtype}; write it again")
     of_a = arrays["a"].shape
     if len(of_a) not in (SINGLE, ARRAYS):
         raise UserError(f"a of {what} has shape {of_a}; expected receivers, transmitters and paths")
@@ -152,16 +158,16 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
 
 
 def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
-    """Returns what a field with paths says (`fields.base.paths_of`) of T transmitters at one frequency, as seen by one element
-    of the receiver's array at its centre.
+    """Returns the paths predicted by a field (`fields.base.paths_of`) from T transmitters at one frequency to a single element at
+    the centre of the receiver's array.
 
-    Transmissions have no place (NaN): a field knows which walls a path passes, and where it is reflected or diffracted.
+    Transmissions have no position (NaN): a field records which walls a path crosses, and where it is reflected or diffracted.
 
     Args:
         arrivals: `wbgs_jax.radio.channel.Arrivals` with a leading axis T.
-        tx_positions: (T, 3) metres, world frame.
-        rx_position: (3,).
-        frequency_hz: that was asked for.
+        tx_positions: (T, 3), metres, world frame.
+        rx_position: (3,), metres, world frame.
+        frequency_hz: frequency of the arrivals.
     """
     amplitude, length = np.asarray(arrivals.amplitude, np.complex128), np.asarray(arrivals.length, np.float64)
     tau = length / SPEED_OF_LIGHT
@@ -186,7 +192,7 @@ def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_
 
 
 def save_paths(path: Path | str, paths: RayPaths) -> None:
-    """Writes paths as an .npz file of `RayPaths.as_sionna`."""
+    """Writes paths as an .npz file with the arrays of `RayPaths.as_sionna`."""
     arrays: dict[str, Any] = paths.as_sionna()
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **arrays)
@@ -197,13 +203,17 @@ def load_paths(path: Path | str, frequency_hz: float | None = None) -> RayPaths:
     complex, or `a_real` and `a_imag`.
 
     Raises:
-        UserError: the file is missing, damaged, or holds no paths.
+        UserError: the file is missing, damaged, or does not contain paths.
     """
     return from_sionna(read_paths(path), frequency_hz)
 
 
 def read_paths(path: Path | str) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file by name, `a` as complex numbers; a missing or damaged one is a `UserError`."""
+    """Returns the arrays of an .npz file by name, with complex `a`.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
     arrays = read_arrays(Path(path), "", "check the path, or write it again")
     if "a_real" in arrays and "a_imag" in arrays:
         arrays["a"] = arrays.pop("a_real") + 1j * arrays.pop("a_imag")
@@ -211,7 +221,7 @@ def read_paths(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def array_of(paths: Any, name: str) -> np.ndarray | None:
-    """Returns an array by its name as a key or an attribute; a pair of arrays, as Sionna's `a`, is a complex one."""
+    """Returns an array by key or attribute; a pair of arrays, such as Sionna's `a`, becomes a complex one."""
     value = paths.get(name) if isinstance(paths, Mapping) else getattr(paths, name, None)
     if value is None:
         return None
@@ -221,19 +231,19 @@ def array_of(paths: Any, name: str) -> np.ndarray | None:
 
 
 def frequency_of(value: Any) -> float:
-    """Returns hertz, of several the first."""
+    """Returns a frequency in hertz, the first one of several."""
     try:
         found = float(np.reshape(value, -1)[0])
     except (ValueError, TypeError, IndexError):
         found = np.nan
     if not LOWEST_OF_PATHS_HZ <= found <= MAX_FREQUENCY_HZ:
-        raise UserError(f"the frequency of these paths is {found:g} Hz; give hertz, 28e9 for 28 GHz")
+        raise UserError(f"the frequency of these paths is {found:g} Hz; give hertz, such as 28e9 for 28 GHz")
     return found
 
 
 def _of_antennas(name: str, values: np.ndarray, antennas: tuple[int, int]) -> np.ndarray:
-    """Returns an array without axes of antennas, which stand behind receivers and transmitters; where all antennas share what
-    it holds, there are fewer of them."""
+    """Returns an array at the chosen antennas, without the axes of antennas, which follow those of receivers and transmitters.
+    These axes may be shorter if several antennas share the values."""
     before, after = (1, 0) if name == "interactions" else (1, 1) if name == "vertices" else (0, 0)
     if values.ndim == before + after + ARRAYS:
         received, sent = (number % values.shape[before + axis] for number, axis in zip(antennas, (1, 3), strict=True))
@@ -242,36 +252,36 @@ def _of_antennas(name: str, values: np.ndarray, antennas: tuple[int, int]) -> np
 
 
 def _places(paths: Any, name: str, count: int, antenna: int) -> np.ndarray:
-    """Returns positions (n, 3), of several antennas at a place the one that is chosen."""
+    """Returns positions (n, 3), that of the chosen antenna if devices have several."""
     found = array_of(paths, name)
     if found is None:
         return np.full((count, 3), np.nan)
     places = places_of(found, not isinstance(paths, Mapping), name)
     if not len(places) or len(places) % count:
-        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected ({count}, 3): a place for each of them")
+        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected ({count}, 3): one position for each")
     several = len(places) // count
     return places[antenna % several :: several]
 
 
 def places_of(found: np.ndarray, columns: bool, name: str) -> Float[np.ndarray, "n 3"]:
-    """Returns positions (n, 3); `columns` stand in objects of Sionna, (3, n), and in what was saved from them."""
+    """Returns positions (n, 3). With `columns`, a 3 x 3 array is transposed: Sionna's objects have shape (3, n)."""
     if found.dtype.kind not in "fiu":
-        raise UserError(f"{name} of these paths holds no numbers but {found.dtype}; write them again")
+        raise UserError(f"{name} of these paths is not numeric but {found.dtype}; write it again")
     places = np.asarray(found, np.float64)
     if places.ndim == 2 and (places.shape[1] != 3 or (len(places) == 3 and columns)):
         places = places.T
     if places.ndim != 2 or places.shape[1] != 3:
-        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected (n, 3): a place for each of them")
+        raise UserError(f"{name} of these paths has shape {np.shape(found)}; expected (n, 3): one position for each")
     return places
 
 
 def carrier(frequency_hz: float, tau: Float[np.ndarray, "*n"]) -> Complex[np.ndarray, "*n"]:
-    """Returns the phasors of the carrier after some delays (seconds)."""
+    """Returns the phasors of the carrier after delays (seconds)."""
     return np.exp(-2j * np.pi * np.mod(frequency_hz * tau, 1))
 
 
 def directions_of(theta: Float[np.ndarray, "*n"], phi: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
-    """Returns the unit vectors of angles (radians)."""
+    """Returns unit vectors from angles (radians)."""
     sine = np.sin(theta)
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), np.cos(theta)], -1)
 
@@ -281,7 +291,7 @@ def _angles(directions: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*
 
 
 def _vertices(interaction: Int[np.ndarray, "t k d"], points: Any) -> Float[np.ndarray, "t k d 3"]:
-    """Returns where every interaction happens: points between the ends belong to reflections and diffractions, in order."""
+    """Returns the points of interaction: those between the ends belong to reflections and diffractions, in order."""
     found = np.full((*interaction.shape, 3), np.nan)
     if points is None:
         return found
@@ -292,29 +302,34 @@ def _vertices(interaction: Int[np.ndarray, "t k d"], points: Any) -> Float[np.nd
 
 
 LONGEST_M = 1e6
-"""Of a path."""
+"""Maximum length of a path."""
 SLACK, SLACK_M = 1e-3, 0.1
-"""By which a path may be shorter than the straight line: rounding, and arrays whose elements stand beside their centre."""
+"""Relative and absolute amount by which a path may be shorter than the straight line, for rounding and off-centre elements."""
 SAME, SAME_M = 1e-4, 0.01
-"""By which the length of a path may differ from the straight line that is the line of sight."""
+"""Relative and absolute tolerance within which a path counts as the line of sight."""
 ASIDE_DEGREES, NEAREST_M = 10.0, 0.5
-"""By which the angles of lines of sight may differ from those of their ends, and how far apart these are at least."""
+"""Maximum deviation of the angles of lines of sight from those of their ends, and minimum distance between these."""
 LARGEST_GAIN = 3.0
-"""Of a path's amplitude: antennas a hand's breadth apart."""
+"""Maximum amplitude of a path, for antennas a hand's breadth apart."""
 
 
 def check_paths(paths: RayPaths, name: str) -> None:
-    """Raises a `UserError` for paths that contradict physics or their places; `name` is theirs."""
+    """Raises a `UserError` for paths that contradict physics or their positions.
+
+    Args:
+        paths: to check.
+        name: of the paths, for messages.
+    """
     valid = paths.valid
     if not valid.any():
-        raise UserError(f"{name} holds no path")
+        raise UserError(f"{name} has no valid path")
     if not np.isfinite(paths.a[valid]).all() or (gain := np.abs(paths.a[valid]).max()) > LARGEST_GAIN:
-        found = "no number" if not np.isfinite(paths.a[valid]).all() else f"{gain:.3g}"
-        raise UserError(f"{name}: a path amplifies (|a| is {found}); give amplitudes, no decibels")
+        found = "not finite" if not np.isfinite(paths.a[valid]).all() else f"{gain:.3g}"
+        raise UserError(f"{name}: a path amplifies (|a| is {found}); give amplitudes, not decibels")
     for angle in ("theta_t", "phi_t", "theta_r", "phi_r"):
         largest = np.abs(getattr(paths, angle)[valid]).max()
         if not largest <= 2 * np.pi + 1e-3:
-            raise UserError(f"{name}: {angle} is {largest:.3g}; give radians, no degrees")
+            raise UserError(f"{name}: {angle} is {largest:.3g}; give radians, not degrees")
     length = SPEED_OF_LIGHT * paths.tau
     if (longest := length[valid].max()) > LONGEST_M:
         raise UserError(f"{name}: a path is {longest:.3g} m long (tau {paths.tau[valid].max():.3g}); give delays in seconds")
@@ -323,37 +338,39 @@ def check_paths(paths: RayPaths, name: str) -> None:
     if short.any():
         r, t, k = np.argwhere(short)[0]
         raise UserError(
-            f"{name}: a path is {length[r, t, k]:.3g} m long where transmitter {t + 1} and receiver {r + 1} are "
+            f"{name}: a path is {length[r, t, k]:.3g} m long although transmitter {t + 1} and receiver {r + 1} are "
             f"{straight[r, t]:.3g} m apart; give delays in seconds from the transmitter on (Sionna: normalize_delays=False), "
-            "positions in metres, and a row of three numbers for every place"
+            "positions in metres, and a row of three numbers for every position"
         )
     _check_vertices(paths, name, length)
-    _check_sight(paths, name, length, straight[..., None])
+    _check_line_of_sight(paths, name, length, straight[..., None])
 
 
 def _check_vertices(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"]) -> None:
-    """Raises a `UserError` where most paths are of another length than the line through their vertices, or between their ends
-    where they have none."""
-    if not len(paths.interactions):  # nobody has recorded them
+    """Raises a `UserError` if most paths differ in length from the line through their vertices, or from the straight line if
+    they have none."""
+    if not len(paths.interactions):  # not recorded
         return
     here, along = np.broadcast_to(paths.sources[None, :, None], (*length.shape, 3)), np.zeros(length.shape)
     for met, there in zip(paths.interactions != NONE, paths.vertices, strict=True):
         along = along + np.where(met, np.linalg.norm(there - here, axis=-1), 0)
         here = np.where(met[..., None], there, here)
     along = along + np.linalg.norm(paths.targets[:, None, None] - here, axis=-1)
-    known = paths.valid & np.isfinite(along)
-    other = known & (np.abs(length - along) > length * SLACK + SLACK_M)
-    if other.sum() > known.sum() / 2:
+    complete = paths.valid & np.isfinite(along)
+    other = complete & (np.abs(length - along) > length * SLACK + SLACK_M)
+    if other.sum() > complete.sum() / 2:
         r, t, k = np.argwhere(other)[0]
         long, drawn = length[r, t, k], along[r, t, k]
         raise UserError(
-            f"{name}: a path from transmitter {t + 1} to receiver {r + 1} is {long:.3g} m long, and {drawn:.3g} m "
-            "through its vertices; give positions in metres, in one frame, a row of three numbers for every place"
+            f"{name}: a path from transmitter {t + 1} to receiver {r + 1} is {long:.3g} m long, but {drawn:.3g} m "
+            "through its vertices; give positions in metres, in one frame, with a row of three numbers for every position"
         )
 
 
-def _check_sight(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]) -> None:
-    """Raises a `UserError` where lines of sight come from elsewhere than the other end."""
+def _check_line_of_sight(
+    paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]
+) -> None:
+    """Raises a `UserError` if lines of sight do not arrive from the other end."""
     sight = paths.valid & (np.abs(length - straight) <= straight * SAME + SAME_M) & (straight > NEAREST_M)
     if not sight.any():
         return
@@ -363,6 +380,6 @@ def _check_sight(paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"],
         cosine = np.sum(found * sign * towards, -1)[sight]
         if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > ASIDE_DEGREES:
             raise UserError(
-                f"{name}: theta_{end}, phi_{end} of lines of sight point {aside:.0f} degrees beside the other end; give angles "
+                f"{name}: theta_{end}, phi_{end} of lines of sight deviate {aside:.0f} degrees from the other end; give angles "
                 "in the frame of the positions, theta from +z, phi from +x, outwards at both ends"
             )

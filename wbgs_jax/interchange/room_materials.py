@@ -1,9 +1,8 @@
-"""Which object of a room is of which material: by its name in a .toml, by a pattern there, or as the room's file records it.
+"""Assignment of materials to the objects of a room: by name or pattern in a .toml file, or as recorded in the room's own file.
 
-The building materials a scene may be made of: where they are defined and how thick a builder makes them.
-
-They are those of ITU-R P.2040 that Sionna RT knows, and materials of a user's own (`own_material`). Sionna tells only in the
-middle of a run that a material ends below the frequency asked for (brick at 40 GHz, say); the checks here tell before it.
+Building materials are those of ITU-R P.2040 that Sionna RT supports, each with the band in which it is defined and its usual
+thickness, and custom materials (`own_material`). Sionna reports only in the middle of a run that a material is not defined at a
+frequency (such as brick at 40 GHz); the checks here do so beforehand.
 """
 
 import fnmatch
@@ -22,13 +21,13 @@ VALID_HZ = (1e9, 100e9)
 
 
 class Material(NamedTuple):
-    """What this project knows about a material of ITU-R P.2040; the electrical constants are the simulator's."""
+    """Usual thickness and band of a material of ITU-R P.2040; its electrical constants are the simulator's."""
 
     thickness: float
-    """Usual thickness of a slab in metres."""
+    """Usual thickness of a slab, metres."""
     low_ghz: float
     high_ghz: float
-    """Ends of the band, both included. There are more bands above 100 GHz, where no scene is."""
+    """Ends of the band (GHz), both included. Bands above 100 GHz, where there are no scenes, are not listed."""
 
 
 ITU = {
@@ -41,7 +40,7 @@ ITU = {
     "ceiling_board": Material(0.02, 1, 100),
     "chipboard": Material(0.02, 1, 100),
     "plywood": Material(0.018, 1, 40),
-    "marble": Material(0.02, 1, 59.999),  # in the simulator's single precision, 60 GHz is just beyond its end
+    "marble": Material(0.02, 1, 59.999),  # in the simulator's single precision, 60 GHz lies just outside the band
     "floorboard": Material(0.02, 50, 100),
     "vinyl_tile": Material(0.003, 1, 40),
     "carpet_tile": Material(0.006, 1, 40),
@@ -51,18 +50,18 @@ ITU = {
     "medium_dry_ground": Material(0.50, 1, 10),
     "wet_ground": Material(0.50, 1, 10),
 }
-"""By name all but vacuum, of which nothing is built."""
+"""Materials by name, except vacuum."""
 
 THICKNESS = {
     name: material.thickness
     for name, material in ITU.items()
     if material.low_ghz * 1e9 <= VALID_HZ[0] and material.high_ghz * 1e9 >= VALID_HZ[1]
 }
-"""Default slab thickness (metres) of the materials that are defined over all of `VALID_HZ`: those of the released scenes."""
+"""Default slab thickness (metres) of the materials defined over all of `VALID_HZ`, which are those of the released scenes."""
 
 
 class Law(NamedTuple):
-    """Relative permittivity a f^b and conductivity c f^d (S/m), with f in GHz, as in ITU-R P.2040."""
+    """Frequency dependence as in ITU-R P.2040: relative permittivity a f^b and conductivity c f^d (S/m), with f in GHz."""
 
     a: float
     b: float
@@ -76,13 +75,13 @@ _OWN = re.compile(rf"[\w-]+\(({_NUMBER}), ({_NUMBER}), ({_NUMBER}), ({_NUMBER})\
 
 
 def own_material(name: str, law: Law) -> str:
-    """Returns the name under which a part of a material of a user's own carries its law, as in `clay(3.9, 0, 0.024, 0.16)`.
+    """Returns the name of a custom material with its law in it, as in `clay(3.9, 0, 0.024, 0.16)`.
 
     Raises:
-        UserError: the name is taken or has odd characters, or no passive medium follows the law from 1 to 100 GHz.
+        UserError: the name is taken or has invalid characters, or the law is not that of a passive medium from 1 to 100 GHz.
     """
     if name in ITU or not re.fullmatch(r"[\w-]+", name):
-        raise UserError(f"material {name!r} needs another name: letters, digits, _ and -, and none of ITU-R P.2040")
+        raise UserError(f"material {name!r} needs another name: letters, digits, _ and -, and not one of ITU-R P.2040")
     gentle = math.isfinite(law.a) and math.isfinite(law.c) and max(abs(law.b), abs(law.d)) <= MAX_EXPONENT
     if not gentle or law.c < 0 or min(law.a * ghz**law.b for ghz in (1.0, 100.0)) < 1:
         raise UserError(f"material {name!r} needs a relative permittivity of 1 or more and a conductivity of 0 S/m or more")
@@ -90,20 +89,28 @@ def own_material(name: str, law: Law) -> str:
 
 
 def own_law(material: str) -> Law | None:
-    """Returns the law in the name of a part's material; None for one of ITU-R P.2040, whose law the simulator knows."""
+    """Returns the law in the name of a custom material; None for one of ITU-R P.2040, whose law the simulator has."""
     found = _OWN.fullmatch(material)
     return Law(*map(float, found.groups())) if found else None
 
 
 def check_material(name: str) -> str:
-    """Returns `name`, or raises a `UserError` that lists the materials there are over all of `VALID_HZ`."""
+    """Returns `name`.
+
+    Raises:
+        UserError: it is not defined over all of `VALID_HZ`; the message lists the materials that are.
+    """
     if name not in THICKNESS:
-        raise UserError(f"unknown material {name!r}; choose among {', '.join(sorted(THICKNESS))}")
+        raise UserError(f"unknown material {name!r}; choose one of {', '.join(sorted(THICKNESS))}")
     return name
 
 
 def check_frequency(frequency_hz: float) -> float:
-    """Returns `frequency_hz`, or raises a `UserError` when the materials are not defined there."""
+    """Returns `frequency_hz`.
+
+    Raises:
+        UserError: materials are not defined there.
+    """
     low, high = VALID_HZ
     if not low <= frequency_hz <= high:
         band = f"{low / 1e9:g}-{high / 1e9:g} GHz"
@@ -112,7 +119,7 @@ def check_frequency(frequency_hz: float) -> float:
 
 
 def check_material_frequencies(materials: Iterable[str], frequencies_hz: Iterable[float]) -> None:
-    """Raises a `UserError` when a material (one of `ITU` or of a user's own) is not defined at one of the frequencies."""
+    """Raises a `UserError` if a material (one of `ITU` or a custom one) is not defined at one of the frequencies."""
     frequencies = [check_frequency(frequency) for frequency in frequencies_hz]
     for name in sorted(name for name in set(materials) if own_law(name) is None):
         _, low, high = ITU[name]
@@ -126,29 +133,29 @@ def check_material_frequencies(materials: Iterable[str], frequencies_hz: Iterabl
 
 
 MAX_THICKNESS = 2.0
-"""Metres: a thicker slab is one given in millimetres."""
+"""Metres: a larger thickness was probably given in millimetres."""
 HELP = "see docs/own_scene.md"
 
 
 class Slab(NamedTuple):
-    """A material by name and its thickness in metres; the name of an own material carries its law (`own_material`)."""
+    """Name of a material and thickness in metres; the name of a custom material contains its law (`own_material`)."""
 
     material: str
     thickness: float
     given: bool = False
-    """Whether the thickness is given for the object itself, rather than for its material."""
+    """Whether the thickness was specified for the object itself rather than for its material."""
 
 
 def slabs_of(file: Path, objects: Sequence[FileObject], materials: Path | None) -> list[Slab]:
     """Returns the slab of every object.
 
     Args:
-        file: that the objects are from, for messages.
+        file: file of the objects, for messages.
         objects: of a room (`read_objects`).
-        materials: the .toml (docs/own_scene.md); None only where the room's file itself records all materials.
+        materials: the .toml file (docs/own_scene.md); may be None if the room's own file records all materials.
 
     Raises:
-        UserError: the .toml cannot be read or holds something else, it names an object that is not there, or an object has no
+        UserError: the .toml file cannot be read or is invalid, it names an object that does not exist, or an object has no
             material.
     """
     tables = _read_toml(materials) if materials is not None else {}
@@ -157,7 +164,7 @@ def slabs_of(file: Path, objects: Sequence[FileObject], materials: Path | None) 
     names = [o.name for o in objects]
     for pattern in chosen:
         if pattern not in names and not fnmatch.filter(names, pattern):
-            raise UserError(f"{materials}: {pattern!r} is no object of {file}; there are {listed(names)}")
+            raise UserError(f"{materials}: {pattern!r} is not an object of {file}; its objects are {listed(names)}")
     found = [_choose(o, chosen, f"{file}: {o.name!r}") for o in objects]
     without = [o.name for o, slab in zip(objects, found, strict=True) if slab is None]
     if without:
@@ -167,7 +174,7 @@ def slabs_of(file: Path, objects: Sequence[FileObject], materials: Path | None) 
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:
-    """Returns names as text for people, the first of very many."""
+    """Returns names as text, at most the first `most` of them."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(repr(name) for name in names[:most]) + more
 
@@ -195,33 +202,35 @@ def _read_toml(file: Path) -> dict[str, dict[str, Any]]:
     except ValueError as error:  # TOMLDecodeError, UnicodeDecodeError
         raise UserError(f"{file} is not valid TOML: {error}") from error
     if not set(tables) <= {"objects", "materials"} or not all(isinstance(table, dict) for table in tables.values()):
-        raise UserError(f"{file} may hold the tables [objects] and [materials.<name>] and nothing else; {HELP}")
+        raise UserError(f"{file} may contain only the tables [objects] and [materials.<name>]; {HELP}")
     return tables
 
 
 def _own_slab(name: str, table: Any, where: str) -> Slab:
-    """Returns a user's own material.
+    """Returns a custom material.
 
     Its relative permittivity and conductivity (S/m) are each a number, or [a, b] for a f^b with f in GHz.
     """
     keys = ("relative_permittivity", "conductivity", "thickness")
     if not isinstance(table, dict) or set(table) != set(keys):
-        raise UserError(f"{where}: [materials.{name}] needs {', '.join(keys)} and nothing else; {HELP}")
+        raise UserError(f"{where}: [materials.{name}] needs exactly {', '.join(keys)}; {HELP}")
     laws = [table[key] if isinstance(table[key], list) else [table[key], 0] for key in keys[:2]]
     if not all(len(law) == 2 and all(isinstance(value, int | float) for value in law) for law in laws):
-        raise UserError(f"{where}: [materials.{name}] is described by numbers, or [a, b] for a f^b with f in GHz")
+        raise UserError(f"{where}: [materials.{name}] needs numbers, or [a, b] for a f^b with f in GHz")
     return Slab(own_material(name, Law(*laws[0], *laws[1])), _thickness(table["thickness"], f"{where}: {name!r}"))
 
 
 def _slab(value: Any, own: dict[str, Slab], where: str) -> Slab:
-    """Returns the slab that `"name"` or `{material = "name", thickness = metres}` stands for."""
+    """Returns the slab described by `"name"` or `{material = "name", thickness = metres}`."""
     table = {"material": value} if isinstance(value, str) else value
     if not isinstance(table, dict) or not isinstance(table.get("material"), str) or not set(table) <= {"material", "thickness"}:
-        raise UserError(f'{where} needs "material" or {{material = "...", thickness = metres}}; quote names that have a dot')
+        raise UserError(f'{where} needs "material" or {{material = "...", thickness = metres}}; quote names with a dot')
     name = table["material"]
     if name not in own and name not in ITU:
-        known = ", ".join(sorted({*own, *THICKNESS}))
-        raise UserError(f"{where} is of unknown material {name!r}; choose among {known} (more in {HELP.removeprefix('see ')})")
+        choices = ", ".join(sorted({*own, *THICKNESS}))
+        raise UserError(
+            f"{where} has the unknown material {name!r}; choose one of {choices} (more in {HELP.removeprefix('see ')})"
+        )
     slab = own.get(name) or Slab(name, ITU[name].thickness)
     return Slab(slab.material, _thickness(table.get("thickness", slab.thickness), where), "thickness" in table)
 

@@ -1,4 +1,4 @@
-"""A room as a user's own file has it: its objects, what they are made of, and walls with two faces as one sheet."""
+"""Rooms from users' own files: objects with materials, with two-faced walls converted to single sheets."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,18 +14,19 @@ from wbgs_jax.mesh.importers import FileObject, read_objects
 from wbgs_jax.mesh.walls import walls_as_sheets
 
 EXTENT = (0.5, 200.0)
-"""Metres: the largest side of a scene is in between, or its unit is not the metre, unless somebody gives it, ..."""
+"""Metres: range of the largest side of a scene; outside it the unit is probably not the metre, unless the scale is given,
+..."""
 GIVEN_EXTENT = (0.01, 20_000.0)
-"""... and then in between these. A scene.xml of Sionna RT is always in metres."""
+"""... in which case this range applies. A scene.xml of Sionna RT is always in metres."""
 USUAL = 10.0
-"""Metres: the usual size of a room, to guess a unit from."""
+"""Metres: typical size of a room, used to guess a unit."""
 MAX_TRIANGLES = 2_000_000
 MANY_TRIANGLES = 20_000
-"""From so many on, paths take long to find, and furniture in such detail changes none."""
+"""Number of triangles from which finding paths takes long; furniture in such detail does not change the paths."""
 SHOWN = 40
-"""Objects that are described."""
+"""Maximum number of objects that are listed."""
 UNKNOWN = 0.0
-"""Thickness that a room file gives what nobody has measured."""
+"""Thickness in a room file that marks an unmeasured one."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class RoomObject:
     mesh: trimesh.Trimesh
     slab: Slab
     wall: float = 0.0
-    """Metres between the two faces of the closed box that the sheet was; 0 for all else."""
+    """Distance between the two faces of the closed box that a sheet replaces, metres; 0 for all other objects."""
 
 
 def read_room(
@@ -44,16 +45,16 @@ def read_room(
 ) -> list[RoomObject]:
     """Returns the objects of a room in order of their names.
 
-    Closed boxes that are walls become sheets of the box's thickness, unless the materials give another for the object. Shapes
-    of a scene.xml stay as they are: the simulator that wrote it counts every face.
+    Closed boxes that are walls become sheets with the box's thickness, unless the materials give another one for the object.
+    Shapes of a scene.xml are unchanged, because the simulator that wrote it counts every face.
 
     Args:
         file: .glb, .gltf, .obj, .ply or .xml.
-        materials: a .toml (docs/own_scene.md).
-        up: "y" or "z": the axis of the file that points up, where it is not the usual one.
-        scale: metres in one unit of the file; without it the unit is the metre, and sizes that make one doubt it are refused.
-        named: whether all objects must have a material; otherwise, without `materials`, each is of its own, of unknown
-            thickness.
+        materials: a .toml file (docs/own_scene.md).
+        up: "y" or "z", the axis of the file that points up, if not the usual one.
+        scale: metres per unit of the file; by default the unit is the metre, and implausible sizes are rejected.
+        named: whether all objects must have a material; otherwise, without `materials`, each has a material of its own, of
+            unknown thickness.
 
     Raises:
         UserError: the file or the materials cannot be read, or the size is not that of a room.
@@ -72,7 +73,7 @@ def read_room(
 
 
 def room_of(objects: Sequence[RoomObject]) -> Room:
-    """Returns what a room file holds of some objects."""
+    """Returns the room file representation of objects."""
     starts = np.cumsum([0, *(len(one.mesh.vertices) for one in objects)])
     faces = [np.asarray(one.mesh.faces) + start for one, start in zip(objects, starts, strict=False)]
     return Room(
@@ -84,13 +85,18 @@ def room_of(objects: Sequence[RoomObject]) -> Room:
 
 
 def open_room(path: Path) -> Room:
-    """Returns the room of a room file or a scene file (.npz), or of a model in metres whose materials are not known."""
+    """Returns the room of a room file or a scene file (.npz), or of a model in metres with unknown materials."""
     return load_room(path) if path.suffix.lower() == ".npz" else room_of(read_room(path, named=False))
 
 
 def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
-    """Returns how objects were understood, a line each, of many those with most triangles: name, material, thickness, of which
-    sort it is (one for each object), number of triangles; and what walls were taken from closed boxes."""
+    """Returns a description of objects, one line each, of at most those with the most triangles: name, material, thickness,
+    sort, number of triangles; it also reports which walls were converted from closed boxes.
+
+    Args:
+        objects: of the room.
+        sorts: sort of each object, such as a body or a sheet.
+    """
     largest = sorted(np.argsort([-len(one.mesh.faces) for one in objects], kind="stable")[:SHOWN])
     rows = [_row(objects[i], sorts[i]) for i in largest]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -107,8 +113,8 @@ def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
 
 
 def _row(one: RoomObject, sort: str) -> tuple[str, ...]:
-    sort = f"sheet, of a closed box {one.wall:.2g} m deep" if one.wall else sort
-    thickness = f"{one.slab.thickness:g} m" if one.slab.thickness else "of unknown thickness"
+    sort = f"sheet from a closed box {one.wall:.2g} m deep" if one.wall else sort
+    thickness = f"{one.slab.thickness:g} m" if one.slab.thickness else "unknown thickness"
     return one.name, one.slab.material, thickness, sort, f"{len(one.mesh.faces)} triangles"
 
 
@@ -125,7 +131,7 @@ def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, 
         factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / USUAL)))
         sides = " x ".join(f"{side:.4g}" for side in size)
         raise UserError(
-            f"{file} measures {sides} m; give the metres in its unit, perhaps --scale {factor:g}, or --scale 1 if that is right"
+            f"{file} measures {sides} m; give its unit in metres, perhaps --scale {factor:g}, or --scale 1 if this is right"
         )
     total = sum(len(o.mesh.faces) for o in objects)
     if total > MAX_TRIANGLES:

@@ -1,4 +1,4 @@
-"""Paths of other programs, and measured snapshots, as a scene file that a field can be trained on."""
+"""Converts paths of other programs, and measured snapshots, to scene files on which a field can be trained."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
 
 TEST_SHARE = 0.2
 FEWEST = 5
-"""Transmitters."""
+"""Minimum number of transmitters."""
 
 
 def scene_of_paths(
@@ -25,13 +25,13 @@ def scene_of_paths(
     seed: int = 0,
     room: Room | None = None,
 ) -> SceneFile:
-    """Returns a scene of paths between the same places at one frequency or several: snapshots of an array at every receiver,
-    whose local frame is the world's. A fifth of the transmitters is for the test.
+    """Returns a scene from paths between the same positions at one or more frequencies: snapshots of an array at every
+    receiver, with the world's axes as its local frame. A fifth of the transmitters is used for testing.
 
-    Waves are plane over the array, and elements are alike: what `a` of the paths says already holds the antennas.
+    Waves are plane over the array, and its elements are identical: the coefficients `a` already contain the antennas.
 
     Args:
-        paths: of each frequency.
+        paths: one entry per frequency.
         element_positions: of the receivers' arrays, wavelengths.
         name: of the scene.
         vertices: of the scene's surfaces, metres; none by default.
@@ -40,19 +40,21 @@ def scene_of_paths(
         room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
 
     Raises:
-        UserError: places are not known or differ, or there are too few transmitters.
+        UserError: positions are unknown or differ, or there are too few transmitters.
     """
     first, count = paths[0], len(paths[0].sources)
     places = np.concatenate([first.sources, first.targets])
     if not np.isfinite(places).all():
-        raise UserError(f"the paths of {name} do not say where transmitters and receivers are; give sources and targets")
+        raise UserError(
+            f"the paths of {name} do not record the positions of transmitters and receivers; give sources and targets"
+        )
     if any(not np.allclose(p.sources, first.sources) or not np.allclose(p.targets, first.targets) for p in paths):
         raise UserError(
             f"the paths of {name} at different frequencies have different ends; give the same ones in the same order"
         )
     if count < FEWEST:
         raise UserError(
-            f"{name} has {count} transmitters, and a training needs {FEWEST}; swap the ends if it has many receivers"
+            f"{name} has {count} transmitters, but training needs {FEWEST}; exchange the ends if it has many receivers"
         )
     order = np.argsort([p.frequency_hz for p in paths])
     snapshots = np.stack([snapshots_of(paths[i], element_positions) for i in order], 2)
@@ -76,16 +78,16 @@ def scene_of_snapshots(
     seed: int = 0,
     room: Room | None = None,
 ) -> SceneFile:
-    """Returns a scene of measured array snapshots, to be written with `save_scene`. A fifth of the transmitters is for the
-    test.
+    """Returns a scene from measured array snapshots, to be written with `save_scene`. A fifth of the transmitters is used for
+    testing.
 
     Args:
-        snapshots: complex voltages of the elements; phases count between the elements of one snapshot, and powers between
-            snapshots. They need not be relative to what was transmitted: a common gain is learned.
+        snapshots: complex voltages of the elements. Only phases between the elements of one snapshot and relative powers
+            between snapshots matter. A common gain is learned, so they need not be relative to the transmitted power.
         tx_positions: world frame, metres.
         frequencies_hz: hertz, ascending.
         rx_position: world frame, metres.
-        rx_orientation: quaternions (wxyz) from the arrays' frame to the world's; 1 0 0 0 looks along +x.
+        rx_orientation: quaternions (wxyz) from the arrays' frame to the world's; 1 0 0 0 faces +x.
         element_positions: of the receivers' arrays, wavelengths, in their own frame (`planar_array`).
         name: of the scene.
         vertices: of the scene's surfaces, metres; none by default.
@@ -94,7 +96,7 @@ def scene_of_snapshots(
         room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
 
     Raises:
-        UserError: there are too few transmitters, or the shapes do not agree.
+        UserError: there are too few transmitters, or the shapes do not match.
     """
     count, receivers = len(tx_positions), len(rx_position)
     wanted = count, receivers, len(frequencies_hz), len(element_positions)
@@ -103,9 +105,9 @@ def scene_of_snapshots(
             f"the snapshots of {name} have shape {np.shape(snapshots)}; by transmitter, receiver, frequency and element it "
             f"must be {wanted}"
         )
-    transmitter = group_transmitters(tx_positions)  # what is measured twice at one place
+    transmitter = group_transmitters(tx_positions)  # repeated measurements at one position count once
     if (places := len(np.unique(transmitter))) < FEWEST:
-        raise UserError(f"{name} has {places} transmitters, and a training needs {FEWEST}")
+        raise UserError(f"{name} has {places} transmitters, but training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
     split[tx_disjoint_split(transmitter, TEST_SHARE, seed)[1]] = TEST
     surfaces = room or _one_surface(vertices, faces)
@@ -126,7 +128,7 @@ def scene_of_snapshots(
 
 
 def _one_surface(vertices: np.ndarray | None, faces: np.ndarray | None) -> Room:
-    """Returns surfaces of which nothing else is known; none where there are no triangles."""
+    """Returns surfaces without further information; empty if there are no triangles."""
     if vertices is None or faces is None:
         return Room(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32))
     part = {"name": "surface", "material": "unknown", "thickness": 0}
@@ -134,7 +136,8 @@ def _one_surface(vertices: np.ndarray | None, faces: np.ndarray | None) -> Room:
 
 
 def snapshots_of(paths: RayPaths, element_positions: Float[np.ndarray, "elements 3"]) -> Complex[np.ndarray, "t r elements"]:
-    """Returns the voltages of the elements of every receiver's array (wavelengths, world frame), carrier phase included."""
+    """Returns the voltages of the elements of every receiver's array (wavelengths, world frame), including the carrier
+    phase."""
     voltage = np.where(paths.valid, paths.a * carrier(paths.frequency_hz, paths.tau), 0)
     direction = directions_of(paths.theta_r, paths.phi_r)
     steering = np.exp(2j * np.pi * np.nan_to_num(direction) @ np.asarray(element_positions).T)

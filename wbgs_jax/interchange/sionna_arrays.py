@@ -1,8 +1,8 @@
-"""Snapshots of the antenna arrays in paths of Sionna RT (`sionna.rt.Paths`), by Sionna's own coefficients.
+"""Array snapshots from paths of Sionna RT (`sionna.rt.Paths`), computed from Sionna's own coefficients.
 
 `a` has axes receivers, their antennas, transmitters, their antennas, paths. With a synthetic array all antennas of a device
-share its paths, and the coefficients hold the phases of their places; without, each antenna has paths of its own. Antennas of
-two polarisations come one polarisation after the other.
+share its paths, and the coefficients contain the phases of the antenna positions; otherwise each antenna has paths of its own.
+Antennas of two polarisations are ordered by polarisation.
 """
 
 from collections.abc import Mapping
@@ -30,21 +30,22 @@ from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 
 DEFAULT = 4, 4
-"""Rows and columns."""
+"""Rows and columns of the default array."""
 FITS = 0.995
-"""Correlation of a path's coefficients with the steering vector of an array."""
+"""Minimum correlation of a path's coefficients with the steering vector of an array."""
 WRAPPED = 0.95
-"""Share of half a turn between neighbours beyond which it may be on the other side."""
+"""Direction cosine between neighbours (phase in half turns) beyond which the phase may have wrapped."""
 OFF_WAVELENGTHS = 0.02
-"""By which the places of antennas may differ from those of a planar array."""
+"""Maximum distance of antenna positions from those of a planar array, wavelengths."""
 SPAN = 1e-3
-"""Of the directions of paths: below it they lie in a plane, and show two axes of an array at most."""
+"""Smallest singular value of the directions of paths; below it they lie in a plane and determine at most two axes of an
+array."""
 
 Shape = tuple[int, int]
 
 
 class _Device(NamedTuple):
-    """Place (metres), orientation (quaternion wxyz) and elements (wavelengths, local frame) of a receiver."""
+    """Position (metres), orientation (quaternion wxyz) and elements (wavelengths, local frame) of a receiver."""
 
     place: Float[np.ndarray, "3"]
     orientation: Float[np.ndarray, "4"]
@@ -62,28 +63,28 @@ def scene_of_sionna(
     room: Room | None = None,
     source: str = "",
 ) -> SceneFile:
-    """Returns the snapshots that the receivers' arrays take of every transmitter, as a scene to train on.
+    """Returns the snapshots of the receivers' arrays for every transmitter, as a scene to train on.
 
-    Of receivers with a single antenna, plane waves over an array of `shape` are taken instead.
+    For receivers with a single antenna, plane waves over an array of `shape` are used instead.
 
     Args:
         paths: a `sionna.rt.Paths` object, or a mapping with its arrays.
         name: of the scene.
-        frequency_hz: of the carrier, where the paths do not record it.
-        shape: rows and columns of the receivers' arrays, half a wavelength apart; by default as the paths have them, else 4x4.
-        port: of antennas with two polarisations: 1 or 2.
-        tx_antenna: of transmitters with several antennas: 1, 2, ...
-        swap: whether to train for the transmitters' side.
+        frequency_hz: of the carrier, if the paths do not record it.
+        shape: rows and columns of the receivers' arrays, half a wavelength apart; by default that of the paths, or else 4x4.
+        port: for antennas with two polarisations: 1 or 2.
+        tx_antenna: for transmitters with several antennas: 1, 2, ...
+        swap: whether to exchange transmitters and receivers.
         room: the scene's surfaces (`load_room`).
-        source: what errors call the paths; by default the name of the scene.
+        source: name of the paths in error messages; by default the name of the scene.
 
     Raises:
-        UserError: something is missing or contradictory, or several antennas leave a choice.
+        UserError: something is missing or contradictory, or several antennas require a choice.
     """
     what = source or name
     arrays = {key: found for key in OF_PATHS if (found := array_of(paths, key)) is not None}
     if "a" in arrays and arrays["a"].ndim > ARRAYS:
-        raise UserError(f"a of {what} has {arrays['a'].ndim} axes, time among them; give `paths.a`, one moment alone")
+        raise UserError(f"a of {what} has {arrays['a'].ndim} axes, including time; give `paths.a` for a single instant")
     check_arrays(arrays, f"the paths of {what}")
     for end in ("sources", "targets"):
         if (found := array_of(paths, end)) is not None:
@@ -91,26 +92,26 @@ def scene_of_sionna(
     if (found := array_of(paths, "frequency_hz")) is not None:
         arrays["frequency_hz"] = found
     elif frequency_hz is None:
-        raise UserError(f"{what} does not record its frequency; give --ghz, that of the scene that it was traced in")
+        raise UserError(f"{what} does not record its frequency; give --ghz, the frequency of the scene that it was traced in")
     arrays = _swapped(arrays) if swap else arrays
     if arrays["a"].ndim < ARRAYS:
         single = from_sionna(arrays, frequency_hz)
         check_paths(single, what)
         return scene_of_paths([single], planar_array(*(shape or DEFAULT)), name, room=room)
-    sent = _chosen(arrays["a"].shape[3], tx_antenna, f"the transmitters of {what} have", "--tx-antenna")
+    tx_index = _chosen(arrays["a"].shape[3], tx_antenna, f"the transmitters of {what} have", "--tx-antenna")
     chosen, shape = _elements(arrays["a"], shape, port, what)
-    first = from_sionna(arrays, frequency_hz, antennas=(int(chosen[0]), sent))
+    first = from_sionna(arrays, frequency_hz, antennas=(int(chosen[0]), tx_index))
     check_paths(first, what)
     if len(chosen) == 1:
         return scene_of_paths([first], planar_array(*(shape or DEFAULT)), name, room=room)
-    a, tau, direction = _of_antennas(arrays, chosen, sent)
+    a, tau, direction = _of_antennas(arrays, chosen, tx_index)
     valid = np.isfinite(a) & (tau >= 0)
     snapshots = np.where(valid, a * carrier(first.frequency_hz, tau), 0).sum(-1)  # receiver, antenna, transmitter
     if arrays["tau"].ndim == ARRAYS:
         places = np.asarray(arrays.get("targets", np.full((a.shape[0], 3), np.nan)), np.float64)
         devices = _by_places(places, a.shape[:2], shape, SPEED_OF_LIGHT / first.frequency_hz, what)
     else:
-        assert shape is not None, "chosen"
+        assert shape is not None, "_elements returns a shape for synthetic arrays"
         devices = [
             _Device(place, _orientation(own, towards, shape, what), planar_array(*shape))
             for place, own, towards in zip(first.targets, a, direction, strict=True)
@@ -128,65 +129,67 @@ def scene_of_sionna(
 
 
 def _chosen(count: int, wanted: int | None, what: str, option: str) -> int:
-    """Returns the place of one of several antennas."""
+    """Returns the index of one of several antennas."""
     if wanted is None and count > 1:
         raise UserError(f"{what} {count} antennas; choose one: {option} 1 to {count}")
     if wanted is not None and not 1 <= wanted <= count:
-        raise UserError(f"{what} {count} antennas; {option} {wanted} is none of them")
+        raise UserError(f"{what} {count} antennas; {option} {wanted} is out of range")
     return 0 if wanted is None else wanted - 1
 
 
 def _elements(
     a: Complex[np.ndarray, "r e t s k"], shape: Shape | None, port: int | None, name: str
 ) -> tuple[Any, Shape | None]:
-    """Returns which antennas of a receiver are its array, and the array's rows and columns where they are known."""
-    count, known = a.shape[1], shape
+    """Returns the indices of a receiver's antennas that form its array, and the array's rows and columns if known."""
+    count, form = a.shape[1], shape
     if shape is None and count in (1, 2, 16, 32):
-        known = DEFAULT
-    size = 0 if known is None else known[0] * known[1]
+        form = DEFAULT
+    size = 0 if form is None else form[0] * form[1]
     ports, elements = {size: (1, size), 2 * size: (2, size), 1: (1, 1), 2: (2, 1)}.get(count, (0, 0))
     if not ports and (shape is not None or (count % 2 == 0 and port is not None)):
         raise UserError(
             f"the receivers of {name} have {count} antennas; --array {shape} does not fit: give its rows and columns"
         )
-    if not ports:  # an array of any form
+    if not ports:  # an array of any geometry
         return np.arange(count), None
     if ports == 1:
-        return np.arange(elements), known
+        return np.arange(elements), form
     power = [f"{10 * np.log10(np.mean(np.abs(half) ** 2) + 1e-30):.0f} dB" for half in np.split(a, 2, 1)]
     if port not in (1, 2):
         raise UserError(
             f"the receivers of {name} have {count} antennas: two polarisations of {elements} (mean power of a path "
-            f"{power[0]} and {power[1]}); choose --port 1 or --port 2, or give the form of the array, --array ROWSxCOLUMNS"
+            f"{power[0]} and {power[1]}); choose --port 1 or --port 2, or give the shape of the array, --array ROWSxCOLUMNS"
         )
-    return np.arange(elements) + (port - 1) * elements, known
+    return np.arange(elements) + (port - 1) * elements, form
 
 
-def _of_antennas(arrays: dict[str, np.ndarray], chosen: Any, sent: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns coefficients and delays (receiver, antenna, transmitter, path), and the directions (receiver, transmitter, path,
-    3) from which waves come, where all antennas of a device share them."""
-    a = np.asarray(arrays["a"][:, :, :, sent][:, chosen], np.complex128)
+def _of_antennas(arrays: dict[str, np.ndarray], chosen: Any, tx_index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns coefficients and delays (receiver, antenna, transmitter, path), and the directions of arrival (receiver,
+    transmitter, path, 3) if all antennas of a device share them."""
+    a = np.asarray(arrays["a"][:, :, :, tx_index][:, chosen], np.complex128)
     if arrays["tau"].ndim < ARRAYS:
         valid = np.asarray(arrays.get("valid", arrays["tau"] >= 0), bool)
         tau = np.where(valid, np.asarray(arrays["tau"], np.float64), -1)[:, None]
         angles = (np.asarray(arrays[angle], np.float64) for angle in ("theta_r", "phi_r"))
         return a, np.broadcast_to(tau, a.shape), directions_of(*angles)
     own = np.asarray(chosen) % arrays["tau"].shape[1]  # polarisations may share their delays
-    tau = np.asarray(arrays["tau"], np.float64)[:, :, :, min(sent, arrays["tau"].shape[3] - 1)][:, own]
+    tau = np.asarray(arrays["tau"], np.float64)[:, :, :, min(tx_index, arrays["tau"].shape[3] - 1)][:, own]
     if "valid" in arrays:
-        tau = np.where(np.asarray(arrays["valid"], bool)[:, :, :, min(sent, arrays["valid"].shape[3] - 1)][:, own], tau, -1)
+        tau = np.where(np.asarray(arrays["valid"], bool)[:, :, :, min(tx_index, arrays["valid"].shape[3] - 1)][:, own], tau, -1)
     return a, tau, np.zeros((len(a), 0, 0, 3))
 
 
 def _by_places(
     places: Float[np.ndarray, "n 3"], count: tuple[int, int], shape: Shape | None, wavelength: float, name: str
 ) -> list[_Device]:
-    """Returns receivers from the places of their antennas."""
+    """Returns receivers computed from the positions of their antennas."""
     receivers, antennas = count
     if len(places) % receivers or len(places) // receivers not in (antennas, 2 * antennas):
-        raise UserError(f"{name} has {len(places)} targets for {receivers} receivers of {antennas} antennas; give all places")
+        raise UserError(
+            f"{name} has {len(places)} targets for {receivers} receivers of {antennas} antennas; give all positions"
+        )
     if not np.isfinite(places).all():
-        raise UserError(f"{name} does not record where its antennas are; give targets")
+        raise UserError(f"{name} does not record the positions of its antennas; give targets")
     own = places.reshape(receivers, -1, 3)[:, :antennas]
     centres = own.mean(1)
     offsets = (own - centres[:, None]) / wavelength
@@ -197,7 +200,7 @@ def _by_places(
         if worst < OFF_WAVELENGTHS:
             return [_Device(place, _quaternion(turn), regular) for place, turn in zip(centres, turns, strict=True)]
     if np.abs(offsets - offsets[0]).max() > OFF_WAVELENGTHS:
-        raise UserError(f"the receivers of {name} have arrays of different forms or orientations; give --array ROWSxCOLUMNS")
+        raise UserError(f"the receivers of {name} have arrays of different shapes or orientations; give --array ROWSxCOLUMNS")
     level = np.array([1.0, 0, 0, 0])
     return [_Device(place, level, offsets[0]) for place in centres]
 
@@ -205,11 +208,11 @@ def _by_places(
 def _orientation(
     a: Complex[np.ndarray, "e t k"], direction: Float[np.ndarray, "t k 3"], shape: Shape, name: str
 ) -> Float[np.ndarray, "4"]:
-    """Returns the orientation (wxyz) of a planar array, from the phases between neighbours: half a wavelength apart, they are
-    the direction's cosines."""
+    """Returns the orientation (wxyz) of a planar array, computed from the phases between neighbours: at half a wavelength,
+    these are the direction cosines."""
     rows, columns = shape
-    heard = np.isfinite(a).all(0) & (np.abs(a) > 0).all(0)
-    own, towards = a[:, heard].reshape(columns, rows, -1), direction[heard]
+    received = np.isfinite(a).all(0) & (np.abs(a) > 0).all(0)
+    own, towards = a[:, received].reshape(columns, rows, -1), direction[received]
     measured = []
     for axis, neighbours, sign in ((1, own[1:] * own[:-1].conj(), 1.0), (2, own[:, 1:] * own[:, :-1].conj(), -1.0)):
         if neighbours.size:
@@ -219,8 +222,8 @@ def _orientation(
     fits = [_fit(own.reshape(rows * columns, -1), towards, one.apply(planar_array(rows, columns))) for one in candidates]
     if max(fits) < FITS:
         raise UserError(
-            f"the phases of {name} fit no {rows}x{columns} array of half a wavelength (correlation {max(fits):.3f}); give its "
-            "form, --array ROWSxCOLUMNS, or trace with synthetic_array=False"
+            f"the phases of {name} do not fit a {rows}x{columns} array of half a wavelength (correlation {max(fits):.3f}); "
+            "give its shape, --array ROWSxCOLUMNS, or trace with synthetic_array=False"
         )
     return _quaternion(candidates[0] if fits[0] >= FITS and fits[0] >= max(fits) - 1e-4 else candidates[int(np.argmax(fits))])
 
@@ -228,24 +231,24 @@ def _orientation(
 def _turn(
     measured: list[tuple[int, np.ndarray]], towards: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"]
 ) -> Rotation | None:
-    """Returns the rotation whose axes have some direction cosines; None where directions do not show it."""
+    """Returns the rotation whose axes have the measured direction cosines; None if the directions do not determine it."""
     axes, found = [], []
     for axis, cosine in measured:
-        sure = np.abs(cosine) < WRAPPED
-        scale = np.sqrt(weight[sure] / max(weight[sure].max(initial=0), 1e-300))[:, None]
-        if sure.sum() < 3 or np.linalg.svd(scale * towards[sure], compute_uv=False)[-1] < SPAN:
+        reliable = np.abs(cosine) < WRAPPED
+        scale = np.sqrt(weight[reliable] / max(weight[reliable].max(initial=0), 1e-300))[:, None]
+        if reliable.sum() < 3 or np.linalg.svd(scale * towards[reliable], compute_uv=False)[-1] < SPAN:
             return None
-        solution = np.linalg.lstsq(scale * towards[sure], scale[:, 0] * cosine[sure], rcond=None)[0]
+        solution = np.linalg.lstsq(scale * towards[reliable], scale[:, 0] * cosine[reliable], rcond=None)[0]
         axes.append(np.eye(3)[axis])
         found.append(solution / np.linalg.norm(solution))
     return Rotation.align_vectors(np.array(found), np.array(axes))[0] if found else None
 
 
 def _fit(a: Complex[np.ndarray, "e n"], towards: Float[np.ndarray, "n 3"], elements: Float[np.ndarray, "e 3"]) -> float:
-    """Returns the correlation of coefficients with steering vectors, over all paths by their power."""
+    """Returns the power-weighted correlation of coefficients with steering vectors, over all paths."""
     steering = np.exp(2j * np.pi * elements @ towards.T)
-    alike = np.abs((a * steering.conj()).sum(0)) ** 2 / len(a)
-    return float(np.sqrt(alike.sum() / max((np.abs(a) ** 2).sum(), 1e-300)))
+    matched = np.abs((a * steering.conj()).sum(0)) ** 2 / len(a)
+    return float(np.sqrt(matched.sum() / max((np.abs(a) ** 2).sum(), 1e-300)))
 
 
 def _quaternion(turn: Rotation) -> Float[np.ndarray, "4"]:
@@ -253,11 +256,11 @@ def _quaternion(turn: Rotation) -> Float[np.ndarray, "4"]:
 
 
 def _swapped(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Returns the paths the other way round."""
+    """Returns the paths with transmitters and receivers exchanged."""
     other = {"theta_t": "theta_r", "phi_t": "phi_r", "sources": "targets"}
     other |= {value: key for key, value in other.items()}
 
-    def turned(name: str, values: np.ndarray) -> np.ndarray:
+    def exchanged(name: str, values: np.ndarray) -> np.ndarray:
         if name in ("sources", "targets", "frequency_hz"):
             return values
         before = int(name in ("interactions", "vertices"))
@@ -267,4 +270,4 @@ def _swapped(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             values = np.swapaxes(values, before + one, before + two)
         return values
 
-    return {other.get(name, name): turned(name, values) for name, values in arrays.items()}
+    return {other.get(name, name): exchanged(name, values) for name, values in arrays.items()}

@@ -1,1 +1,1 @@
-"""Meshes: readers, cleaning, facets and edges."""
+"""Meshes: readers, cleaning, simplification, facets and edges."""

@@ -1,4 +1,4 @@
-"""What readers of rooms give: bodies by name, in the units and axes of their file."""
+"""Bodies as returned by the readers of room files: named, in the units and axes of their file."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,14 @@ from jaxtyping import Float, Int
 
 
 class RadioMaterial(NamedTuple):
-    """What a file records of a body's material."""
+    """Material of a body as recorded in a file."""
 
     name: str
-    """Of an ITU material, or of an own one."""
+    """Name of an ITU material or of a custom one."""
     thickness: float
     """Metres."""
     properties: tuple[float, float] | None = None
-    """Relative permittivity and conductivity (S/m) of an own one."""
+    """Relative permittivity and conductivity (S/m) of a custom material."""
 
 
 class Body(NamedTuple):
@@ -27,7 +27,7 @@ class Body(NamedTuple):
 
 
 def joined(bodies: list[Body]) -> list[Body]:
-    """Returns bodies, those of one name as one."""
+    """Returns bodies with those of the same name joined."""
     by_name: dict[str, list[Body]] = {}
     for body in bodies:
         by_name.setdefault(body.name, []).append(body)

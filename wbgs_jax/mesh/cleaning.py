@@ -1,9 +1,7 @@
-"""What exports of meshes often get wrong, mended: parts that hold every triangle twice, and triangles that face both ways.
+"""Repairs frequent errors of mesh exports: parts that contain every triangle twice, and inconsistent orientations.
 
-A surface that is there twice reflects twice, and lets pass what has passed two slabs; an edge between triangles that face both
-ways is none. Runs on the host.
-
-What is common to all that look at the triangles of a mesh: sides, names of sides, what hangs together. Runs on the host.
+A duplicated surface reflects twice and transmits through two slabs; triangles of opposite orientation form no diffracting edge.
+The helpers for sides and connected components are shared with other modules. Runs on the host.
 """
 
 import warnings
@@ -16,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 
 
 def components(count: int, first: Int[np.ndarray, " n"], second: Int[np.ndarray, " n"]) -> Int[np.ndarray, " nodes"]:
-    """Returns which connected component each of `count` nodes is in; components are numbered by their first nodes."""
-    ends = first.astype(np.int32), second.astype(np.int32)  # wider indices are not for every SciPy's graphs
+    """Returns the connected component of each of `count` nodes; components are numbered by their first nodes."""
+    ends = first.astype(np.int32), second.astype(np.int32)  # some versions of SciPy's graph functions accept no wider indices
     joined = coo_array((np.ones(len(first), bool), ends), shape=(count, count))
     return connected_components(joined, directed=False)[1]
 
@@ -28,7 +26,7 @@ def sides(triangles: Int[np.ndarray, "t 3"]) -> Int[np.ndarray, "sides 2"]:
 
 
 def names(owner: Int[np.ndarray, " n"], sides: Int[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-    """Returns one integer for every side of an owner: equal for equal ones."""
+    """Returns one integer per side and owner, the same for equal ones."""
     corners = int(sides.max(initial=0)) + 1
     return (owner.astype(np.int64) * corners + sides[:, 0]) * corners + sides[:, 1]
 
@@ -36,12 +34,12 @@ def names(owner: Int[np.ndarray, " n"], sides: Int[np.ndarray, "n 2"]) -> Int[np
 def repaired(
     points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]
 ) -> tuple[Int[np.ndarray, "k 3"], Int[np.ndarray, " k"]]:
-    """Returns the triangles that are kept, and their numbers, and warns of what was mended.
+    """Returns the triangles that are kept, with consistent orientations, and their indices; warns of repairs.
 
     Args:
-        points: corners, metres, none twice.
-        triangles: as indices of corners.
-        part: of every triangle.
+        points: corners, metres, without duplicates.
+        triangles: indices of corners.
+        part: part of every triangle.
     """
     kept = _once(triangles, part)
     triangles, part = triangles[kept].copy(), part[kept]
@@ -49,15 +47,15 @@ def repaired(
     wrong = np.unique(part[pairs.first[pairs.against]])
     if len(wrong):
         own = np.flatnonzero(np.isin(part, wrong))
-        turned = own[_turned(points, triangles[own], _neighbours(triangles[own], part[own]))]
-        triangles[turned] = triangles[turned, ::-1]
-        warnings.warn(f"triangles of {len(wrong)} parts of the mesh face both ways; they are taken to face one", stacklevel=4)
+        flipped = own[_flipped(points, triangles[own], _neighbours(triangles[own], part[own]))]
+        triangles[flipped] = triangles[flipped, ::-1]
+        warnings.warn(f"inconsistent triangle orientations were repaired (parts of the mesh: {len(wrong)})", stacklevel=4)
     return triangles, kept
 
 
 def _once(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int[np.ndarray, " k"]:
-    """Returns the triangles without the repetitions in parts of which every triangle is repeated, either side up. Where only
-    some are, bodies of one part touch."""
+    """Returns the triangles without the duplicates in parts in which every triangle is repeated, in either orientation. If only
+    some are repeated, bodies of one part touch."""
     corners = np.sort(triangles, 1)
     _, side = np.unique(names(part, corners[:, :2]), return_inverse=True)
     _, first, which, count = np.unique(
@@ -68,19 +66,19 @@ def _once(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> Int
     if single[part].all():
         return np.arange(len(triangles))
     doubled = len(np.unique(part[~single[part]]))
-    warnings.warn(f"every triangle of {doubled} parts of the mesh is there twice; it is taken once", stacklevel=5)
+    warnings.warn(f"duplicate triangles are ignored (parts of the mesh with every triangle twice: {doubled})", stacklevel=5)
     return np.union1d(np.flatnonzero(single[part]), first)
 
 
 class _Neighbours(NamedTuple):
-    """Pairs of triangles with a side that no other triangle of their part has."""
+    """Pairs of triangles that share a side with no other triangle of their part."""
 
     first: Int[np.ndarray, " n"]
     second: Int[np.ndarray, " n"]
     against: Bool[np.ndarray, " n"]
-    """Whether both go along it in the same direction: they face different ways."""
+    """Whether both traverse it in the same direction, so that their orientations differ."""
     closed: Bool[np.ndarray, " t"]
-    """Of every triangle, whether all of its sides are such ones."""
+    """Whether all sides of a triangle are of this kind."""
 
 
 def _neighbours(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) -> _Neighbours:
@@ -90,19 +88,19 @@ def _neighbours(triangles: Int[np.ndarray, "t 3"], part: Int[np.ndarray, " t"]) 
     one, other = order[start], order[start + 1]
     forward = (np.roll(triangles, -1, 1) > triangles).reshape(-1)
     closed = (count == 2)[which].reshape(-1, 3).all(1)
-    against = (forward[one] == forward[other]) & (side[one, 0] != side[one, 1])  # one of no length has no direction
+    against = (forward[one] == forward[other]) & (side[one, 0] != side[one, 1])  # a side of zero length has no direction
     return _Neighbours(one // 3, other // 3, against, closed)
 
 
-def _turned(points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], pairs: _Neighbours) -> Bool[np.ndarray, " t"]:
-    """Returns which triangles to turn round, so that all face as their neighbours do, and outwards where bodies are closed."""
+def _flipped(points: Float[np.ndarray, "w 3"], triangles: Int[np.ndarray, "t 3"], pairs: _Neighbours) -> Bool[np.ndarray, " t"]:
+    """Returns which triangles to flip so that orientations agree within bodies, and point outwards if these are closed."""
     count, across = len(triangles), len(triangles) * pairs.against
-    # Every triangle twice, as it is and turned round. What faces alike is joined, so that a body is there twice, too.
+    # Every triangle occurs twice, as given and flipped. Consistent ones are connected, so that every body occurs twice as well.
     first = np.concatenate([pairs.first, pairs.first + count])
     second = np.concatenate([pairs.second + across, pairs.second + count - across])
     as_it_is, other_way = components(2 * count, first, second).reshape(2, count)
-    body, turned = np.minimum(as_it_is, other_way), as_it_is > other_way
+    body, flipped = np.minimum(as_it_is, other_way), as_it_is > other_way
     a, b, c = (points - points.mean(0))[triangles].swapaxes(0, 1)
-    volume = np.bincount(body, np.where(turned, -1, 1) * np.sum(a * np.cross(b, c), -1))
+    volume = np.bincount(body, np.where(flipped, -1, 1) * np.sum(a * np.cross(b, c), -1))
     inward = (volume < 0) & (np.bincount(body, ~pairs.closed) == 0)
-    return turned ^ inward[body]
+    return flipped ^ inward[body]

@@ -1,11 +1,10 @@
-"""The edges that waves are diffracted at: where two facets of one body meet at an angle.
+"""Diffracting edges: where two facets of one body meet at an outer angle (host).
 
-Runs on the host. Free edges of single sheets are no wedges and are left out, and so are inner corners.
+Free edges of single sheets are not wedges and are omitted, as are inner corners.
 
-Edges and chains filled up to sizes that seldom change: surfaces that are moved a little have a few more or fewer of them,
-and everything that is compiled for one number would be compiled anew for the next.
-
-What is added is never a path: edges of no length, and mirror images that lie in the plane of their mirror (`image_method.py`).
+Edges, reflection sequences and pairs can be padded to sizes that rarely change: displaced surfaces have slightly different
+numbers of them, and every new number would trigger a compilation. Padding never makes a path: padded edges have zero length,
+and padded images lie in the plane of their mirror (`image_method.py`).
 """
 
 import dataclasses
@@ -21,16 +20,16 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.mesh.facets import CORNERS, WELD, AnyArray, Facets, outline_of
 
 SHARPEST = 0.05
-"""Edges that turn by less than this angle (radians) are part of a smooth surface."""
+"""Radians: edges with a smaller angle between their normals are part of a smooth surface."""
 GAP = 0.006
 """Metres: surfaces nearer than this are joined."""
 ODD = 0.137
-"""Added before rounding, so that round numbers do not lie where rounding turns."""
+"""Offset added before rounding, so that round coordinates do not lie on a rounding boundary."""
 
 
 @pytree
 class Edges:
-    """E straight wedges, open to the outside by more than half a turn."""
+    """E straight wedges with an exterior angle of more than half a turn."""
 
     start: Float[AnyArray, "e 3"]
     """World frame, metres."""
@@ -43,11 +42,11 @@ class Edges:
     normal_n: Float[AnyArray, "e 3"]
     """Outward normal of the n-face."""
     facet: Int[AnyArray, " e"]
-    """The 0-face; both faces are of one body, so of one material."""
+    """Index of the 0-face; both faces belong to one body and hence have one material."""
 
 
 class _Side(NamedTuple):
-    """A side of a facet that has a length."""
+    """A facet side of non-zero length."""
 
     facet: int
     start: Float[np.ndarray, "3"]
@@ -55,7 +54,7 @@ class _Side(NamedTuple):
 
 
 def edges_of_facets(facets: Facets) -> Edges:
-    """Returns the edges (float64 and int32 NumPy arrays) that two facets of one body share, whole or in part."""
+    """Returns the edges (float64 and int32 NumPy arrays) that two facets of one body share, wholly or in part."""
     normal, body, centre = np.asarray(facets.normal), np.asarray(facets.body), np.asarray(facets.corners).mean(1)
     found = []
     for on_line in _sides_by_line(facets):
@@ -83,7 +82,7 @@ def _sides_by_line(facets: Facets) -> list[list[_Side]]:
 
 
 def _line(point: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple[int, ...]:
-    """Returns a hashable name of a straight line: equal for equal lines, up to rounding."""
+    """Returns a hashable key of a straight line, the same for equal lines up to rounding."""
     first = along[np.argmax(np.abs(along) > 1e-3)]
     along = along if first > 0 else -along
     foot = point - (point @ along) * along
@@ -93,7 +92,8 @@ def _line(point: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple
 def _wedge(
     first: _Side, second: _Side, normal: Float[np.ndarray, "f 3"], centre: Float[np.ndarray, "f 3"]
 ) -> list[tuple[Any, ...]]:
-    """Returns the edge (its fields) where two sides of one line overlap; none if they do not, or not at an outer angle."""
+    """Returns the edge (its fields) where two sides on one line overlap; none if they do not, or if the angle is an inner
+    one."""
     i, a, b = first
     j, c, d = second
     turn = np.arccos(np.clip(normal[i] @ normal[j], -1, 1))
@@ -112,11 +112,11 @@ def _wedge(
 
 
 def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
-    """Returns whether another surface closes the gap in front of an edge: where two bodies are joined nothing is diffracted."""
+    """Returns whether another surface closes the gap in front of an edge: joints between bodies do not diffract."""
     out = edges.normal_0 + edges.normal_n
     out = out / np.maximum(
         np.linalg.norm(out, axis=-1, keepdims=True), WELD
-    )  # a sheet's two faces have no way out between them
+    )  # the outward direction between the two faces of a sheet is zero
     middle = edges.start + edges.direction * edges.length[:, None] / 2
     normal, outline = np.asarray(facets.normal), outline_of(facets)
     covered = np.zeros(len(middle), bool)
@@ -132,23 +132,23 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
 
 
 PARTS = 8
-"""Sizes between a power of two and the next one: at most an eighth of what is searched is padding."""
+"""Sizes between consecutive powers of two: at most an eighth of the padded arrays is padding."""
 
 
 def padded_size(count: int) -> int:
-    """Returns the next size that seldom changes; 0 for nothing."""
+    """Returns the next larger size of the padding scheme; 0 for 0."""
     step = max(2 ** (count.bit_length() - 1) // PARTS, 1)
     return -(-count // step) * step
 
 
 def padded_edges(edges: Edges) -> Edges:
-    """Returns edges, and behind them copies of the first one without length, which diffract nothing (host)."""
+    """Returns edges followed by copies of the first one with zero length, which diffract nothing (host)."""
     count = len(edges.length)
     more: Edges = jax.tree.map(filled, edges)
     return dataclasses.replace(more, length=np.where(np.arange(len(more.length)) < count, more.length, 0))
 
 
 def filled(rows: Shaped[AnyArray, "n ..."]) -> Shaped[np.ndarray, "k ..."]:
-    """Returns rows, and behind them the first one again."""
+    """Returns rows padded with copies of the first one."""
     missing = padded_size(len(rows)) - len(rows)
     return np.concatenate([rows, np.broadcast_to(rows[:1], (missing, *rows.shape[1:]))])

@@ -1,8 +1,9 @@
-"""A mesh as a few planar facets: convex polygons of three or four corners, merged from coplanar triangles of one body.
+"""Represents a mesh by a few planar facets: convex polygons of three or four corners, merged from coplanar triangles of one
+body.
 
-Facets are what reflects, transmits and shades. They tile every planar piece of the mesh without gaps or overlaps. A body is
-what they are merged in, and what edges are searched in (`edges.py`): an object of the scene, or several open sheets of one
-material that meet, such as the walls of a room. Objects that are closed stay apart even where they touch. Runs on the host.
+Facets reflect, transmit and block waves. They cover every planar piece of the mesh without gaps or overlaps. A body is the unit
+in which triangles are merged and edges are found (`edges.py`): an object of the scene, or several open sheets of one material
+that meet, such as the walls of a room. Closed objects stay separate even where they touch. Runs on the host.
 """
 
 import dataclasses
@@ -20,14 +21,14 @@ from wbgs_jax.mesh.cleaning import components, names, repaired, sides
 from wbgs_jax.types import Mesh
 
 AnyArray = Array | np.ndarray
-"""Geometry is found in NumPy, in double precision, and used in JAX."""
+"""Geometry is computed in NumPy in double precision and used in JAX."""
 CORNERS = 4
 WELD = 1e-5
-"""Metres: corners nearer than this are one."""
+"""Metres: corners nearer than this are merged."""
 SMALLEST_AREA = 1e-10
-"""Square metres: smaller triangles are no surface."""
+"""Square metres: smaller triangles are ignored."""
 FLAT = 1e-4
-"""Sine of the largest angle between normals of one plane, and between edges of one straight line."""
+"""Sine of the largest angle between normals of one plane, and between sides of one straight line."""
 Polygon = list[int]
 
 
@@ -42,26 +43,29 @@ class Facets:
     offset: Float[AnyArray, " f"]
     """Distance of the plane from the origin along the normal, metres."""
     body: Int[AnyArray, " f"]
-    """What a facet may have edges with: the object that it belongs to, or the open sheets of its material that meet."""
+    """Index of the body within which a facet can form edges: its object, or the open sheets of its material that meet."""
     material: Int[AnyArray, " f"]
     """Index of the mesh's material."""
     mover: Int[AnyArray, " f"]
-    """What a facet moves with, if it stands elsewhere than the mesh says: the corners of a body that hang together."""
+    """Index of the rigid body that a facet moves with when the geometry is displaced: a connected component of its body."""
 
 
 @pytree
 class Outline:
-    """The sides of all facets: a point of the plane lies inside where inward . point >= offset for all four."""
+    """Half-planes of all facets: a point of the plane lies inside where inward . point >= offset for all four sides."""
 
     inward: Float[AnyArray, "f 4 3"]
-    """Unit vectors in the plane, world frame; zero for a side of no length."""
+    """Unit vectors in the plane, world frame; zero for a side of zero length."""
     offset: Float[AnyArray, "f 4"]
     """Metres."""
 
 
 def facets_from_mesh(mesh: Mesh) -> Facets:
-    """Returns the facets of a mesh, which is `repaired` first, as float64 and int32 NumPy arrays, the largest first; a mesh
-    without any surface is a `UserError`."""
+    """Returns the facets of a mesh, which is `repaired` first, as float64 and int32 NumPy arrays, the largest first.
+
+    Raises:
+        UserError: a mesh without any surface.
+    """
     points, index = _weld(np.asarray(mesh.vertices, np.float64))
     part_and_material = np.column_stack([np.asarray(mesh.part), np.asarray(mesh.material)])
     pieces, piece = np.unique(part_and_material, axis=0, return_inverse=True)
@@ -69,14 +73,14 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     piece = piece.reshape(-1)[kept]
     material = pieces[piece, 1]
     body = _bodies(triangles, piece, pieces[:, 1])
-    mover = _movers(triangles, body)
+    mover = _rigid_bodies(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
     if not keep.any():
-        raise UserError("the mesh has no triangle with an area; leave the mesh out, or give one with surfaces")
+        raise UserError("the mesh has no triangle with an area; omit the mesh, or provide one with surfaces")
     triangles, normal, body, material, mover = (a[keep] for a in (triangles, normal, body, material, mover))
     polygons: list[Polygon] = []
-    first = []  # triangle of every polygon's plane
+    first = []  # a triangle in every polygon's plane
     for group in _coplanar(triangles, normal, body):
         merged = _merge(points, triangles[group].tolist(), normal[group[0]])
         polygons += merged
@@ -87,39 +91,45 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     order = np.argsort(-sizes, kind="stable")
     owner = np.array(first, int)[order]
     offset = np.sum(normals[order] * corners[order].mean(1), -1)
-    _, hangs_with = np.unique(mover[owner], return_inverse=True)
-    numbers = (values.astype(np.int32) for values in (body[owner], material[owner], hangs_with.reshape(-1)))
+    _, rigid_body = np.unique(mover[owner], return_inverse=True)
+    numbers = (values.astype(np.int32) for values in (body[owner], material[owner], rigid_body.reshape(-1)))
     return Facets(corners[order], normals[order], offset, *numbers)
 
 
 def centres(facets: Facets, movers: int) -> Float[Array, "m 3"]:
-    """Returns the centres that the movers of the facets turn about: the means of their facets' corners."""
+    """Returns the centres about which the rigid bodies rotate: the means of their facets' corners, metres."""
     start = jnp.zeros((movers, 3)), jnp.zeros((movers, 1))
     total = start[0].at[facets.mover].add(jnp.mean(jnp.asarray(facets.corners, jnp.float32), 1))
     return total / jnp.maximum(start[1].at[facets.mover].add(1), 1)
 
 
 def moved(facets: Facets, shift: Float[np.ndarray, "m 3"], turn: Float[np.ndarray, "m 3"]) -> Facets:
-    """Returns the facets with their movers turned about their centres (rotation vectors, radians) and shifted (metres)."""
+    """Returns the facets with their rigid bodies rotated about their centres and shifted.
+
+    Args:
+        facets: at their nominal positions.
+        shift: of every rigid body, metres.
+        turn: rotation vector of every rigid body, radians.
+    """
     mover, corners = np.asarray(facets.mover), np.asarray(facets.corners, np.float64)
     centre, rotation = np.asarray(centres(facets, len(shift)), np.float64)[mover], Rotation.from_rotvec(turn[mover])
     arms = corners - centre[:, None]
-    turned = np.stack([rotation.apply(arms[:, k]) for k in range(CORNERS)], 1)
-    corners = centre[:, None] + turned + np.asarray(shift, np.float64)[mover][:, None]
+    rotated = np.stack([rotation.apply(arms[:, k]) for k in range(CORNERS)], 1)
+    corners = centre[:, None] + rotated + np.asarray(shift, np.float64)[mover][:, None]
     normal = rotation.apply(np.asarray(facets.normal, np.float64))
     return dataclasses.replace(facets, corners=corners, normal=normal, offset=np.sum(normal * corners.mean(1), -1))
 
 
 def remaining(facets: Facets, movers: Int[np.ndarray, " k"]) -> Facets:
-    """Returns the facets of some movers (ascending), which are numbered anew in their order."""
+    """Returns the facets of the given rigid bodies (indices, ascending), which are renumbered in that order."""
     own = np.isin(np.asarray(facets.mover), movers)
     left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], facets)
     return dataclasses.replace(left, mover=np.searchsorted(movers, left.mover).astype(np.int32))
 
 
 def outline_of(facets: Facets) -> Outline:
-    """Returns the sides of all facets (float64). Where two facets meet, one of them ends `WELD` before the other begins: what
-    hits the seam, as in rooms of round numbers, hits one of them."""
+    """Returns the half-planes of all facets (float64). Where two facets meet, one of them ends `WELD` before the other begins,
+    so that a point on the seam, as is common in rooms with round dimensions, hits exactly one of them."""
     corners = np.asarray(facets.corners, np.float64)
     along = np.roll(corners, -1, 1) - corners
     inward = np.cross(np.asarray(facets.normal)[:, None], along)
@@ -136,7 +146,7 @@ def areas(facets: Facets) -> Float[np.ndarray, " f"]:
 
 def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, " v"]]:
     """Returns the corners without duplicates, and the new index of every vertex."""
-    different, which = np.unique(vertices, axis=0, return_inverse=True)  # at once: pairs of equal ones may be many
+    different, which = np.unique(vertices, axis=0, return_inverse=True)  # first, as there may be many pairs of equal ones
     pairs = cKDTree(different).query_pairs(WELD, output_type="ndarray")
     index = components(len(different), pairs[:, 0], pairs[:, 1])[which.reshape(-1)]
     _, first = np.unique(index, return_index=True)
@@ -146,10 +156,10 @@ def _weld(vertices: Float[np.ndarray, "v 3"]) -> tuple[Float[np.ndarray, "w 3"],
 def _bodies(
     triangles: Int[np.ndarray, "t 3"], piece: Int[np.ndarray, " t"], material: Int[np.ndarray, " pieces"]
 ) -> Int[np.ndarray, " t"]:
-    """Returns the body of every triangle: its piece, which is what one part has of one material, or all open pieces of its
+    """Returns the body of every triangle: its piece (the triangles of one part and material), or all open pieces of its
     material that meet in corners of their borders.
 
-    A piece is open if a side of it belongs to an odd number of triangles. (Watertight in the sense of trimesh says no: two
+    A piece is open if one of its sides belongs to an odd number of triangles. (This differs from trimesh's watertightness: two
     blocks of one object that touch along an edge share it four times, and are closed.)
     """
     owner, side = np.repeat(piece, 3), sides(triangles)
@@ -157,13 +167,13 @@ def _bodies(
     border = first[(count % 2 == 1) & (side[first, 0] != side[first, 1])]
     owner, corner = np.repeat(owner[border], 2), side[border].reshape(-1)
     _, shared = np.unique(np.column_stack([material[owner], corner]), axis=0, return_inverse=True)
-    # A graph whose nodes are the pieces, and behind them the corners of borders, one for each material that meets there.
+    # The nodes of the graph are the pieces, followed by the corners of borders, one for each material that meets there.
     label = components(len(material) + len(owner), owner, len(material) + shared.reshape(-1))
     return label[piece]
 
 
-def _movers(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
-    """Returns the mover of every triangle: those of one body that are joined by common corners share it."""
+def _rigid_bodies(triangles: Int[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
+    """Returns the rigid body of every triangle: triangles of one body that are connected by common corners share it."""
     _, node = np.unique(np.column_stack([np.repeat(body, 3), triangles.reshape(-1)]), axis=0, return_inverse=True)
     node = node.reshape(-1, 3)
     label = components(int(node.max(initial=-1)) + 1, node[:, [0, 1]].reshape(-1), node[:, [1, 2]].reshape(-1))
@@ -195,7 +205,7 @@ def _polygon_normals(corners: Float[np.ndarray, "f 4 3"]) -> tuple[Float[np.ndar
 def _coplanar(
     triangles: Int[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"], body: Int[np.ndarray, " t"]
 ) -> list[Int[np.ndarray, " k"]]:
-    """Returns the triangles of one body that share sides and a plane, as groups of indices."""
+    """Returns groups of triangles (indices) of one body that are connected by common sides and coplanar."""
     _, first, which = np.unique(names(np.repeat(body, 3), sides(triangles)), return_index=True, return_inverse=True)
     owner = np.repeat(np.arange(len(triangles)), 3)
     other = owner[first[which]]
@@ -211,7 +221,7 @@ def _parallel(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Bool[
 
 
 def _merge(points: Float[np.ndarray, "w 3"], polygons: list[Polygon], normal: Float[np.ndarray, "3"]) -> list[Polygon]:
-    """Returns polygons with neighbours joined while the union is convex with at most four corners."""
+    """Returns polygons with neighbours merged as long as the union is convex with at most four corners."""
     merged = True
     while merged:
         merged = False

@@ -1,8 +1,8 @@
-"""Objects of glTF 2.0 files, .gltf and .glb (Khronos specification 2.0.1): every triangle that is declared, or a refusal.
+"""Reads objects from glTF 2.0 files, .gltf and .glb (Khronos specification 2.0.1): all declared triangles, or an error.
 
-Read are lists, strips and fans of triangles; accessors that are sparse, interleaved, or integers, normalised or not
-(KHR_mesh_quantization); nodes that are instanced (EXT_mesh_gpu_instancing); morph targets by their default weights. Refused are
-compressed primitives, skins, and whatever else a file requires. Metres, y up.
+Supported: lists, strips and fans of triangles; sparse, interleaved and (normalised) integer accessors (KHR_mesh_quantization);
+instanced nodes (EXT_mesh_gpu_instancing); morph targets with their default weights. Compressed primitives, skins and other
+required extensions are rejected. Units are metres, y up.
 """
 
 import base64
@@ -24,18 +24,24 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TRIANGLES, STRIP, FAN = 4, 5, 6
-KNOWN = {"KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "KHR_texture_transform", "KHR_lights_punctual", "EXT_texture_webp"}
-"""Extensions that may be required: of geometry, those that are read; of looks, they do not matter."""
-OF_LOOKS = ("KHR_materials_", "KHR_texture_", "MSFT_texture_", "EXT_texture_", "EXT_lights_")
+SUPPORTED = {
+    "KHR_mesh_quantization",
+    "EXT_mesh_gpu_instancing",
+    "KHR_texture_transform",
+    "KHR_lights_punctual",
+    "EXT_texture_webp",
+}
+"""Extensions that may be required: supported ones that concern geometry, and ones that concern appearance and do not matter."""
+APPEARANCE = ("KHR_materials_", "KHR_texture_", "MSFT_texture_", "EXT_texture_", "EXT_lights_")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 MOST = 20_000_000
-"""Rows of an accessor."""
+"""Maximum number of rows of an accessor."""
 DEEPEST = 200
-"""Nodes below each other."""
+"""Maximum depth of the node hierarchy."""
 
 
 class _File:
-    """A document and its bytes."""
+    """A glTF document and its binary data."""
 
     def __init__(self, file: Path) -> None:
         content = file.read_bytes()
@@ -47,10 +53,14 @@ class _File:
         self.buffers: dict[int, bytes] = {}
 
     def of(self, kind: str, number: int) -> dict[str, Any]:
-        """Returns an entry of the document."""
+        """Returns an entry of the document.
+
+        Raises:
+            ValueError: there is no such entry.
+        """
         entries = self.document.get(kind, [])
         if not 0 <= number < len(entries):
-            raise ValueError(f"there is no {kind} {number}")
+            raise ValueError(f"{kind} {number} does not exist")
         found: dict[str, Any] = entries[number]
         return found
 
@@ -69,7 +79,12 @@ class _File:
         return self.buffers[number]
 
     def accessor(self, number: int, what: str) -> Float[np.ndarray, "n k"]:
-        """Returns the numbers of an accessor as its columns."""
+        """Returns the values of an accessor, one row per element, float64.
+
+        Raises:
+            UserError: compressed data.
+            ValueError: invalid sizes.
+        """
         entry = self.of("accessors", number)
         count, width = int(entry["count"]), WIDTHS[entry["type"]]
         if count > MOST:
@@ -80,14 +95,16 @@ class _File:
         elif "sparse" in entry:
             values = np.zeros((count, width), kind)
         else:
-            raise UserError(f"{what} holds no numbers for {count} vertices: export it without compression")
+            raise UserError(f"{what} has no data for {count} vertices: export it without compression")
         if "sparse" in entry:
             sparse = entry["sparse"]
             own, where = int(sparse["count"]), sparse["indices"]
             index_kind = np.dtype(COMPONENTS[where["componentType"]])
             index = self._numbers(where["bufferView"], where.get("byteOffset", 0), index_kind, own, 1, what)[:, 0]
-            given = sparse["values"]
-            values[index] = self._numbers(given["bufferView"], given.get("byteOffset", 0), kind, own, width, what)
+            sparse_values = sparse["values"]
+            values[index] = self._numbers(
+                sparse_values["bufferView"], sparse_values.get("byteOffset", 0), kind, own, width, what
+            )
         found = values.astype(np.float64)
         if entry.get("normalized") and kind.kind in "iu":
             found = np.maximum(found / np.iinfo(kind).max, -1.0)
@@ -106,23 +123,23 @@ class _File:
             or stride < kind.itemsize * width
             or start + stride * (count - 1) + kind.itemsize * width > len(content)
         ):
-            raise ValueError(f"{count} rows are declared, and its bytes end before")
+            raise ValueError(f"{count} rows are declared, but the data end before")
         shape, strides = (count, width), (stride, kind.itemsize)
         return np.ndarray(shape, kind, content, start, strides).copy()
 
 
 def read_gltf(file: Path) -> list[Body]:
-    """Returns the objects of a file by the names of their nodes, which may hold several primitives.
+    """Returns the objects of a file, named after their nodes, which may hold several primitives.
 
     Raises:
-        UserError: something that is declared is of a kind that is not read: it names the object.
+        UserError: a declared object is of an unsupported kind; the message names the object.
     """
     opened = _File(file)
     document = opened.document
     for name in document.get("extensionsRequired", []):
-        if name not in KNOWN and not name.startswith(OF_LOOKS):
+        if name not in SUPPORTED and not name.startswith(APPEARANCE):
             where = _first_object(document, name)
-            raise UserError(f"{file} requires the extension {name}{where}, which is not read; export it without")
+            raise UserError(f"{file} requires the extension {name}{where}, which is not supported; export it without")
     roots = _roots(document)
     bodies: list[Body] = []
     for number in roots:
@@ -140,16 +157,16 @@ def _roots(document: dict[str, Any]) -> list[int]:
 
 
 def _node(opened: _File, number: int, above: Float[np.ndarray, "4 4"], bodies: list[Body], depth: int) -> None:
-    """Adds the bodies of a node and of those below it."""
+    """Adds the bodies of a node and of its descendants."""
     node = opened.of("nodes", number)
     if depth > DEEPEST:
-        raise ValueError("its nodes go round in a circle")
+        raise ValueError("its nodes form a cycle")
     placed = above @ _matrix(node)
     if "mesh" in node:
         mesh = opened.of("meshes", int(node["mesh"]))
         name = str(node.get("name") or mesh.get("name") or f"node_{number}").strip()
         if "skin" in node:
-            raise UserError(f"object {name!r} of {opened.file} is moved by a skin; apply its pose and export it again")
+            raise UserError(f"object {name!r} of {opened.file} is deformed by a skin; apply its pose and export it again")
         own = _mesh(opened, mesh, node, name)
         bodies += [
             Body(name, vertices @ one[:3, :3].T + one[:3, 3], faces)
@@ -163,10 +180,10 @@ def _node(opened: _File, number: int, above: Float[np.ndarray, "4 4"], bodies: l
 def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    return _moved(node.get("translation", (0, 0, 0)), node.get("rotation", (0, 0, 0, 1)), node.get("scale", (1, 1, 1)))
+    return _transform(node.get("translation", (0, 0, 0)), node.get("rotation", (0, 0, 0, 1)), node.get("scale", (1, 1, 1)))
 
 
-def _moved(translation: Any, rotation: Any, scale: Any) -> Float[np.ndarray, "4 4"]:
+def _transform(translation: Any, rotation: Any, scale: Any) -> Float[np.ndarray, "4 4"]:
     result = np.eye(4)
     result[:3, :3] = Rotation.from_quat(np.asarray(rotation, np.float64)).as_matrix() * np.asarray(scale, np.float64)
     result[:3, 3] = translation
@@ -185,13 +202,13 @@ def _instances(
     count = max((len(values) for values in columns.values()), default=0)
     usual = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
     rows = [columns.get(key, np.tile(np.array(value, float), (count, 1))) for key, value in usual.items()]
-    return [placed @ _moved(*row) for row in zip(*rows, strict=True)]
+    return [placed @ _transform(*row) for row in zip(*rows, strict=True)]
 
 
 def _mesh(
     opened: _File, mesh: dict[str, Any], node: dict[str, Any], name: str
 ) -> list[tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]]:
-    """Returns vertices and triangles of every primitive that has some; points and lines have none."""
+    """Returns vertices and triangles of every primitive that has triangles; points and lines are skipped."""
     found, what = [], f"object {name!r} of {opened.file}"
     for primitive in mesh["primitives"]:
         mode = primitive.get("mode", TRIANGLES)
@@ -220,7 +237,7 @@ def _triangles(index: Int[np.ndarray, " n"], mode: int) -> Int[np.ndarray, "t 3"
 
 
 def _first_object(document: dict[str, Any], extension: str) -> str:
-    """Returns words about the first object that an extension is about; none where none is."""
+    """Returns " (object NAME)" for the first object that uses an extension; empty if there is none."""
     for number, mesh in enumerate(document.get("meshes", [])):
         if any(extension in primitive.get("extensions", {}) for primitive in mesh.get("primitives", [])):
             names = [node.get("name") for node in document.get("nodes", []) if node.get("mesh") == number]
@@ -230,10 +247,10 @@ def _first_object(document: dict[str, Any], extension: str) -> str:
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes]:
-    """Returns the text and the bytes of a .glb."""
+    """Returns the JSON text and the binary data of a .glb file."""
     (version,) = struct.unpack_from("<I", content, 4)
     if version != 2:
-        raise ValueError(f"it is of version {version} of glTF, not 2")
+        raise ValueError(f"it is glTF version {version}, not 2")
     text, binary, place = b"", b"", 12
     while place + 8 <= len(content):
         size, kind = struct.unpack_from("<II", content, place)

@@ -1,4 +1,4 @@
-"""Objects of a scene.xml of Mitsuba and Sionna RT: meshes in files, rectangles, cubes, spheres, disks and cylinders."""
+"""Reads objects from a scene.xml of Mitsuba or Sionna RT: mesh files, rectangles, cubes, spheres, disks and cylinders."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -15,17 +15,21 @@ from wbgs_jax.mesh.ply import read_mesh
 from wbgs_jax.mesh.wavefront import read_obj
 
 THICKNESS = 0.1
-"""Metres: what Sionna RT takes where nothing is given."""
+"""Metres: Sionna RT's default."""
 SECTIONS = 64
-"""Of what is round."""
+"""Number of segments that approximate a circle."""
 POINTS = ("point", "vector")
-"""What people write for places, and what Mitsuba writes."""
+"""Tags of positions: common usage, and Mitsuba's own."""
 MOVED = ("to_world", "toWorld")
-"""Transforms of shapes, in versions from 2 on and before."""
+"""Names of a shape's transform, since version 2 and before."""
 
 
 def read_mitsuba(file: Path) -> list[Body]:
-    """Returns the shapes of a scene; one that is not read is a `UserError` that names it."""
+    """Returns the shapes of a scene.
+
+    Raises:
+        UserError: an unsupported shape; the message names it.
+    """
     root = ET.parse(file).getroot()
     _fill_in(root, file)
     if root.find(".//include") is not None:
@@ -36,7 +40,7 @@ def read_mitsuba(file: Path) -> list[Body]:
 
 
 def _fill_in(root: ET.Element, file: Path) -> None:
-    """Puts the values of <default> where $name stands."""
+    """Replaces $name by the value of its <default>."""
     values = {one.get("name", ""): one.get("value", "") for one in root.iter("default")}
     for element in root.iter():
         for key, text in element.attrib.items():
@@ -45,7 +49,7 @@ def _fill_in(root: ET.Element, file: Path) -> None:
             for name in sorted(values, key=len, reverse=True):
                 text = text.replace(f"${name}", values[name])
             if "$" in text:
-                raise UserError(f"{file} leaves {text[:40]!r} open; give a <default> for it")
+                raise UserError(f"{file} has no value for {text[:40]!r}; add a <default> for it")
             element.set(key, text)
 
 
@@ -58,7 +62,7 @@ def _body(shape: ET.Element, number: int, materials: dict[str | None, RadioMater
         made = BUILT_IN[kind](shape)
         vertices, faces = np.asarray(made.vertices, np.float64), np.asarray(made.faces)
     else:
-        raise UserError(f"shape {name!r} of {file} is of type {kind!r}; export it as ply or obj")
+        raise UserError(f"shape {name!r} of {file} has the unsupported type {kind!r}; export it as ply or obj")
     moved = next((one for one in shape.findall("transform") if one.get("name") in MOVED), None)
     matrix = _transform(moved, name, file)
     vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -105,7 +109,7 @@ def _sphere(shape: ET.Element) -> trimesh.Trimesh:
 
 
 def _cylinder(shape: ET.Element) -> trimesh.Trimesh:
-    """Returns a side without caps."""
+    """Returns the side of a cylinder, without caps."""
     start, end = _point(shape, "p0", (0.0, 0.0, 0.0)), _point(shape, "p1", (0.0, 0.0, 1.0))
     rim = _disk(shape).vertices[:SECTIONS] * _value(shape, "radius", 1.0)
     length = float(np.linalg.norm(end - start))
@@ -151,7 +155,7 @@ def _transform(transform: ET.Element | None, name: str, file: Path) -> Float[np.
             case "matrix":
                 matrix = np.array(_numbers(step.get("value", ""))).reshape(4, 4)
             case _:
-                raise UserError(f"shape {name!r} of {file} is moved by <{step.tag}>; write a <matrix> in its place")
+                raise UserError(f"shape {name!r} of {file} has the transform <{step.tag}>; replace it by a <matrix>")
         result = matrix @ result
     return result
 
@@ -166,7 +170,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _material(bsdf: ET.Element) -> RadioMaterial | None:
-    """Returns the material as Sionna RT understands a bsdf; None for one that is about looks alone."""
+    """Returns the material of a bsdf as Sionna RT interprets it; None if it describes only the appearance."""
 
     def value(kind: str, name: str, missing: float | str) -> Any:
         found = bsdf.find(f"{kind}[@name='{name}']")

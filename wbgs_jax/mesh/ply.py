@@ -1,8 +1,7 @@
-"""Meshes and point clouds as PLY files, in and out; positions in metres, in whatever frame the file has.
+"""Reads and writes meshes and point clouds as PLY files; positions are in metres, in the frame of the file.
 
-The PLY format (Turk 1994): elements, each with properties that are numbers or lists of numbers, as text or binary.
-
-The libraries that read it are under the GPL, or read no polygons of different sizes.
+A PLY file (Turk 1994) has elements with properties, which are numbers or lists of numbers, as text or binary. Existing
+libraries are under the GPL or do not read polygons of different sizes.
 """
 
 import struct
@@ -24,13 +23,13 @@ TYPES = {
     **{"float32": "f4", "float64": "f8"},
 }
 FORMATS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
-"""Byte orders; none: text."""
+"""Byte orders; empty for text."""
 LONGEST_HEADER = 1 << 16
 """Bytes."""
 
 
 class Ragged(NamedTuple):
-    """Lists of different lengths, one after the other."""
+    """Lists of different lengths, concatenated."""
 
     values: Num[np.ndarray, " total"]
     sizes: Int[np.ndarray, " n"]
@@ -41,7 +40,7 @@ Columns = dict[str, np.ndarray | Ragged]
 
 
 class _Damaged(ValueError):
-    """What is wrong with a file, in words that fit into parentheses."""
+    """Describes a defect of a file, worded to fit into parentheses."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class _Property:
     name: str
     type: np.dtype
     count: np.dtype | None
-    """Of the length of a list; None: a number."""
+    """Type of the length of a list; None for a number."""
 
 
 @dataclass(frozen=True)
@@ -61,24 +60,24 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Body:
-    """What follows the header: bytes, or the numbers of a text."""
+    """Content after the header: bytes, or the numbers of a text."""
 
     cells: np.ndarray
     is_text: bool
 
     def width(self, kind: np.dtype) -> int:
-        """Returns how many cells a number takes."""
+        """Returns the number of cells of a value."""
         return 1 if self.is_text else kind.itemsize
 
     def reader(self, kind: np.dtype | None) -> Callable[[memoryview, int], tuple[float]]:
-        """Returns a quick function that reads one number."""
+        """Returns a fast function that reads one number."""
         if self.is_text or kind is None:
             return lambda cells, place: (cells[place],)
         order = "" if kind.str[0] == "|" else kind.str[0]
         return struct.Struct(order + kind.char).unpack_from
 
     def at(self, places: Int[np.ndarray, " n"], kind: np.dtype) -> Num[np.ndarray, " n"]:
-        """Returns the numbers that begin at some cells."""
+        """Returns the numbers that begin at the given cells."""
         if self.is_text:
             numbers = self.cells[places]
         else:
@@ -98,7 +97,7 @@ def read_elements(path: Path | str) -> dict[str, Columns]:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}; check the path and its permissions") from error
     try:
-        with np.errstate(invalid="ignore", over="ignore"):  # numbers that no integer holds: faces point nowhere then
+        with np.errstate(invalid="ignore", over="ignore"):  # floats that no integer can hold give faces with invalid indices
             order, elements, body = _header(content)
             return _elements(elements, _text(body) if not order else _Body(np.frombuffer(body, np.uint8), False))
     except _Damaged as error:
@@ -131,11 +130,11 @@ def write_elements(path: Path | str, elements: Mapping[str, np.ndarray]) -> None
 
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
-    """Returns the byte order (none: text), the elements, and what follows."""
+    """Returns the byte order (empty for text), the elements, and the rest of the content."""
     end = content.find(b"end_header", 0, LONGEST_HEADER)
     lines = [line.split() for line in content[: max(end, 0)].splitlines()]
     if len(lines) < 2 or lines[0] != [b"ply"] or len(lines[1]) != 3 or lines[1][1] not in FORMATS:
-        raise _Damaged("its header is none")
+        raise _Damaged("it has no valid header")
     order, elements = FORMATS[lines[1][1]], list[_Element]()
     for words in lines[2:]:
         match words:
@@ -150,8 +149,8 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
             case [b"property", kind, name] if elements:
                 elements[-1].properties.append(_Property(name.decode(errors="replace"), _type(kind, order), None))
             case _:
-                raise _Damaged(f"its header says {b' '.join(words)[:60].decode(errors='replace')!r}")
-    ends = b"\n" if b"\n" in content[:end] else b"\r"  # of lines: binary content may begin with either
+                raise _Damaged(f"invalid header line {b' '.join(words)[:60].decode(errors='replace')!r}")
+    ends = b"\n" if b"\n" in content[:end] else b"\r"  # line end of the header: binary content may begin with either
     body = content.find(ends, end)
     return order, elements, content[body + 1 :] if body >= 0 else b""
 
@@ -159,7 +158,7 @@ def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
 def _type(name: bytes, order: str) -> np.dtype:
     code = TYPES.get(name.decode(errors="replace"))
     if code is None:
-        raise _Damaged(f"numbers of no known type {name[:20].decode(errors='replace')!r}")
+        raise _Damaged(f"unknown number type {name[:20].decode(errors='replace')!r}")
     return np.dtype(order + code)
 
 
@@ -167,7 +166,7 @@ def _text(body: bytes) -> _Body:
     try:
         return _Body(np.array(body.split(), np.float64), True)
     except ValueError:
-        raise _Damaged("what should be numbers is none") from None
+        raise _Damaged("it contains something other than numbers") from None
 
 
 def _elements(elements: list[_Element], body: _Body) -> dict[str, Columns]:
@@ -175,19 +174,19 @@ def _elements(elements: list[_Element], body: _Body) -> dict[str, Columns]:
     for element in elements:
         least = sum(body.width(p.count or p.type) for p in element.properties)
         if element.rows * least > len(body.cells) - start:
-            raise _Damaged(f"{element.rows} rows of {element.name} are announced, and it ends before")
+            raise _Damaged(f"{element.rows} rows of {element.name} are declared, but the data end before")
         found[element.name], start = _columns(element, body, start)
     return found
 
 
 def _columns(element: _Element, body: _Body, start: int) -> tuple[Columns, int]:
-    """Returns an element's properties, and where it ends."""
+    """Returns an element's properties and the position of its end."""
     if not element.rows or not element.properties:
         empty = {
             p.name: np.zeros(0, p.type) if p.count is None else _no_lists(element.rows, p.type) for p in element.properties
         }
         return empty, start
-    places, sizes, end = _alike(element, body, start) or _one_by_one(element, body, start, element.rows)
+    places, sizes, end = _equal_rows(element, body, start) or _varying_rows(element, body, start, element.rows)
     columns: Columns = {}
     for number, p in enumerate(element.properties):
         if p.count is None:
@@ -204,12 +203,12 @@ def _no_lists(rows: int, kind: np.dtype) -> Ragged:
 
 
 Walked = tuple[np.ndarray, np.ndarray, int]
-"""Where every property's numbers begin (properties, rows), how many they are, and where the element ends."""
+"""First cell of every property's numbers (properties, rows), their counts, and the end of the element."""
 
 
-def _alike(element: _Element, body: _Body, start: int) -> Walked | None:
-    """Returns the places of rows whose lists are all as long as the first one's; None where some are not."""
-    first, sizes, end = _one_by_one(element, body, start, 1)
+def _equal_rows(element: _Element, body: _Body, start: int) -> Walked | None:
+    """Returns the positions of rows whose lists all have the lengths of the first row; None if some differ."""
+    first, sizes, end = _varying_rows(element, body, start, 1)
     stride = end - start
     if start + stride * element.rows > len(body.cells):
         return None
@@ -220,22 +219,22 @@ def _alike(element: _Element, body: _Body, start: int) -> Walked | None:
     return places, sizes, start + stride * element.rows
 
 
-def _one_by_one(element: _Element, body: _Body, start: int, rows: int) -> Walked:
-    """Returns the places of any rows, one after the other."""
+def _varying_rows(element: _Element, body: _Body, start: int, rows: int) -> Walked:
+    """Returns the positions of rows with lists of any length, read one after the other."""
     layout = [(body.width(p.type), body.width(p.count) if p.count else 0, body.reader(p.count)) for p in element.properties]
     cells, places, sizes, place = memoryview(body.cells), list[int](), list[int](), start
     try:
         for _ in range(rows):
-            for width, head, told in layout:
-                size = int(told(cells, place)[0]) if head else 1
+            for width, head, read_size in layout:
+                size = int(read_size(cells, place)[0]) if head else 1
                 place += head
                 if size < 0:
-                    raise _Damaged("a list has no length")
+                    raise _Damaged("a list has a negative length")
                 places.append(place)
                 sizes.append(size)
                 place += size * width
     except (struct.error, IndexError, ValueError, OverflowError) as error:
-        raise _Damaged(f"it ends within {element.name}, or a list has no length") from error
+        raise _Damaged(f"it ends within {element.name}, or a list has an invalid length") from error
     if place > len(body.cells):
         raise _Damaged(f"it ends within {element.name}")
     shape = rows, len(layout)
@@ -243,39 +242,43 @@ def _one_by_one(element: _Element, body: _Body, start: int, rows: int) -> Walked
 
 
 CORNERS = ("vertex_indices", "vertex_index")
-"""What exporters call the corners of faces."""
+"""Names that exporters use for the corners of faces."""
 STRIPS = "tristrips"
-"""Element whose lists are strips of triangles: each corner makes one with the two before it; -1 begins a new strip."""
+"""Element whose lists are triangle strips: each corner makes a triangle with the two before it; -1 begins a new strip."""
 
 
 def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """Returns vertices (float32) and triangles (int32) of a PLY file, ASCII or binary; otherwise as `read_mesh`."""
+    """Returns vertices (float32) and triangles (int32) of a PLY file, ASCII or binary.
+
+    Raises:
+        UserError: as in `read_mesh`, or coordinates that are not finite in single precision.
+    """
     vertices, faces = read_mesh(path)
     with np.errstate(over="ignore"):
         single = vertices.astype(np.float32)
     if not np.isfinite(single).all():
-        raise UserError(f"{path} has NaN or infinity among its vertices; clean the mesh and export it again")
+        raise UserError(f"{path} has NaN or infinite vertex coordinates; clean the mesh and export it again")
     return single, faces
 
 
 def read_mesh(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
     """Returns vertices (float64) and triangles (int32) of a PLY file, ASCII or binary.
 
-    Quads and larger polygons, concave ones too, and strips of triangles are cut into triangles; polygons of fewer than three
-    corners are left out. A cloud without faces has no triangles.
+    Quads and larger polygons (also concave ones) and triangle strips are cut into triangles; polygons of fewer than three
+    corners are omitted. A point cloud has no triangles.
 
     Raises:
-        UserError: the file is missing, truncated, not a PLY, without points, or its numbers make no mesh.
+        UserError: the file is missing, truncated, not a PLY file, without points, or not a valid mesh.
     """
     path, elements = Path(path), read_elements(path)
     points, polygons = elements.get("vertex", {}), elements.get("face", {})
     axes = [points.get(axis) for axis in "xyz"]
     if not all(isinstance(axis, np.ndarray) and len(axis) for axis in axes):
-        raise UserError(f"{path} holds no points: it needs a 'vertex' element with x, y and z; export the mesh again")
+        raise UserError(f"{path} has no points: it needs a 'vertex' element with x, y and z; export the mesh again")
     vertices = np.stack([np.asarray(axis, np.float64) for axis in axes], -1)
     corners = next((polygons[name] for name in CORNERS if name in polygons), None)
     if isinstance(corners, np.ndarray):
-        raise UserError(f"{path} has one corner a face; export the mesh again")
+        raise UserError(f"{path} has a single corner per face; export the mesh again")
     faces = np.zeros((0, 3), np.int64)
     if corners is not None:
         faces = triangulate(vertices, np.asarray(corners.values, np.int64), corners.sizes)
@@ -284,12 +287,12 @@ def read_mesh(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np
         if isinstance(own, Ragged):
             faces = np.concatenate([faces, strip_triangles(own)])
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
-        raise UserError(f"{path} has faces that point at vertices that do not exist; export the mesh again")
+        raise UserError(f"{path} has faces that refer to vertices that do not exist; export the mesh again")
     return vertices, faces.astype(np.int32)
 
 
 def write_ply(path: Path | str, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
-    """Writes float32 vertices and int32 triangles as a binary PLY file, atomically; no triangles make a point cloud."""
+    """Writes float32 vertices and int32 triangles as a binary PLY file, atomically; without triangles it is a point cloud."""
     points = np.rec.fromarrays(np.asarray(vertices, "<f4").T, dtype=[(axis, "<f4") for axis in "xyz"])
     elements: dict[str, np.ndarray] = {"vertex": points}
     if len(faces):
@@ -299,7 +302,7 @@ def write_ply(path: Path | str, vertices: Float[np.ndarray, "vertices 3"], faces
 
 
 def strip_triangles(strips: Ragged) -> Int[np.ndarray, "n 3"]:
-    """Returns the triangles of strips, every second one turned back; those without area only lead from one part to the next."""
+    """Returns the triangles of strips with alternating order undone; degenerate ones, which only connect parts, are dropped."""
     found = [np.zeros((0, 3), np.int64)]
     for own in np.split(np.asarray(strips.values, np.int64), np.cumsum(strips.sizes)[:-1]):
         for part in np.split(own, np.flatnonzero(own == -1)):
@@ -308,6 +311,6 @@ def strip_triangles(strips: Ragged) -> Int[np.ndarray, "n 3"]:
                 continue
             three = np.stack([corners[:-2], corners[1:-1], corners[2:]], -1)
             three[1::2] = three[1::2, [1, 0, 2]]
-            alike = (three[:, 0] == three[:, 1]) | (three[:, 1] == three[:, 2]) | (three[:, 0] == three[:, 2])
-            found.append(three[~alike])
+            degenerate = (three[:, 0] == three[:, 1]) | (three[:, 1] == three[:, 2]) | (three[:, 0] == three[:, 2])
+            found.append(three[~degenerate])
     return np.concatenate(found)

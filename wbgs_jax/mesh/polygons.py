@@ -1,4 +1,4 @@
-"""Triangles of polygons, concave ones too."""
+"""Triangulation of convex and concave polygons."""
 
 from typing import Any
 
@@ -6,21 +6,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 FLAT = 1e-12
-"""Share of a polygon's squared size below which a corner is none."""
+"""Fraction of a polygon's squared size below which the area of a corner counts as zero."""
 
 
 def triangulate(
     vertices: Float[np.ndarray, "v 3"], corners: Int[np.ndarray, " total"], sizes: Int[np.ndarray, " n"]
 ) -> Int[np.ndarray, "t 3"]:
-    """Returns the triangles of polygons, in their order and orientation; fewer than three corners are none.
+    """Returns the triangles of polygons, in their order and orientation; polygons of fewer than three corners give none.
 
-    Convex ones become fans around their first corner. Others are cut by their ears (Meisters 1975), in the plane of Newell's
-    normal.
+    Convex polygons become fans around their first corner. Others are cut by ear clipping (Meisters 1975), in the plane of
+    Newell's normal.
 
     Args:
         vertices: any unit.
-        corners: of all polygons, one after the other.
-        sizes: how many corners each has.
+        corners: indices of all polygons' corners, concatenated.
+        sizes: number of corners of each polygon.
     """
     corners = np.asarray(corners, np.int64)
     fans = np.maximum(sizes - 2, 0)
@@ -40,7 +40,7 @@ def triangulate(
 def _concave(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], fans: Int[np.ndarray, " n"]
 ) -> Int[np.ndarray, " k"]:
-    """Returns the polygons with a triangle of the fan that is turned against the sum of all of its own."""
+    """Returns the polygons whose fan has a triangle oriented against the polygon's total normal."""
     a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[triangles], 1, 0)
     normal = np.cross(b - a, c - a)
     polygon = np.repeat(np.arange(len(fans)), fans)
@@ -51,7 +51,7 @@ def _concave(
 
 
 def _ears(points: Float[np.ndarray, "n 3"], names: Int[np.ndarray, " n"]) -> Int[np.ndarray, "t 3"]:
-    """Returns the triangles of a polygon, one ear after the other; of one that crosses itself, whatever is left as a fan."""
+    """Returns the triangles of a polygon by ear clipping; what remains of a self-intersecting one becomes a fan."""
     plane = _in_plane(np.asarray(points, np.float64))
     left, found = list(range(len(plane))), []
     size = float(np.ptp(plane, axis=0).max()) ** 2
@@ -68,7 +68,7 @@ def _ears(points: Float[np.ndarray, "n 3"], names: Int[np.ndarray, " n"]) -> Int
 
 
 def _is_ear(plane: Float[np.ndarray, "n 2"], left: list[int], i: int, least: float) -> bool:
-    """Returns whether the triangle at a corner lies within the polygon; one without area is cut off as well."""
+    """Returns whether the triangle at a corner lies within the polygon; triangles without area count as ears."""
     a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
     area = _area(plane[a], plane[b], plane[c])
     if area < -least:
@@ -77,7 +77,7 @@ def _is_ear(plane: Float[np.ndarray, "n 2"], left: list[int], i: int, least: flo
     if abs(area) <= least:
         return True
     corners = plane[[a, b, c]]
-    same = (np.abs(others[:, None] - corners) < np.sqrt(least)).all(-1).any(-1)  # a bridge to a hole comes back to its corner
+    same = (np.abs(others[:, None] - corners) < np.sqrt(least)).all(-1).any(-1)  # a bridge to a hole returns to its corner
     sides = np.stack([_area(corners[k], corners[(k + 1) % 3], others) for k in range(3)])
     return not ((sides > -least).all(0) & ~same).any()
 
@@ -88,7 +88,7 @@ def _area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Any:
 
 
 def _in_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Returns coordinates in the polygon's plane, in which it goes round counter-clockwise."""
+    """Returns coordinates in the polygon's plane, in which its orientation is counter-clockwise."""
     following = np.roll(points, -1, 0)
     normal = np.cross(points - points[0], following - points[0]).sum(0)
     length = np.linalg.norm(normal)

@@ -1,9 +1,10 @@
-"""A finely tessellated mesh with fewer triangles, and how far it is from what it was (host).
+"""Simplification of a finely tessellated mesh, with a measure of the deviation from the original (host).
 
-Vertices are drawn into neighbours where that moves surfaces least, by quadric error metrics (Garland and Heckbert, SIGGRAPH
-1997): the sum over the planes that met in a vertex of their areas times squared distances. A border counts as a wall upright on
-it, so sheets keep their outline. What is left are corners of the mesh as it was: planes stay planes. Objects never grow
-together, and large surfaces go last. Many vertices that are no neighbours go at once.
+Vertices are collapsed into neighbours where that changes the surfaces least, by quadric error metrics (Garland and Heckbert,
+SIGGRAPH 1997): the sum of squared distances from the planes that met in a vertex, weighted by area. A border adds a plane
+perpendicular to its surface, so that sheets keep their outline. The remaining vertices are vertices of the original mesh, so
+planes stay planes. Separate objects are never merged, and large surfaces are simplified last. Many vertices that are not
+neighbours are collapsed at once.
 """
 
 import dataclasses
@@ -20,45 +21,46 @@ from wbgs_jax.mesh.facets import Facets, areas, facets_from_mesh
 from wbgs_jax.types import Mesh
 
 WELD = 1e-5
-"""Metres: corners of one object that are nearer are one."""
+"""Metres: corners of one object that are nearer than this are merged."""
 BORDER = 10.0
-"""Weight of a border's upright wall, as high as the border is long."""
+"""Weight of a border's perpendicular plane, whose area is the square of the border's length."""
 SHORT = 1e-16
-"""What a side costs, times the fourth power of its length and a random factor of 1 to 2: flat pieces lose short sides first, in
-no order that would let only one go at a time."""
+"""Extra cost of a side: this factor times the fourth power of its length and a random factor of 1 to 2. Flat pieces lose their
+short sides first, in a random order in which many can be collapsed at once."""
 TURNED = 0.2
-"""Cosine of the largest angle that a triangle is turned by at once."""
+"""Cosine of the largest angle by which a triangle may be rotated in one step."""
 AT_ONCE = 0.5
-"""Share of the vertices, the cheapest, that may go at once."""
+"""Fraction of the vertices (the cheapest) that may be collapsed in one step."""
 FINE = 300_000
-"""Triangles: meshes of more are simplified before coplanar ones are merged, which takes longer."""
+"""Triangles: larger meshes are simplified before coplanar triangles are merged, which would take longer."""
 FEW = 3000
-"""Facets that cost little time: as many as there are, and of a mesh that is simplified, ..."""
+"""Number of facets that cost little time: at least this many of the existing ones are kept (and this many of a simplified
+mesh), ..."""
 KEPT = 0.98
-"""... and as many of the largest beyond them as make up this share of the surface."""
+"""... and as many of the largest ones as make up this fraction of the surface."""
 LEFT_OUT = 0.1
-"""Share of the surface that may be left out, as its smallest facets, before the mesh is simplified instead."""
+"""Fraction of the surface that may be omitted as its smallest facets before the mesh is simplified instead."""
 TRIES = 4
 PROBES = 1000
-"""Points on the mesh whose distance from the simplified one is measured."""
+"""Points on the mesh whose distances from the simplified mesh are measured."""
 
 Quadrics = Float[np.ndarray, "v 10"]
-"""xx, xy, xz, yy, yz, zz, x, y, z and 1 of the sum of squared distances from planes, seen from the vertex: the walls of a large
-room would drown small things in rounding errors, seen from its origin."""
+"""Coefficients xx, xy, xz, yy, yz, zz, x, y, z and 1 of the sum of squared distances from planes, relative to the vertex:
+relative to the origin of a large room, rounding errors would exceed the contributions of small objects."""
 
 
 @dataclass(frozen=True)
 class Simplified:
-    """What was left out."""
+    """Size of a simplified mesh and its deviation from the original."""
 
     triangles: int
-    """Of the mesh as it was ..."""
+    """Triangles of the original mesh ..."""
     left: int
     """... and of the simplified one."""
     typical_mm: float
-    """Median distance of points on the mesh from the simplified one ..."""
+    """Median distance of points on the original mesh from the simplified one, millimetres ..."""
     largest_mm: float
-    """... and the distance that 99 of 100 keep."""
+    """... and the 99th percentile of these distances, millimetres."""
 
     def __str__(self) -> str:
         size = f"{self.typical_mm:.2f} mm in the median, 99 of 100 points within {self.largest_mm:.1f} mm"
@@ -66,8 +68,9 @@ class Simplified:
 
 
 def facets_that_fit(mesh: Mesh, most: int) -> Facets:
-    """Returns at most so many facets: the largest of the mesh, as many as count (`FEW`, `KEPT`), or those of a simplified one
-    where the largest would leave out what counts; a warning says how far it is from the mesh as it was."""
+    """Returns at most `most` facets: the largest of the mesh, as many as matter (`FEW`, `KEPT`), or those of a simplified mesh
+    if the largest would omit too much of the surface (`LEFT_OUT`). A warning then states the deviation from the original
+    mesh."""
     if len(mesh.faces) <= FINE:
         found = facets_from_mesh(mesh)
         share = np.cumsum(areas(found)) / areas(found).sum()
@@ -87,11 +90,11 @@ def facets_that_fit(mesh: Mesh, most: int) -> Facets:
 
 
 def simplified(mesh: Mesh, triangles: int, seed: int = 0) -> tuple[Mesh, Simplified]:
-    """Returns a mesh of so many triangles at most, if its shape allows, and what that costs.
+    """Returns a mesh of at most `triangles` triangles, if its shape allows, and its deviation from the original.
 
     Args:
-        mesh: objects (`part`) and materials stay apart.
-        triangles: as many as are left.
+        mesh: objects (`part`) and materials stay separate.
+        triangles: number of triangles to keep.
         seed: of the points at which distances are measured.
     """
     faces, part, material = (np.asarray(leaf) for leaf in (mesh.faces, mesh.part, mesh.material))
@@ -114,7 +117,7 @@ def simplified(mesh: Mesh, triangles: int, seed: int = 0) -> tuple[Mesh, Simplif
 def welded(
     corners: Float[np.ndarray, "t 3 3"], piece: Int[np.ndarray, " t"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Returns the corners of every piece without duplicates, and where the corners of all triangles are among them."""
+    """Returns the corners of every piece without duplicates, and the indices of all triangles' corners among them."""
     grid = np.round(corners.reshape(-1, 3) / WELD).astype(np.int64)
     keys = np.ascontiguousarray(np.column_stack([np.repeat(piece, 3), grid]))
     rows = keys.view([("", keys.dtype)] * 4).reshape(-1)
@@ -125,7 +128,7 @@ def welded(
 def decimated(
     points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], count: int
 ) -> tuple[Int[np.ndarray, "l 3"], Int[np.ndarray, " l"]]:
-    """Returns at most so many triangles, if their shape allows, and which of the old ones each of them was."""
+    """Returns at most `count` triangles, if their shape allows, and the index of each among the original ones."""
     which = np.flatnonzero((triangles != np.roll(triangles, 1, 1)).all(1))
     triangles = triangles[which]
     quadrics, rng = vertex_quadrics(points, triangles), np.random.default_rng(0)
@@ -133,13 +136,13 @@ def decimated(
     while len(triangles) > count:
         sides = _Sides.of(points, triangles, quadrics, refused, rng)
         removed, kept, no = sides.collapses(points, triangles, (len(triangles) - count + 1) // 2)
-        if not len(removed) and not len(no):  # all that is left has refused; what it refused for may be gone since
+        if not len(removed) and not len(no):  # every side left has been refused; the reasons may have disappeared since
             if not fewer:
                 break
             refused, fewer = refused[:0], False
             continue
         refused, fewer = np.union1d(refused, no), fewer or len(removed) > 0
-        np.add.at(quadrics, kept, _seen_from(quadrics[removed], points[kept] - points[removed]))
+        np.add.at(quadrics, kept, _displaced(quadrics[removed], points[kept] - points[removed]))
         target = np.arange(len(points))
         target[removed] = kept
         triangles = target[triangles]
@@ -149,7 +152,8 @@ def decimated(
 
 
 def vertex_quadrics(points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> Quadrics:
-    """Returns the quadrics of all vertices: of the planes of their triangles, by area, and of walls upright on borders."""
+    """Returns the quadrics of all vertices: planes of their triangles, weighted by area, and perpendicular planes on
+    borders."""
     a, b, c = points[triangles].swapaxes(0, 1)
     normal, twice = _unit(np.cross(b - a, c - a))
     planes = _plane(normal) * (twice / 2)[:, None]
@@ -157,7 +161,7 @@ def vertex_quadrics(points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray,
     for corner in triangles.T:
         np.add.at(quadrics, corner, planes)
     sides = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    border = np.flatnonzero(_times(sides, len(points)) == 1)
+    border = np.flatnonzero(_multiplicity(sides, len(points)) == 1)
     u, v = sides[border].T
     upright, length = _unit(np.cross(points[v] - points[u], normal[border // 3]))
     walls = BORDER * _plane(upright) * (length**2)[:, None]
@@ -167,7 +171,7 @@ def vertex_quadrics(points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray,
 
 
 def distances(corners: Float[np.ndarray, "t 3 3"], others: Float[np.ndarray, "f 3 3"], seed: int) -> Float[np.ndarray, " n"]:
-    """Returns how far points drawn on some triangles are from other triangles, metres."""
+    """Returns the distances (metres) of points drawn at random on triangles from other triangles."""
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     rng = np.random.default_rng(seed)
     one = corners[rng.choice(len(corners), PROBES, p=area / area.sum())]
@@ -176,7 +180,7 @@ def distances(corners: Float[np.ndarray, "t 3 3"], others: Float[np.ndarray, "f 
 
 
 def distance_from(point: Float[np.ndarray, "3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
-    """Returns how far a point is from the nearest of some triangles: from its plane if it stands over it, else from a side."""
+    """Returns the distance from a point to the nearest triangle: to its plane if the foot lies inside it, else to a side."""
     along = np.roll(triangles, -1, 1) - triangles
     arm = point - triangles
     share = np.sum(arm * along, -1) / np.maximum(np.sum(along**2, -1), 1e-30)
@@ -189,7 +193,7 @@ def distance_from(point: Float[np.ndarray, "3"], triangles: Float[np.ndarray, "f
 
 @dataclass(frozen=True)
 class _Sides:
-    """The sides of some triangles, both ways round, and what it costs to draw their first ends into the second ones."""
+    """Directed sides of triangles, and the cost of collapsing their first ends into the second ones."""
 
     start: Int[np.ndarray, " e"]
     end: Int[np.ndarray, " e"]
@@ -204,7 +208,7 @@ class _Sides:
         refused: Int[np.ndarray, " n"],
         rng: np.random.Generator,
     ) -> "_Sides":
-        names = np.sort(_name(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), len(points)))
+        names = np.sort(_side_key(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), len(points)))
         names = names[np.append(True, np.diff(names) > 0)]
         u, v = names // len(points), names % len(points)
         way = points[v] - points[u]
@@ -218,7 +222,7 @@ class _Sides:
     def collapses(
         self, points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], most: int
     ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " n"]]:
-        """Returns vertices, no two of them neighbours, the neighbours into which they are drawn, and sides that refuse."""
+        """Returns vertices to remove, no two of them neighbours, the neighbours they collapse into, and sides refused."""
         lowest_cost, best = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
         np.minimum.at(lowest_cost, self.start, self.cost)
         is_best = np.flatnonzero(self.cost == lowest_cost[self.start])
@@ -240,7 +244,7 @@ class _Sides:
     def _keeps_topology(
         self, triangles: Int[np.ndarray, "t 3"], removed: Int[np.ndarray, " k"], kept: Int[np.ndarray, " k"], count: int
     ) -> Bool[np.ndarray, " k"]:
-        """Returns where two ends have no neighbours in common but those of the triangles that vanish: nothing is pinched."""
+        """Returns where two ends share only the neighbours of the triangles that vanish, so that nothing is pinched."""
         ones = np.ones(len(self.start), np.int32)
         neighbours = coo_array((ones, (self.start, self.end)), shape=(count, count)).tocsr()
         common = neighbours[removed].multiply(neighbours[kept]).sum(1)
@@ -256,7 +260,7 @@ def _keeps_shape(
     removed: Int[np.ndarray, " k"],
     kept: Int[np.ndarray, " k"],
 ) -> Bool[np.ndarray, " k"]:
-    """Returns which vertices may go without turning a triangle over."""
+    """Returns which vertices can be removed without flipping a triangle."""
     own = _owner(triangles, removed, len(points))
     touched = np.flatnonzero(own >= 0)
     target = np.arange(len(points))
@@ -271,20 +275,20 @@ def _keeps_shape(
 
 
 def _owner(triangles: Int[np.ndarray, "t 3"], removed: Int[np.ndarray, " k"], count: int) -> Int[np.ndarray, " t"]:
-    """Returns which of the vertices that go is the triangle's, -1 for none: no triangle has two."""
+    """Returns the index of the removed vertex of every triangle, -1 for none; no triangle has two."""
     row = np.full(count, -1)
     row[removed] = np.arange(len(removed))
     return row[triangles].max(1)
 
 
-def _name(sides: Int[np.ndarray, "s 2"], count: int) -> Int[np.ndarray, " s"]:
-    """Returns one integer for every side, whichever way it goes."""
+def _side_key(sides: Int[np.ndarray, "s 2"], count: int) -> Int[np.ndarray, " s"]:
+    """Returns one integer per side, independent of its direction."""
     return sides.min(1).astype(np.int64) * count + sides.max(1)
 
 
-def _times(sides: Int[np.ndarray, "s 2"], count: int) -> Int[np.ndarray, " s"]:
-    """Returns how many triangles share every side."""
-    _, which, times = np.unique(_name(sides, count), return_inverse=True, return_counts=True)
+def _multiplicity(sides: Int[np.ndarray, "s 2"], count: int) -> Int[np.ndarray, " s"]:
+    """Returns the number of triangles that share every side."""
+    _, which, times = np.unique(_side_key(sides, count), return_inverse=True, return_counts=True)
     return times[which.reshape(-1)]
 
 
@@ -294,19 +298,19 @@ def _unit(vectors: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], 
 
 
 def _plane(normal: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 10"]:
-    """Returns the quadrics of planes, seen from points in them."""
+    """Returns the quadrics of planes, relative to points in them."""
     x, y, z = normal.T
     nothing = np.zeros((len(normal), 4))
     return np.concatenate([np.stack([x * x, x * y, x * z, y * y, y * z, z * z], -1), nothing], -1)
 
 
-def _seen_from(quadrics: Float[np.ndarray, "n 10"], way: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 10"]:
-    """Returns quadrics as they are seen from points that are so far away."""
+def _displaced(quadrics: Float[np.ndarray, "n 10"], way: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 10"]:
+    """Returns quadrics relative to points displaced by `way`."""
     return np.concatenate([quadrics[:, :6], quadrics[:, 6:9] + _slope(quadrics, way), _at(quadrics, way)[:, None]], -1)
 
 
 def _at(quadrics: Float[np.ndarray, "n 10"], way: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns quadrics so far away."""
+    """Returns the values of quadrics at a displacement `way`."""
     return quadrics[:, 9] + np.sum(way * (2 * quadrics[:, 6:9] + _slope(quadrics, way)), -1)
 
 

@@ -1,4 +1,4 @@
-"""Closed bodies, and which points are inside (NumPy)."""
+"""Tests which points lie inside closed bodies (NumPy)."""
 
 from typing import NamedTuple
 
@@ -6,19 +6,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 CHUNK = 1_000_000
-"""Pairs of a point and a triangle whose solid angles are computed together; bounds the memory to some 100 MB."""
+"""Maximum number of pairs of a point and a triangle whose solid angles are computed together; limits memory to about 100 MB."""
 
 
 class ClosedBody(NamedTuple):
-    """A solid object: a cabinet, a pillar."""
+    """A closed object, such as a cabinet or a pillar."""
 
     name: str
     triangles: Float[np.ndarray, "t 3 3"]
-    """Corners, metres."""
+    """Corners of the triangles, metres."""
 
 
 def inside(body: ClosedBody, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Returns which points a body goes around."""
+    """Returns which points (metres) lie inside a body."""
     low, high = body.triangles.min((0, 1)), body.triangles.max((0, 1))
     result = ((points > low) & (points < high)).all(1)
     result[result] = np.abs(winding_number(body.triangles, points[result])) > 0.5
@@ -26,8 +26,8 @@ def inside(body: ClosedBody, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarra
 
 
 def winding_number(triangles: Float[np.ndarray, "t 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns how often closed triangles go around every point: 0 outside, 1 or -1 inside (from their solid angles, van
-    Oosterom and Strackee 1983)."""
+    """Returns the winding number of closed triangles around every point: 0 outside, 1 or -1 inside (computed from solid angles,
+    van Oosterom and Strackee 1983)."""
     step = max(1, CHUNK // max(1, len(triangles)))
     each = [_solid_angles(triangles, points[i : i + step]).sum(1) for i in range(0, len(points), step)]
     return np.concatenate([np.zeros(0), *each]) / (4 * np.pi)

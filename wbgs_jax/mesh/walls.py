@@ -1,9 +1,10 @@
-"""Closed boxes that are walls: building models give a wall two faces, where a slab of its thickness is one surface.
+"""Converts walls modelled as closed boxes to single sheets: building models give a wall two faces, while the propagation model
+needs one surface with a slab of the wall's thickness.
 
-A wave that passes two surfaces, each a slab of the wall's thickness, is attenuated twice. So of a thin closed body only the
-face that looks at the middle of the room is kept, and the distance of the two faces is its thickness. Surfaces that met meet
-again: a panel in an opening moves into the plane of its wall, and a sheet that ended at the face that is gone is lengthened
-to the other.
+A wave that passes two surfaces, each a slab of the wall's thickness, would be attenuated twice. Of a thin closed body,
+therefore, only the face towards the middle of the room is kept, and the distance between its two faces is the thickness.
+Surfaces that met are joined again: a panel in an opening moves into the plane of its wall, and a sheet that ended at a removed
+face is extended to the remaining one.
 """
 
 from collections.abc import Sequence
@@ -14,44 +15,44 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 
 THICKEST = 0.6
-"""Metres of a wall or a floor, at most."""
+"""Maximum thickness of a wall or floor, metres."""
 THIN = 0.25
-"""Thickness over the smaller of the two other sides, at most."""
+"""Maximum ratio of the thickness to the smaller of the two other sides."""
 SMALLEST_WALL, SMALLEST_FLOOR = 0.5, 2.0
-"""Metres: the smaller side of an upright slab and of a level one, at least; a table top is a body with edges."""
+"""Metres: minimum of the smaller side of a vertical and of a horizontal slab. A table top stays a body with edges."""
 MOST_FACES = 2_000
-"""Triangles of a wall; a body of more is something else."""
+"""Maximum number of triangles of a wall."""
 UNEQUAL = 0.02
-"""Share by which the areas of the two faces may differ."""
+"""Maximum relative difference between the areas of the two faces."""
 FLAT = 1e-3
-"""Metres that corners may be off the plane of a face, and corners of one side off a line."""
+"""Metres: maximum distance of corners from the plane of a face, and of the corners of a side from a line."""
 PARALLEL = 0.999
-"""Cosine between the normals of one face, at least."""
+"""Minimum cosine between the normals of one face."""
 NEAR = 0.02
-"""Metres between bodies that touch, at most."""
+"""Maximum distance between touching bodies, metres."""
 
 
 @dataclass
 class Sheet:
-    """A flat piece of surface, and the body that it stands for."""
+    """A planar piece of surface and the body that it represents."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "t 3"]
     normal: Float[np.ndarray, "3"]
     thickness: float
-    """Metres between the two faces of the body; 0 where there was but one."""
+    """Distance between the two faces of the body, metres; 0 if there was only one."""
     bounds: Float[np.ndarray, "2 3"]
     """Lowest and highest corner of the body."""
     span: Float[np.ndarray, "2"]
-    """Lowest and highest place of the body along the normal, metres."""
+    """Lowest and highest coordinate of the body along the normal, metres."""
 
     @property
     def offset(self) -> float:
-        """The place of the plane along the normal, metres."""
+        """Coordinate of the plane along the normal, metres."""
         return float(self.vertices[0] @ self.normal)
 
     def axes(self) -> Float[np.ndarray, "2 3"]:
-        """Returns two directions in the plane, the first one level."""
+        """Returns two orthogonal unit vectors in the plane, the first one horizontal."""
         level = np.cross(self.normal, [0.0, 0.0, 1.0])
         size = np.linalg.norm(level)
         first = level / size if size > 1e-3 else np.array([1.0, 0.0, 0.0])
@@ -59,8 +60,14 @@ class Sheet:
 
 
 def walls_as_sheets(meshes: Sequence[trimesh.Trimesh]) -> tuple[list[trimesh.Trimesh], list[float]]:
-    """Returns the meshes of a room (metres, z up), those of which all bodies are walls as sheets; and the thickness of these
-    walls, metres, 0 for all other meshes."""
+    """Returns the meshes of a room with those consisting only of walls converted to sheets, and the thickness of these walls.
+
+    Args:
+        meshes: metres, z up.
+
+    Returns:
+        The meshes, and one thickness per mesh (metres), 0 for those that are not walls.
+    """
     corners = np.concatenate([mesh.bounds for mesh in meshes])
     centre = (corners.min(0) + corners.max(0)) / 2
     walls = [_walls(mesh, centre) for mesh in meshes]
@@ -69,14 +76,14 @@ def walls_as_sheets(meshes: Sequence[trimesh.Trimesh]) -> tuple[list[trimesh.Tri
     single = [[] if own else _panels(mesh) for mesh, own in zip(meshes, walls, strict=True)]
     sheets = [sheet for own in (*walls, *single) for sheet in own]
     _move_panels(sheets)
-    _lengthen(sheets)
+    _extend(sheets)
     pieces = [own or panels for own, panels in zip(walls, single, strict=True)]
     results = [_joined(own) if own else mesh for mesh, own in zip(meshes, pieces, strict=True)]
     return results, [float(np.median([sheet.thickness for sheet in own])) if own else 0.0 for own in walls]
 
 
 def _walls(mesh: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> list[Sheet]:
-    """Returns a sheet for every body of a mesh; none unless all bodies are walls of one thickness, to a tenth."""
+    """Returns a sheet for every body of a mesh; none unless all bodies are walls of equal thickness within 10 %."""
     if not mesh.is_watertight:
         return []
     found = [_wall(body, centre) for body in mesh.split(only_watertight=False)]
@@ -86,7 +93,7 @@ def _walls(mesh: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> list[Sheet]
 
 
 def _wall(body: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> Sheet | None:
-    """Returns the face of a slab that looks at a point; None for a body that is no wall."""
+    """Returns the face of a slab towards a point; None if the body is not a wall."""
     normals, areas = np.asarray(body.face_normals), np.asarray(body.area_faces)
     if len(normals) > MOST_FACES:
         return None
@@ -105,7 +112,7 @@ def _wall(body: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> Sheet | None
 
 
 def _panels(mesh: trimesh.Trimesh) -> list[Sheet]:
-    """Returns a mesh as a sheet if it is flat: a pane or a door in an opening, perhaps."""
+    """Returns a planar mesh as a sheet, as it may be a pane or a door in an opening; nothing for other meshes."""
     if not 0 < len(mesh.faces) <= MOST_FACES:
         return []
     normal = np.asarray(mesh.face_normals[np.argmax(mesh.area_faces)])
@@ -121,7 +128,7 @@ def _sheet(body: trimesh.Trimesh, faces: Bool[np.ndarray, " t"], normal: Float[n
 
 
 def _move_panels(sheets: Sequence[Sheet]) -> None:
-    """Moves what stands within the thickness of a parallel wall into the wall's plane: beside it there would be a gap."""
+    """Moves panels within the thickness of a parallel wall into the wall's plane, so that no gap remains beside them."""
     for panel in sheets:
         for wall in sheets:
             low, high = np.sort(panel.span * np.sign(panel.normal @ wall.normal))
@@ -131,15 +138,15 @@ def _move_panels(sheets: Sequence[Sheet]) -> None:
                 break
 
 
-def _lengthen(sheets: Sequence[Sheet]) -> None:
-    """Moves straight sides of walls to the plane of the wall that their bodies touched."""
-    moves = [(sheet, *move) for sheet in sheets if sheet.thickness for move in _missing(sheet, sheets)]
+def _extend(sheets: Sequence[Sheet]) -> None:
+    """Extends walls to the plane of the wall that their bodies touched."""
+    moves = [(sheet, *move) for sheet in sheets if sheet.thickness for move in _extensions(sheet, sheets)]
     for sheet, corners, step in moves:
         sheet.vertices[corners] += step
 
 
-def _missing(sheet: Sheet, sheets: Sequence[Sheet]) -> list[tuple[Bool[np.ndarray, " v"], Float[np.ndarray, "3"]]]:
-    """Returns which corners of a sheet are to move, and by how much (metres)."""
+def _extensions(sheet: Sheet, sheets: Sequence[Sheet]) -> list[tuple[Bool[np.ndarray, " v"], Float[np.ndarray, "3"]]]:
+    """Returns which corners of a sheet are to be moved, and their displacement (metres)."""
     found = []
     for outward in (*sheet.axes(), *-sheet.axes()):
         places = sheet.vertices @ outward

@@ -1,7 +1,7 @@
-"""Objects of OBJ files (Wavefront, appendix B of the Advanced Visualizer's manual): polygons alone.
+"""Reads objects from OBJ files (Wavefront, appendix B of the Advanced Visualizer's manual): polygons only.
 
-Corners count from 1, or backwards from the newest one if they are negative. Objects begin with `o`; where there is none, groups
-(`g`) are objects. Text in any encoding: names of one file only have to differ.
+Corners are numbered from 1, or backwards from the newest one if negative. Objects begin with `o`; in files without it, groups
+(`g`) are objects. Text may be in any encoding: the names within a file only have to differ.
 """
 
 import re
@@ -15,17 +15,21 @@ from wbgs_jax.mesh.bodies import Body
 from wbgs_jax.mesh.polygons import triangulate
 
 CURVED = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp"}
-"""Statements of curves and curved surfaces."""
+"""Statements that define curves and curved surfaces."""
 NAMED = re.compile(r"\s*((o|g|usemtl|mtllib)\s|#)")
-"""Statements of names, and comments: they are not continued in the next line."""
+"""Name statements and comments, which are not continued on the next line."""
 COMMENT, REMARK = re.compile("#"), re.compile(r"(?:^|\s)#(?=\s|$)|^\s*#")
-"""What begins a comment; behind a name, which may hold the sign, it stands alone."""
+"""Patterns that begin a comment; after a name, which may itself contain `#`, the sign must stand alone."""
 LINES = re.compile(r"\r\n|\r|\n")
 WIDE = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 
 def read_obj(file: Path) -> list[Body]:
-    """Returns the objects of a file; a curved surface, or a face of corners that are none, is a `UserError`."""
+    """Returns the objects of a file.
+
+    Raises:
+        UserError: curved surfaces, or faces with corners that do not exist.
+    """
     statements = list(_statements(_text(file.read_bytes())))
     begins = "o" if any(words[0] == "o" for words in statements) else "g"
     vertices: list[list[float]] = []
@@ -35,7 +39,7 @@ def read_obj(file: Path) -> list[Body]:
         match words[0]:
             case "v":
                 vertices.append([float(word) for word in words[1:4]])
-            case "f" | "fo":  # as it was called before
+            case "f" | "fo":  # the former name
                 corners = [_corner(word, len(vertices), file) for word in words[1:]]
                 own, sizes = faces.setdefault(name, ([], []))
                 own += corners
@@ -55,7 +59,7 @@ def read_obj(file: Path) -> list[Body]:
 
 
 def _corner(word: str, count: int, file: Path) -> int:
-    """Returns the place of a vertex, "7", "7/1/2" or "-1"."""
+    """Returns the index of a vertex given as "7", "7/1/2" or "-1"."""
     number = int(word.split("/", 1)[0])
     place = number - 1 if number > 0 else count + number
     if number == 0 or place < 0:
@@ -64,8 +68,8 @@ def _corner(word: str, count: int, file: Path) -> int:
 
 
 def _statements(text: str) -> Iterator[list[str]]:
-    """Gives the words of every statement, continued lines in one. Names may hold a `#`, and end with a backslash, as characters
-    of Shift-JIS and GBK do whose encoding is not known."""
+    """Yields the words of every statement, with continued lines joined. Names may contain a `#` and end with a backslash, which
+    is the second byte of some Shift-JIS and GBK characters if the encoding is unknown."""
     begun = ""
     for line in LINES.split(text):
         whole = begun + line
@@ -79,7 +83,7 @@ def _statements(text: str) -> Iterator[list[str]]:
 
 
 def _text(content: bytes) -> str:
-    """Returns the text; bytes of no known encoding are kept apart from each other."""
+    """Returns the text; bytes in an unknown encoding are mapped to distinct characters."""
     coding = WIDE.get(content[:2], "utf-8-sig")
     try:
         text = content.decode(coding)

@@ -1,1 +1,1 @@
-"""Rays from a mesh, and what arrives over them: facets -> edges -> image_method -> paths -> slab, utd -> transport."""
+"""Ray tracing over a mesh and the received field: facets -> edges -> image_method -> paths -> materials, utd -> transport."""

@@ -1,9 +1,9 @@
-"""The receiver's mirror images: every chain of facets that a wave can be reflected by on its way to a fixed receiver.
+"""Image method: every sequence of facets that can reflect a wave on its way to a fixed receiver.
 
-A chain (f1, ..., fm) names the facets in the order in which they reflect the wave; its images are the receiver mirrored in fm,
-then in f(m-1), and so on: towards them the wave travels in straight lines. The receiver is fixed, so all chains are found once,
-on the host, and serve every transmitter and frequency (`make_search`). A chain is kept if its facets can be seen through one
-another from the image: occlusion is the business of `paths.py`.
+A reflection sequence (`Chains`) names its facets (f1, ..., fm) in the order in which they reflect the wave. Its images are the
+receiver mirrored in fm, then in f(m-1), and so on; the wave travels in straight lines towards them. The receiver is fixed, so
+all sequences are found once, on the host, and serve every transmitter and frequency (`make_search`). A sequence is kept if its
+facets are visible through one another from the image; occlusion is tested in `paths.py`.
 """
 
 from collections.abc import Sequence
@@ -18,36 +18,37 @@ from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, Outline, areas, outl
 from wbgs_jax.propagation.occlusion import planes_of
 
 SIDE = 1e-4
-"""Metres: points nearer to a plane than this are on neither side."""
+"""Metres: points nearer to a plane than this count as lying on neither side."""
 SLACK = 0.05
-"""Metres by which facets are widened, so that rounding loses no chain."""
+"""Metres by which facets are enlarged, so that rounding loses no sequence."""
 NO_LENGTH = 1e-12
-"""Square metres: twice the smallest triangle of an image and a side that bounds a beam."""
+"""Square metres: lower bound on twice the area of the triangle of an image and a facet side that bounds a beam."""
 BEAMS_AT_ONCE = 64
-"""Few enough for a CPU's cache."""
+"""Beams tested together: few enough for a CPU's cache."""
 MOST_TRIED = 10_000_000
-"""Pairs of a chain and a further mirror that are looked at for one order, ..."""
+"""Maximum number of pairs of a sequence and a further mirror that are examined per order, ..."""
 MOST_PAIRS = 1_000_000
-"""... and pairs of a mirror and an edge: where there are more, as between the fronts of a whole city, the smallest mirrors are
+"""... and of pairs of a mirror and an edge. If there are more, as between the facades of a whole city, the smallest mirrors are
 left out."""
 
 
 @pytree
 class Chains:
-    """All chains of one order m >= 1."""
+    """All reflection sequences of one order m >= 1."""
 
     facet: Int[AnyArray, "chains m"]
-    """In the order in which they reflect the wave."""
+    """Indices of the facets in the order in which they reflect the wave."""
     image: Float[AnyArray, "chains m 3"]
-    """Where the wave heads for before facet j reflects it: the receiver, mirrored in facets m ... j. World frame, metres."""
+    """Point that the wave heads for before facet j reflects it: the receiver, mirrored in facets m ... j. World frame,
+    metres."""
 
 
 @pytree
 class DiffractedChains:
     """Pairs of a mirror and an edge.
 
-    A mirror behind the edge can be seen from the receiver; one in front of it may be any large facet, because the transmitter
-    may be anywhere.
+    A mirror behind the edge must be visible from the receiver; one in front of it may be any large facet, because the
+    transmitter may be anywhere.
     """
 
     after: Int[AnyArray, "a 2"]
@@ -60,7 +61,7 @@ class DiffractedChains:
 
 @pytree
 class Surfaces:
-    """What waves meet, of every receiver: paths refer to them by number."""
+    """Facets and edges that waves interact with; the same for every receiver. Paths refer to them by index."""
 
     facets: Facets
     edges: Edges
@@ -68,15 +69,16 @@ class Surfaces:
 
 @pytree
 class Search(Surfaces):
-    """What a receiver's paths are searched in: independent of the transmitter and of the frequency."""
+    """Image tree of a receiver, in which its paths are searched: independent of the transmitter and of the frequency."""
 
     receiver_position: Float[AnyArray, "3"]
     """World frame, metres."""
     outline: Outline
+    """Half-planes along the sides of the facets."""
     planes: Float[AnyArray, "5 4 p"]
-    """Of the facets and their sides, as legs are cut with them (`occlusion.planes_of`)."""
+    """Planes of the facets and of their sides, for the test of occlusion (`occlusion.planes_of`)."""
     chains: tuple[Chains, ...]
-    """Of orders 1, 2, ..."""
+    """Reflection sequences of orders 1, 2, ..."""
     diffracted: DiffractedChains
 
 
@@ -89,15 +91,15 @@ def make_search(
     mirror_area_before_edge: float,
     padded: bool = False,
 ) -> Search:
-    """Returns what the paths of a receiver are searched in; found on the host in double precision, so not under `jax.jit`.
+    """Returns the image tree of a receiver, computed on the host in double precision (not under `jax.jit`).
 
     Args:
         facets, edges: of the scene, on the host or on the device.
         receiver_position: world frame, metres.
-        mirror_areas: smallest facets that reflect on paths of 1, 2, ... reflections, square metres each.
+        mirror_areas: smallest facet that reflects on paths of 1, 2, ... reflections, square metres each.
         mirror_area_after_edge: smallest facet that reflects a wave after an edge has diffracted it, square metres.
         mirror_area_before_edge: smallest facet that reflects a wave before an edge diffracts it, square metres.
-        padded: whether chains and pairs are filled up to sizes that seldom change (mesh/edges.py).
+        padded: whether sequences and pairs are padded to sizes that rarely change (mesh/edges.py).
 
     Returns:
         float32 and int32 arrays on the device.
@@ -113,25 +115,25 @@ def make_search(
 
 
 def _padded(chains: Chains, facets: Facets) -> Chains:
-    """Returns chains, and behind them some that reflect nothing."""
+    """Returns the sequences, followed by padding that reflects nothing."""
     facet = filled(chains.facet)
     return Chains(facet, _in_the_plane(chains.image, facets, facet))
 
 
 def _padded_pairs(pairs: DiffractedChains, facets: Facets) -> DiffractedChains:
-    """Returns pairs, and behind those with a mirror behind the edge some that reflect nothing; of the others there are as many
-    as of padded edges."""
+    """Returns the pairs; those with a mirror behind the edge are followed by padding that reflects nothing. The number of the
+    others already follows from the padded edges."""
     after = filled(pairs.after)
     return DiffractedChains(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), pairs.before)
 
 
 def _in_the_plane(image: Float[AnyArray, "*n 3"], facets: Facets, mirror: Int[np.ndarray, "*k"]) -> Float[np.ndarray, "*k 3"]:
-    """Returns images, and behind them points of the mirrors' own planes, where no wave is headed for."""
+    """Returns images, followed by points in the mirrors' own planes, which no wave heads for."""
     return np.concatenate([image, np.asarray(facets.corners)[mirror[len(image) :], 0]])
 
 
 def _on_host(leaf: AnyArray) -> np.ndarray:
-    """Returns an array with float64 positions or int32 indices."""
+    """Returns an array on the host, with float64 positions or int32 indices."""
     array = np.asarray(leaf)
     return array.astype(np.float64 if np.issubdtype(array.dtype, np.floating) else np.int32)
 
@@ -139,13 +141,13 @@ def _on_host(leaf: AnyArray) -> np.ndarray:
 def receiver_chains(
     facets: Facets, rx: Float[np.ndarray, "3"], min_areas: Sequence[float], slack: float = SLACK
 ) -> tuple[Chains, ...]:
-    """Returns the chains of orders 1, 2, ... len(min_areas) as float64 and int32 NumPy arrays.
+    """Returns the reflection sequences of orders 1, 2, ... len(min_areas) as float64 and int32 NumPy arrays.
 
     Args:
         facets: of the scene.
         rx: position of the receiver, world frame, metres.
-        min_areas: `min_areas[m - 1]` (square metres) is the smallest facet of a chain of order m.
-        slack: metres by which facets are widened, so that rounding loses none.
+        min_areas: `min_areas[m - 1]` (square metres) is the smallest facet in a sequence of order m.
+        slack: metres by which facets are enlarged, so that rounding loses no sequence.
     """
     area = areas(facets)
     largest_first = np.argsort(-area, kind="stable")
@@ -154,21 +156,21 @@ def receiver_chains(
     facet = np.zeros((1, 0), np.int64)
     image = np.broadcast_to(np.asarray(rx, np.float64), (1, 1, 3))  # the last one of a row is the receiver
     for smallest in min_areas:
-        large, keep = _few_enough(facet, largest_first[: np.count_nonzero(area >= smallest)])
+        large, keep = _limit_mirrors(facet, largest_first[: np.count_nonzero(area >= smallest)])
         facet, image = _prepend(facet[keep], image[keep], large, corners, normal, offset, slack)
         chains.append(Chains(facet.astype(np.int32), image[:, :-1]))
     return tuple(chains)
 
 
-def _few_enough(
+def _limit_mirrors(
     facet: Int[np.ndarray, "chains m"], mirrors: Int[np.ndarray, " k"]
 ) -> tuple[Int[np.ndarray, " large"], Bool[np.ndarray, " chains"]]:
-    """Returns as many of some mirrors, the largest come first, as can be tried in front of every chain of them alone, in
-    ascending order; and those chains."""
+    """Returns as many of the mirrors (largest first) as can be tried in front of every sequence made of them alone within
+    `MOST_TRIED` pairs, in ascending order; and a mask of those sequences."""
     rank = np.full(max(facet.max(initial=-1), mirrors.max(initial=-1)) + 1, len(mirrors))
     rank[mirrors] = np.arange(len(mirrors))
-    worst = rank[facet].max(-1, initial=-1)  # of every chain's mirrors
-    chains_of = np.cumsum(np.bincount(worst + 1, minlength=len(mirrors) + 1))  # of the first 0, 1, ... mirrors
+    worst = rank[facet].max(-1, initial=-1)  # rank of the smallest mirror of every sequence
+    chains_of = np.cumsum(np.bincount(worst + 1, minlength=len(mirrors) + 1))  # made of the first 0, 1, ... mirrors
     count = int(np.searchsorted(np.arange(len(mirrors) + 1) * chains_of[: len(mirrors) + 1], MOST_TRIED, "right")) - 1
     return np.sort(mirrors[:count]), worst < count
 
@@ -176,26 +178,26 @@ def _few_enough(
 def diffracted_chains(
     facets: Facets, edges: Edges, rx: Float[np.ndarray, "3"], after_area: float, before_area: float, slack: float = SLACK
 ) -> DiffractedChains:
-    """Returns the mirrors of at least so many square metres behind and in front of every edge (float64 and int32 NumPy arrays).
+    """Returns the pairs of an edge and a mirror behind or in front of it (float64 and int32 NumPy arrays).
 
     Args:
         facets, edges: of the scene.
         rx: position of the receiver, world frame, metres.
         after_area, before_area: smallest mirror behind an edge and in front of one, square metres.
-        slack: metres by which facets are widened, so that rounding loses none.
+        slack: metres by which facets are enlarged, so that rounding loses none.
     """
     area = areas(facets)
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
     start, end = edges.start, edges.start + edges.direction * edges.length[:, None]
     segment = np.stack([start, end, end, end], 1)
-    real = edges.length > 0  # others are padding
+    real = edges.length > 0  # the others are padding
     most = MOST_PAIRS // max(int(np.count_nonzero(real)), 1)
     largest_first = np.argsort(-area, kind="stable")
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= after_area), most)])
     height = normal[mirrors] @ rx - offset[mirrors]
     image = rx - 2 * height[:, None] * normal[mirrors]
-    seen = _seen(image, np.broadcast_to(rx, image.shape), mirrors, segment, corners, normal, offset, slack)
-    place, edge = np.nonzero(seen & (np.abs(height) > SIDE)[:, None] & real)
+    inside = _inside_beams(image, np.broadcast_to(rx, image.shape), mirrors, segment, corners, normal, offset, slack)
+    place, edge = np.nonzero(inside & (np.abs(height) > SIDE)[:, None] & real)
     after = np.stack([mirrors[place], edge], 1)
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= before_area), most)])
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)
@@ -203,39 +205,39 @@ def diffracted_chains(
 
 
 def _prepend(facet, image, candidates, corners, normal, offset, slack):
-    """Returns every chain with every facet in front of it that its beam reaches: facets and images."""
+    """Returns facets and images of every sequence, extended by every facet that its beam reaches."""
     source = image[:, 0]
     height = source @ normal[candidates].T - offset[candidates]  # (chains, candidates)
     visible = np.abs(height) > SIDE
     if facet.shape[1]:
         visible &= candidates != facet[:, :1]
-        visible &= _seen(source, image[:, 1], facet[:, 0], corners[candidates], corners, normal, offset, slack)
+        visible &= _inside_beams(source, image[:, 1], facet[:, 0], corners[candidates], corners, normal, offset, slack)
     chain, place = np.nonzero(visible)
     mirror = candidates[place]
     mirrored = source[chain] - 2 * height[chain, place, None] * normal[mirror]
     return np.column_stack([mirror, facet[chain]]), np.concatenate([mirrored[:, None], image[chain]], 1)
 
 
-def _seen(source, before, window, candidates, corners, normal, offset, slack):
+def _inside_beams(source, before, window, candidates, corners, normal, offset, slack):
     """Returns which candidates (four corners each) are not wholly outside the beams from images through facets.
 
-    A beam is on the side of its facet `window` where `before`, which `source` is the mirror image of, lies, and inside the
-    planes through the source and the window's sides.
+    The beam of an image `source` passes through its facet `window`. It lies on that side of the facet where `before` lies, the
+    point of which `source` is the mirror image, and inside the planes through the source and the window's sides.
     """
     planes, distances = _beams(source, before, window, corners, normal, offset)
     lowest = np.array([SIDE] + [-slack] * CORNERS, np.float32)[:, None]
     points = candidates.swapaxes(0, 1).reshape(-1, 3).astype(np.float32)
-    seen = np.zeros((len(source), len(candidates)), bool)
+    inside = np.zeros((len(source), len(candidates)), bool)
     for start in range(0, len(source), BEAMS_AT_ONCE):
         some = slice(start, start + BEAMS_AT_ONCE)
         height = planes[some].astype(np.float32) @ points.T - distances[some, :, None].astype(np.float32)
         highest = height.reshape(*height.shape[:2], CORNERS, -1).max(-2)
-        seen[some] = (highest > lowest).all(1)
-    return seen
+        inside[some] = (highest > lowest).all(1)
+    return inside
 
 
 def _beams(source, before, window, corners, normal, offset):
-    """Returns unit normals into beams (beams, 5, 3) and offsets of the planes that bound them; 0 and -1 for a side of no
+    """Returns the unit normals into beams (beams, 5, 3) and the offsets of their bounding planes; 0 and -1 for a side of zero
     length."""
     own, first = normal[window], corners[window]
     side = np.sign(np.sum(own * before, -1) - offset[window])

@@ -11,25 +11,25 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12
-"""Farad a metre."""
+"""Farads per metre."""
 DAMPING = 1 - 1e-4
-"""A loss on every passage that nobody can measure: resonances of lossless slabs at grazing incidence stay finite."""
+"""Loss factor per passage, too small to measure: resonances of lossless slabs at grazing incidence stay finite."""
 
 
 @pytree
 class Slabs:
-    """What every facet is made of at one frequency."""
+    """Material of every facet at one frequency."""
 
     permittivity: Complex[Array, " f"]
-    """Relative and complex (`complex_permittivity`)."""
+    """Relative complex permittivity (`complex_permittivity`)."""
     thickness: Float[Array, " f"]
     """Metres."""
     air: Float[Array, ""] | float = 0.0
-    """Share of the phase of the air in their place that is taken out of what passes them (`slab_coefficients`)."""
+    """Fraction of the phase of the displaced air that is removed from transmitted waves (`slab_coefficients`)."""
 
 
 class SlabCoefficients(NamedTuple):
-    """Amplitude coefficients for the electric field across (TE) and in (TM) the plane of incidence."""
+    """Amplitude coefficients of the electric field perpendicular (TE) and parallel (TM) to the plane of incidence."""
 
     reflect_te: Complex[Array, "*#n"]
     reflect_tm: Complex[Array, "*#n"]
@@ -40,7 +40,7 @@ class SlabCoefficients(NamedTuple):
 def complex_permittivity(
     permittivity: Float[Array, "*#n"], conductivity: Float[Array, "*#n"], frequency_hz: Float[Array, "*#n"]
 ) -> Complex[Array, "*#n"]:
-    """Returns the relative permittivity eps_r - j sigma / (eps_0 omega); conductivity sigma in S/m."""
+    """Returns the relative permittivity eps_r - j sigma / (eps_0 omega), with the conductivity sigma in S/m."""
     return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * VACUUM_PERMITTIVITY)
 
 
@@ -54,18 +54,19 @@ def slab_coefficients(
 ) -> SlabCoefficients:
     """Returns the coefficients of a slab in air (ITU-R P.2040-3, section 2.2.2.2).
 
-    A transmitted wave keeps its direction and is not shifted. Its path runs through the slab, too, where there is no air: the
-    phase k t cos(theta) is counted twice unless it is taken out here. Ray tracers whose walls have no thickness count it twice.
+    A transmitted wave keeps its direction and is not shifted sideways. Its path length includes the thickness of the slab,
+    whose phase k t cos(theta) in air is therefore counted in addition to that of the slab unless it is removed here. Ray
+    tracers whose walls have no thickness leave it in.
 
     Args:
         cosine: of the angle of incidence (0..1).
         permittivity: relative and complex, imaginary part at most 0.
         thickness: metres.
         frequency_hz: of the wave.
-        air: share of that phase which is taken out: 0 as ray tracers have it, 1 as nature has it.
+        air: fraction of that phase which is removed: 0 as in ray tracers, 1 as in reality.
     """
     inner, wavelengths = root(permittivity - (1 - cosine**2)), frequency_hz / SPEED_OF_LIGHT * thickness
-    # Clipped where nothing is left, so that gradients stay finite.
+    # Clipped where the wave has vanished, so that gradients stay finite.
     left = DAMPING * jnp.exp(jnp.maximum(2 * jnp.pi * wavelengths * inner.imag, -40.0))
     one_way = left * phasor(-wavelengths * inner.real)
     round_trip = one_way * one_way

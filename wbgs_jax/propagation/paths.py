@@ -1,9 +1,10 @@
-"""Where the wave runs from a transmitter to the receiver: straight legs between facets that mirror it and edges that diffract
-it, through facets it crosses.
+"""Geometry of the paths from a transmitter to the receiver: straight segments between facets that reflect the wave and edges
+that diffract it, through facets that transmit it.
 
-Every chain of `image_method.py` gives at most one specular path, every edge at most one diffracted path for each mirror in
-front of it or behind it. The candidates that promise most are cut with all facets, and of those that pass, the strongest are
-kept. Nothing here depends on the frequency or on what the facets are made of, and nothing is differentiated.
+Every reflection sequence of `image_method.py` gives at most one specular path, every edge at most one diffracted path for each
+mirror in front of it or behind it. The most promising candidates are tested for intersections with all facets, and the
+strongest of those that pass are kept. The geometry depends neither on the frequency nor on the materials, and is not
+differentiated.
 """
 
 from collections.abc import Callable
@@ -21,53 +22,53 @@ from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossin
 from wbgs_jax.radio.array import EXACT
 
 MAX_ORDER = 3
-"""Reflections and diffractions a path may have."""
+"""Maximum number of reflections and diffractions of a path."""
 MAX_INTERACTIONS = 5
-"""Facets and edges a path may interact with; what has crossed more of them is worth next to nothing."""
+"""Maximum number of facets and edges that a path interacts with; a wave that has crossed more of them is negligible."""
 NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
 """Types of interaction."""
 BEHIND = 1e-6
-"""Share of a leg by which it crosses a facet after its beginning, at least: what is met there comes first."""
+"""Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start."""
 CUT_AT_ONCE = 32
-"""Paths: few enough for a CPU's cache."""
+"""Paths tested together: few enough for a CPU's cache."""
 THROUGH = 0.5
-"""Guess of what is left of the amplitude behind a facet or a mirror, to rank paths by."""
+"""Rough amplitude factor of a crossed or reflecting facet, used to rank paths."""
 
 
 @pytree
 class Paths:
-    """K paths of one transmitter; leading axes stand for more of them."""
+    """K paths of one transmitter; leading axes are batch axes."""
 
     points: Float[Array, "*b k 5 3"]
-    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
     interaction_facet: Int[Array, "*b k 5"]
-    """Indices of the facets (of the edge, where the type is `DIFFRACTED`) in the order in which they act; 0 beyond the last."""
+    """Indices of the facets (of the edge, if the type is `DIFFRACTED`) in the order of interaction; 0 beyond the last."""
     interaction_type: Int[Array, "*b k 5"]
     """`TRANSMITTED`, `REFLECTED` or `DIFFRACTED`; `NONE` beyond the last."""
     interaction_leg: Int[Array, "*b k 5"]
-    """The leg (0: the first) that arrives there."""
+    """Index of the segment (0: the first) that ends or is crossed there."""
     alive: Bool[Array, "*b k"]
-    """Which of the K are paths; the rest is there to fill the array."""
+    """Which of the K entries are paths; the others are padding."""
 
 
 @pytree
 class TracedPaths:
-    """All paths of one transmitter; leading axes stand for more of them."""
+    """All paths of one transmitter; leading axes are batch axes."""
 
     specular: Paths
-    """Without diffraction, the line of sight among them."""
+    """Paths without diffraction, including the line of sight."""
     diffracted: Paths
-    """With one diffraction each."""
+    """Paths with one diffraction each."""
 
 
 class Candidates(NamedTuple):
-    """Paths before they are cut with facets."""
+    """Paths before the test of occlusion."""
 
     points: Float[Array, "c 5 3"]
     interaction_facet: Int[Array, "c 3"]
     interaction_type: Int[Array, "c 3"]
     score: Float[Array, " c"]
-    """Guess of the amplitude; 0 for no path."""
+    """Rough amplitude; 0 for no path."""
 
 
 def trace_paths(
@@ -78,13 +79,13 @@ def trace_paths(
     diffracted_tried: int,
     diffracted_kept: int,
 ) -> TracedPaths:
-    """Returns the paths of one transmitter (`jax.lax.map` takes more of them: a batch at once needs much memory).
+    """Returns the paths of one transmitter. Use `jax.lax.map` for several: batching them needs a lot of memory.
 
     Args:
-        search: of the receiver (`image_method.make_search`).
+        search: image tree of the receiver (`image_method.make_search`).
         tx_position: world frame, metres.
-        specular_tried, diffracted_tried: candidates that are cut with all facets.
-        specular_kept, diffracted_kept: paths that are returned of them, the strongest ones; fewer if fewer are tried.
+        specular_tried, diffracted_tried: number of candidates that are tested for intersections with all facets.
+        specular_kept, diffracted_kept: number of paths returned, the strongest of these; fewer if fewer are tried.
     """
     return TracedPaths(
         specular_paths(tx_position, search, specular_tried, specular_kept),
@@ -93,7 +94,7 @@ def trace_paths(
 
 
 def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
-    """Returns the `kept` strongest paths without diffraction, line of sight included, of at most `tried` candidates."""
+    """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
     mirrored = (_promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
     parts = [_direct(tx, search.receiver_position), *mirrored]
     return _select(parts, search, tried, kept, MAX_ORDER + 1)
@@ -111,14 +112,14 @@ def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: in
 
 
 def _diffracted_only(tx, search: Search) -> Candidates:
-    """Returns one candidate an edge."""
+    """Returns one candidate per edge."""
     edge = jnp.arange(search.edges.length.size)
     point, strength = _diffracted(tx, search.receiver_position, edge, search.edges)
     return _candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
 def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
-    """Returns one candidate a pair of an edge and a mirror behind it."""
+    """Returns one candidate per pair of an edge and a mirror behind it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
     point, strength = _diffracted(tx, image, edge, search.edges)
     mirror, valid = _on_mirror(point, image, search.facets.normal[facet], search.facets.offset[facet])
@@ -128,12 +129,13 @@ def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
 
 
 def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
-    """Returns one candidate a pair of an edge and a mirror in front of it."""
+    """Returns one candidate per pair of an edge and a mirror in front of it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
     normal, offset = search.facets.normal[facet], search.facets.offset[facet]
     image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
     point, strength = _diffracted(image, search.receiver_position, edge, search.edges)
-    # Seen from the image, the point must lie behind the mirror: the wave runs from the transmitter to where it is reflected.
+    # Relative to the image, the point must lie behind the mirror: the wave runs from the transmitter to the point of
+    # reflection.
     mirror, valid = _on_mirror(point, image, normal, offset)
     strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
     vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
@@ -141,7 +143,7 @@ def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
 
 
 def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
-    """Returns candidates from their vertices (points, facet or edge, type of interaction), in order."""
+    """Returns candidates from their vertices (point, facet or edge, type of interaction) in order."""
 
     def rows(value, shape):
         return jnp.broadcast_to(value, (count, *shape))
@@ -155,13 +157,13 @@ def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
 
 
 def _direct(tx, rx) -> Candidates:
-    """Returns the line of sight as a candidate; there is none to a transmitter in the receiver's own place."""
+    """Returns the line of sight as a candidate; there is none if the transmitter is at the receiver's position."""
     distance = jnp.linalg.norm(jax.lax.stop_gradient(tx - rx))
     return _candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
 
 
 def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
-    """Returns one candidate a chain."""
+    """Returns one candidate per reflection sequence."""
     facets, (c, order) = search.facets, chains.facet.shape
     here, valid = jnp.broadcast_to(tx, (c, 3)), jnp.ones(c, bool)
     vertices = []
@@ -175,7 +177,7 @@ def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
 
 
 def _on_mirror(start, goal, normal, offset):
-    """Returns where the way from `start` to the image `goal` hits the plane of a mirror, and whether it does."""
+    """Returns the points where the lines from `start` to the images `goal` meet the planes of mirrors, and whether they do."""
     height, beyond = (jnp.sum(normal * p, -1) - offset for p in (start, goal))
     share = height / jnp.where(height == beyond, 1, height - beyond)
     valid = (height * beyond < 0) & (jnp.abs(height) > NEAR) & (jnp.abs(beyond) > NEAR)
@@ -183,7 +185,7 @@ def _on_mirror(start, goal, normal, offset):
 
 
 def _length(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
-    """Returns the lengths of vectors, `NEAR` at least: that of none has no gradient, and what is nearer is no candidate."""
+    """Returns the lengths of vectors, at least `NEAR`: a zero length has no gradient, and nearer points are no candidates."""
     return jnp.sqrt(jnp.maximum(jnp.sum(vector**2, -1), NEAR**2))
 
 
@@ -193,7 +195,8 @@ def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, 
 
 
 def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
-    """Returns where the shortest way over an edge touches it (Keller's cone), and a guess of the amplitude, 0 if not."""
+    """Returns the point where the shortest path over an edge touches it (Keller's cone), and a rough amplitude, 0 if
+    invalid."""
     start, along = edges.start[edge], edges.direction[edge]
 
     def place(p):
@@ -212,13 +215,13 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     flat_in -= jnp.sum(flat_in * along, -1, keepdims=True) * along
     flat_out -= jnp.sum(flat_out * along, -1, keepdims=True) * along
     turn = jnp.sum(flat_in * flat_out, -1) / jnp.maximum(r_in * r_out, NEAR**2)
-    # Keller's coefficient falls as the wave is turned away from its shadow boundary, where it goes straight on.
+    # Keller's coefficient falls as the direction departs from the shadow boundary, along which the wave goes straight on.
     strength = 1 / jnp.sqrt(jnp.maximum(before * after * (before + after), NEAR)) / jnp.sqrt(0.5 * (1 + turn) + 0.02)
     return point, jnp.where(valid, strength, 0)
 
 
 def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
-    """Returns the best paths that are left of the best candidates when these have been cut with all facets."""
+    """Returns the best paths among the best candidates after these have been tested for intersections with all facets."""
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
     cut = _of_living(lambda c: crossed(c.points[: legs + 1], search.planes), found)
@@ -231,20 +234,20 @@ def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs
 
 
 def _promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
-    """Returns the best candidates of a kind. All are scored, and the best built again: points are most of the work."""
+    """Returns the best candidates of a kind. All are scored first and the best built again: the points are most of the work."""
     score = build(rows).score
     best = jax.lax.top_k(score, min(most, score.size))[1]
     return build(jax.tree.map(lambda leaf: leaf[best], rows))
 
 
 def _best(candidates: Candidates, score: Float[Array, " c"], most: int) -> Candidates:
-    """Returns the candidates of the highest scores, the best first, with these scores."""
+    """Returns the candidates with the highest scores, best first, together with these scores."""
     score, best = jax.lax.top_k(score, min(most, score.size))
     return jax.tree.map(lambda leaf: leaf[best], candidates)._replace(score=score)
 
 
 def _of_living(function: Callable[[Candidates], Any], candidates: Candidates) -> Any:
-    """Returns a function of every candidate that may be a path, zeros of the others; the best ones come first."""
+    """Returns a function of every candidate that may be a path, and zeros for the others; the best ones come first."""
     count = candidates.score.size
     blocks = jax.tree.map(lambda leaf: _in_blocks(leaf, -(-count // CUT_AT_ONCE)), candidates)
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), blocks)
@@ -254,13 +257,13 @@ def _of_living(function: Callable[[Candidates], Any], candidates: Candidates) ->
 
 
 def _in_blocks(leaf: Array, blocks: int) -> Array:
-    """Returns an array in blocks of `CUT_AT_ONCE` rows, filled up with zeros."""
+    """Returns an array in blocks of `CUT_AT_ONCE` rows, padded with zeros."""
     rows = jnp.zeros((blocks * CUT_AT_ONCE, *leaf.shape[1:]), leaf.dtype).at[: len(leaf)].set(leaf)
     return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
 
 
 def _in_order(candidate: Candidates, cut: UInt32[Array, "legs words"], search: Search):
-    """Returns the interactions of one path in order: facet or edge, type, leg."""
+    """Returns the interactions of one path in order: facet or edge, type, segment."""
     number, crosses = first_of(cut.reshape(-1), MAX_INTERACTIONS)
     leg, facet = jnp.divmod(number, cut.shape[1] * WORD)
     share = crossing_share(candidate.points[leg], candidate.points[leg + 1], facet, search.planes)

@@ -1,7 +1,7 @@
-"""The wave on every path: the field vector through reflections, transmissions and a diffraction, and the array's snapshot.
+"""Field transport along paths: the field vector through reflections, transmissions and a diffraction, and the array's snapshot.
 
-The electric field is a complex vector across the ray, split at every slab into its components across (TE) and in (TM) the
-plane of incidence. Antennas are those of radio/antenna.py. The time factor is exp(+j omega t).
+The electric field is a complex vector perpendicular to the ray. At every slab it is split into its components perpendicular
+(TE) and parallel (TM) to the plane of incidence. Antennas are those of radio/antenna.py. The time factor is exp(+j omega t).
 """
 
 import dataclasses
@@ -26,31 +26,31 @@ from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-9
-"""Metres: legs that are shorter fill the places of reflections that a path does not have."""
+"""Metres: shorter segments are padding for reflections that a path does not have."""
 SOMEWHERE = np.arange(5)[:, None] * np.array([0.3, 0.5, 0.7])
-"""Points (metres) of what is no path, on a line that no edge or normal is along."""
+"""Vertices (metres) of padded paths, on a line that is not parallel to any edge or normal."""
 
 
 class Legs(NamedTuple):
-    """The straight pieces of K paths."""
+    """Straight segments of K paths."""
 
     length: Float[Array, "k 4"]
     """Metres."""
     direction: Float[Array, "k 4 3"]
-    """Unit vectors along the way of the wave, world frame."""
+    """Unit vectors in the direction of propagation, world frame."""
     total: Float[Array, " k"]
     """Length of the whole path, metres."""
 
 
 class _SlabInteractions(NamedTuple):
-    """The slabs on K paths: how they split the field and what they do to its parts."""
+    """Slabs along K paths: the basis in which they split the field, and their coefficients."""
 
     across: Float[Array, "k 5 3"]
-    """Unit vectors across the plane of incidence."""
+    """Unit vectors perpendicular to the plane of incidence (TE)."""
     within_in: Float[Array, "k 5 3"]
-    """Unit vectors in it and across the ray that arrives."""
+    """Unit vectors in that plane, perpendicular to the incident ray (TM)."""
     within_out: Float[Array, "k 5 3"]
-    """Unit vectors in it and across the ray that leaves."""
+    """Unit vectors in that plane, perpendicular to the outgoing ray (TM)."""
     te: Complex[Array, "k 5"]
     tm: Complex[Array, "k 5"]
 
@@ -66,22 +66,22 @@ def arrivals(
     transmitter: Antenna | None = None,
     element: Antenna | None = None,
 ) -> Arrivals:
-    """Returns what a transmitter of unit power sends over K paths.
+    """Returns the amplitudes that a transmitter of unit power produces over K paths.
 
     Args:
         paths: of one transmitter (`paths.trace_paths`).
-        surfaces: that the paths were found in: its facets and edges are what they refer to.
-        slabs: what the facets are made of at this frequency.
+        surfaces: surfaces in which the paths were found; paths refer to their facets and edges by index.
+        slabs: materials of the facets at this frequency.
         frequency_hz: of the carrier.
-        receiver: whose array stands where the paths end.
-        diffracted: whether every path has one diffraction, or none has any; static under `jax.jit`.
-        transmitter: its antenna in the world frame; by default upright and isotropic.
-        element: an antenna that every element of the array is besides its known pattern, in the receiver's frame; by default
-            upright and isotropic, which changes nothing.
+        receiver: the receiver at the end of the paths.
+        diffracted: whether all paths have one diffraction or none has any; static under `jax.jit`.
+        transmitter: its antenna in the world frame; by default vertically polarised and isotropic.
+        element: an antenna factor of every array element in addition to its given pattern, in the receiver's frame; by default
+            vertically polarised and isotropic, which changes nothing.
     """
     isotropic = upright(jnp.zeros_like(receiver.pattern_exponents))
     transmitter, element = transmitter or isotropic, element or isotropic
-    # What is no path may have legs of no length, and their direction no derivative.
+    # Padded paths may have segments of zero length, whose directions have no derivative.
     somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
     legs = legs_of(paths)
@@ -97,16 +97,16 @@ def arrivals(
     local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
     own = dataclasses.replace(element, exponents=element.exponents + receiver.pattern_exponents)
     theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
-    parts = jnp.stack([_dot(here, seen) for seen in (antenna_field(own, local), theta, jnp.cross(local, theta))], -1)
+    parts = jnp.stack([_dot(here, basis) for basis in (antenna_field(own, local), theta, jnp.cross(local, theta))], -1)
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
     met = paths.interaction_type, _materials(paths, surfaces)
-    seen = amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:]
-    return Arrivals(*seen, *met, points=paths.points)
+    arrived = amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:]
+    return Arrivals(*arrived, *met, points=paths.points)
 
 
 def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
-    """Returns what paths meet is made of; -1 where they meet nothing."""
+    """Returns the material index at every interaction; -1 where there is none."""
     kind, number = paths.interaction_type, paths.interaction_facet
     facet = jnp.where(kind == DIFFRACTED, 0, number)
     if surfaces.edges.facet.shape[0]:
@@ -118,14 +118,14 @@ def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
 def element_voltages(
     arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
 ) -> Complex[Array, "k elements"]:
-    """Returns what every path alone gives every element.
+    """Returns the complex voltage of every element for every single path.
 
     Args:
-        arrived: what arrives over K paths.
-        receiver: whose elements it is received with.
-        frequency_hz: of the carrier; it matters to elements whose positions are in metres.
-        curved: 0 for plane waves; 1 for spheres around mirrored sources, which are as far away as the path is long. A wave off
-            an edge is curved more than that across the edge. By default what the arrivals say, else plane.
+        arrived: amplitudes and geometry of K paths at the receiver.
+        receiver: the array.
+        frequency_hz: of the carrier; needed for element positions in metres.
+        curved: 0 for plane waves; 1 for spherical waves around mirrored sources at a distance of the path's length. A wave
+            diffracted by an edge is more strongly curved across the edge than this. By default `arrived.curved`, or else 0.
     """
     if curved is None:
         curved = 0.0 if arrived.curved is None else arrived.curved
@@ -135,7 +135,7 @@ def element_voltages(
     along = jnp.matmul(arrived.direction, metres.T, precision=EXACT)
     across = jnp.maximum(jnp.sum(metres**2, -1) - along**2, 0)
     distance = jnp.sqrt((far - along) ** 2 + across + SHORTEST**2)
-    longer = across / (distance + jnp.abs(far - along))  # than of a plane wave, without a difference of large numbers
+    longer = across / (distance + jnp.abs(far - along))  # than for a plane wave, without a difference of large numbers
     turns = -frequency_hz / SPEED_OF_LIGHT * curved * longer
     return plane * phasor(turns) * (1 + curved * (far / distance - 1))
 
@@ -143,7 +143,7 @@ def element_voltages(
 def snapshots_from_paths(
     arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
 ) -> Complex[Array, " elements"]:
-    """Returns the complex voltages of the receiver's elements, all paths together; `jax.vmap` takes more transmitters.
+    """Returns the complex voltages of the receiver's elements, summed over paths; use `jax.vmap` for several transmitters.
     Arguments are those of `element_voltages`."""
     return jnp.sum(element_voltages(arrived, receiver, frequency_hz, curved), 0)
 
@@ -155,13 +155,14 @@ def mimo_matrix(
     tx_elements: Float[Array, "m 3"],
     curved: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "elements m"]:
-    """Returns the voltages of the receiver's elements by each of M elements of the transmitter, alike and seeing plane waves.
+    """Returns the complex voltages of the receiver's elements for each of M transmit elements. These are identical, and plane
+    waves leave them.
 
     Args:
         arrived, receiver, frequency_hz, curved: as in `element_voltages`.
-        tx_elements: their places around the transmitter's position, in wavelengths, world frame.
+        tx_elements: positions relative to the transmitter's, in wavelengths, world frame.
     """
-    assert arrived.departure is not None, "arrivals of traced paths have it"
+    assert arrived.departure is not None, "arrivals of traced paths have a departure direction"
     voltages = element_voltages(arrived, receiver, frequency_hz, curved)
     return jnp.matmul(voltages.T, steering_vector(tx_elements, arrived.departure), precision=EXACT)
 
@@ -178,8 +179,8 @@ def covariance_from_paths(
 
     Args:
         arrived, receiver, frequency_hz, curved: as in `element_voltages`.
-        coherence: what is left of the mean product of two paths' amplitudes (`displacement.coherence`); where it is 1
-            everywhere the result is the snapshot's own product.
+        coherence: remaining mean product of two paths' amplitudes (`displacement.coherence`); where it is 1 everywhere, the
+            result is the outer product of the snapshot.
     """
     voltages = element_voltages(arrived, receiver, frequency_hz, curved)
     parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # real products: four times as fast on a CPU
@@ -189,24 +190,24 @@ def covariance_from_paths(
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Returns the scalar product over the last axis."""
+    """Returns the dot product over the last axis."""
     return jnp.sum(a * b, -1)
 
 
 def _unit(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns unit vectors; a zero vector stays finite."""
+    """Returns unit vectors; a zero vector stays zero and finite."""
     return v / jnp.sqrt(jnp.maximum(_dot(v, v), 1e-12))[..., None]
 
 
 def legs_of(paths: Paths) -> Legs:
-    """Returns the legs of paths."""
+    """Returns the segments of paths."""
     legs = paths.points[:, 1:] - paths.points[:, :-1]
     lengths = jnp.sqrt(jnp.maximum(_dot(legs, legs), SHORTEST**2))
     return Legs(lengths, legs / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
 
 
 def last_leg(paths: Paths) -> Int[Array, " k"]:
-    """Returns the number of the leg that arrives at the receiver."""
+    """Returns the index of the segment that ends at the receiver."""
     ends_leg = (paths.interaction_type == REFLECTED) | (paths.interaction_type == DIFFRACTED)
     return jnp.sum(ends_leg, -1)
 
@@ -214,7 +215,7 @@ def last_leg(paths: Paths) -> Int[Array, " k"]:
 def _slab_interactions(
     paths: Paths, legs: Legs, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
 ) -> _SlabInteractions:
-    """Returns what the slabs of all paths do; nonsense where an interaction is none with a slab."""
+    """Returns the slab basis and coefficients at every interaction; meaningless where an interaction is not with a slab."""
     facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
     along = jnp.take_along_axis(legs.direction, paths.interaction_leg[..., None], 1)
     normal, reflects = surfaces.facets.normal[facet], paths.interaction_type == REFLECTED
@@ -235,21 +236,21 @@ def _slab_interactions(
 def _through_slabs(
     field: Complex[Array, "k 3"], interactions: _SlabInteractions, active: Bool[Array, "k 5"]
 ) -> Complex[Array, "k 3"]:
-    """Returns the field behind the slabs that are active, in their order."""
+    """Returns the field behind the active slabs, applied in order."""
 
     def through(field, one):
         (across, into, out, te, tm), active = one
         changed = (te * _dot(field, across))[:, None] * across + (tm * _dot(field, into))[:, None] * out
         return jnp.where(active[:, None], changed, field).astype(field.dtype), None
 
-    # A loop: written out, XLA compiles it twice as long, and the code it makes for a CPU is slower.
+    # A scan: unrolled, it takes XLA twice as long to compile, and the code for a CPU is slower.
     return jax.lax.scan(through, field, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), (interactions, active)))[0]
 
 
 def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns the unit vector across the plane of incidence; any one at normal incidence."""
+    """Returns the unit vector perpendicular to the plane of incidence; an arbitrary one at normal incidence."""
     s = jnp.cross(along, normal)
-    other = jnp.eye(3, dtype=normal.dtype)[jnp.argmin(jnp.abs(normal), -1)]  # the axis that is least along the normal
+    other = jnp.eye(3, dtype=normal.dtype)[jnp.argmin(jnp.abs(normal), -1)]  # the axis least parallel to the normal
     return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, other), s))
 
 
@@ -263,7 +264,7 @@ def _over_edges(
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
 ) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
-    """Returns the field behind the slabs before an edge, the edge, and the slabs after it; and the spreading factor."""
+    """Returns the field after the slabs before an edge, the edge, and the slabs behind it; and the spreading factor."""
     k, place = jnp.arange(len(field)), jnp.arange(MAX_INTERACTIONS)
     slot = jnp.argmax(paths.interaction_type == DIFFRACTED, -1)
     leg, edge = paths.interaction_leg[k, slot], paths.interaction_facet[k, slot]
@@ -287,12 +288,12 @@ def _diffract(
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
 ) -> Complex[Array, "k 3"]:
-    """Returns the field vector behind the edge, without spreading: the dyadic of `utd.py` in vectors.
+    """Returns the field vector behind the edge, without spreading: the dyadic of `utd.py` in vector form.
 
     Args:
         field: at the edge.
         ki, ko: unit vectors along the incident and the diffracted ray.
-        before, after: length of the way to the edge and from it, metres.
+        before, after: path length to the edge and from it, metres.
         edge: index of the edge.
         edges, slabs: of the scene.
         frequency_hz: of the carrier.
@@ -316,7 +317,7 @@ def _diffract(
 
 
 def _edge_coefficients(ki, ko, before, after, normal_0, normal_n, direction, frequency_hz):
-    """Returns the diffraction coefficients of edges for rays of known lengths (`utd.wedge_coefficients`)."""
+    """Returns the diffraction coefficients of edges for rays of given lengths (`utd.wedge_coefficients`)."""
     tangent = jnp.cross(normal_0, direction)
 
     def angle(v):
@@ -333,5 +334,6 @@ def _edge_coefficients(ki, ko, before, after, normal_0, normal_n, direction, fre
 def _components(
     vector: Complex[Array, "k 3"], along: Float[Array, "k 3"], basis: Float[Array, "k 3"]
 ) -> tuple[Complex[Array, " k"], Complex[Array, " k"]]:
-    """Returns the components of a field across a ray: along a unit vector across the ray, and along the third direction."""
+    """Returns the components of a field perpendicular to a ray: along `basis`, a unit vector perpendicular to the ray, and
+    along the third direction."""
     return _dot(vector, basis), _dot(vector, jnp.cross(along, basis))

@@ -49,7 +49,7 @@ def transition(root: Float[Array, "*n"]) -> Complex[Array, "*n"]:
 def _cotangent_transition(
     angle: Float[Array, "*#n"], n: Float[Array, "*#n"], root_kl: Float[Array, "*#n"]
 ) -> Complex[Array, "*#n"]:
-    """Returns cot(angle) F(kL a), finite through the shadow boundary at angle = 0 (modulo pi)."""
+    """Returns cot(angle) F(kL a), which stays finite at the shadow boundary angle = 0 (modulo pi)."""
     angle = angle - jnp.pi * jnp.round(angle / jnp.pi)
     angle = jnp.where(jnp.abs(angle) < 1e-6, 1e-6, angle)
     root = math.sqrt(2) * root_kl * jnp.abs(jnp.sin(n * angle))
@@ -67,7 +67,7 @@ def wedge_coefficients(
     """Returns (D1 + D2, D3, D4), in square roots of metres (Kouyoumjian and Pathak, equation 25).
 
     Args:
-        phi_in, phi_out: angles (radians) of the source and of the goal from the 0-face, through free space.
+        phi_in, phi_out: angles (radians) of source and observation point, measured from the 0-face through free space.
         n: exterior angle in half turns (1..2).
         sin_beta: sine of the angle between the ray and the edge.
         kl: wavenumber times the distance parameter s s' sin^2(beta) / (s + s').

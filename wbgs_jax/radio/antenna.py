@@ -1,8 +1,8 @@
-"""Antennas: polarisation, and gain by direction.
+"""Antennas: polarisation and directional gain.
 
-An antenna is vertically polarised in its own frame, along theta-hat. Its gain is a product of two known patterns, each with an
-exponent: the element of 3GPP TR 38.901, which looks along +x, and the short dipole along z. Two numbers tell the usual patterns
-apart, and those between them can be learned.
+An antenna is vertically polarised in its own frame, along theta-hat. Its gain is a product of two patterns, each raised to an
+exponent: the element of 3GPP TR 38.901, with boresight +x, and the short dipole along z. The two exponents represent the usual
+patterns, and values between these can be learned.
 """
 
 import re
@@ -17,13 +17,13 @@ from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.geometry import rotation_matrix, to_local
 
 PATTERN_EXPONENTS = {
-    "": (0.0, 0.0),  # not known
+    "": (0.0, 0.0),  # unknown
     "iso": (0.0, 0.0),
     "tr38901": (1.0, 0.0),
     "dipole": (0.0, 1.0),
     "hw_dipole": (0.0, 1.2),  # within 0.41 dB wherever the half-wave dipole is above -10 dB
 }
-"""Exponents of the directional element and of the dipole by the name of a pattern."""
+"""Exponents of the directional element and of the dipole, by pattern name."""
 SPELLINGS = {"isotropic": "iso", "tr38901": "tr38901", "38901": "tr38901", "3gpp38901": "tr38901"}
 SPELLINGS |= {
     "3gpptr38901": "tr38901",
@@ -32,32 +32,36 @@ SPELLINGS |= {
     "halfwavelengthdipole": "hw_dipole",
 }
 SPELLINGS |= {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
-"""Names in small letters, without separators."""
+"""Pattern names by their spellings in lower case without separators."""
 POLE = 1e-12
-"""Squared sine of the zenith angle below which a direction is straight up or down."""
+"""Squared sine of the zenith angle below which a direction counts as vertical."""
 
 
 @pytree
 class Antenna:
-    """How an antenna is turned, and its pattern."""
+    """Orientation and pattern of an antenna."""
 
     orientation: Float[Array, "4"]
-    """Quaternion (wxyz) of any length but zero that turns the antenna's own frame into that of the directions."""
+    """Quaternion (wxyz) of any non-zero length that rotates the antenna's own frame into that of the directions."""
     exponents: Float[Array, "2"]
-    """Of the gain of the TR 38.901 element and of that of the short dipole."""
+    """Exponents of the gains of the TR 38.901 element and of the short dipole."""
 
 
 def upright(exponents: Float[Array, "2"]) -> Antenna:
-    """Returns an antenna that is not turned; zeros stand for an isotropic one."""
+    """Returns an unrotated antenna; exponents of zero make it isotropic."""
     return Antenna(jnp.array([1, 0, 0, 0], exponents.dtype), exponents)
 
 
 def pattern_exponents(pattern: str) -> tuple[float, float]:
-    """Returns the exponents of a named pattern, in any usual spelling; one that is not known is a `UserError`."""
+    """Returns the exponents of a named pattern, in any usual spelling.
+
+    Raises:
+        UserError: an unknown pattern.
+    """
     plain = re.sub(r"[^a-z0-9]", "", pattern.lower())
     if plain not in SPELLINGS:
-        known = ", ".join(filter(None, PATTERN_EXPONENTS))
-        raise UserError(f"the antenna pattern {pattern[:40]!r} is not known; choose {known}, or none where it is not known")
+        choices = ", ".join(filter(None, PATTERN_EXPONENTS))
+        raise UserError(f"unknown antenna pattern {pattern[:40]!r}; choose {choices}, or an empty name if it is unknown")
     return PATTERN_EXPONENTS[SPELLINGS[plain]]
 
 
@@ -74,7 +78,7 @@ def antenna_field(antenna: Antenna, direction: Float[Array, "*n 3"]) -> Float[Ar
 def element_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     """Returns the amplitude gain of the element of 3GPP TR 38.901 (table 7.3-1) in unit directions: boresight +x, 8 dBi.
 
-    Straight up and down, where there is no azimuth, it is that of azimuth 0, and so is its gradient.
+    In the vertical directions, where the azimuth is undefined, gain and gradient are those of azimuth 0.
     """
     x, y, z = jnp.moveaxis(direction, -1, 0)
     squared = x * x + y * y
@@ -93,7 +97,7 @@ def dipole_gain(direction: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
 
 
 def zenith_vector(direction: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns the unit vector theta-hat of a unit direction: the electric field of a vertically polarised antenna."""
+    """Returns the unit vector theta-hat of a unit direction: the electric field direction of a vertically polarised antenna."""
     x, y, z = jnp.moveaxis(direction, -1, 0)
     horizontal = jnp.sqrt(jnp.maximum(x * x + y * y, POLE))
     return jnp.stack([z * x / horizontal, z * y / horizontal, -horizontal], -1)

@@ -8,7 +8,7 @@ A power angular spectrum (PAS) pixel is |a(k)^H y| / max: the AMPLITUDE of conve
 y, scaled by its own maximum. Rows are zenith 0..90 degrees (row 0 = zenith), columns azimuth -180..180 degrees; both ends
 are included, so the first and last column are the same direction.
 
-The beams that a receiver chooses from: directions of the hemisphere, as pixels of its spectrum.
+A receiver's beams are directions of the hemisphere, given as pixels of its spectrum.
 """
 
 import functools
@@ -24,13 +24,14 @@ from wbgs_jax._util.pytree import pytree
 PAS_HEIGHT, PAS_WIDTH = 90, 360
 PAS_SHAPE = (PAS_HEIGHT, PAS_WIDTH)
 SPEED_OF_LIGHT = 299_792_458.0
-"""Metres a second."""
+"""Metres per second."""
 EXACT = jax.lax.Precision.HIGHEST
-"""Of matrix products on positions and phases: the default of a GPU may be TF32, whose ten bits are millimetres in a room."""
+"""Precision of matrix products on positions and phases: a GPU's default may be TF32, whose ten bits are millimetres in a
+room."""
 
 
 FAINTEST_POWER = 1e-8
-"""Of a pixel of the spectrum of a covariance of unit trace; what is fainter is nothing."""
+"""Power of a pixel in the spectrum of a covariance of unit trace below which it counts as zero."""
 
 
 def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float[np.ndarray, "elements 3"]:
@@ -73,10 +74,12 @@ def array_response(
     second: Float[Array, "m 3"],
     steering_first: Complex[Array, "n elements"] | None = None,
 ) -> Float[Array, "n m"]:
-    """Returns |a(u)^H a(v)| / elements, 0..1: what the array hears in unit directions u of plane waves from v.
+    """Returns |a(u)^H a(v)| / elements, 0..1: the array's response in unit directions u to plane waves from v.
 
-    Directions are those of the receiver's frame. Positions are in wavelengths: the same for all v, or those of each.
-    `steering_first` are the steering vectors of u, where they are known.
+    Args:
+        element_positions: wavelengths; the same for all v, or one set for each.
+        first, second: unit vectors u and v, receiver's frame.
+        steering_first: steering vectors of u, if already computed.
     """
     if element_positions.ndim == 3:
         alone = jax.vmap(lambda positions, v: array_response(positions, first, v[None])[:, 0], out_axes=1)
@@ -88,7 +91,7 @@ def array_response(
 
 
 def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m elements"]) -> Float[Array, "*nm"]:
-    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and steering vector: shape (*n, *m)."""
+    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and steering vector; shape (*n, *m)."""
     return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]], precision=EXACT))
 
 
@@ -98,7 +101,7 @@ def snapshot_to_pas(
 ) -> Float[Array, "*n 90 360"]:
     """Returns the power angular spectra, each scaled to a maximum of 1, of complex array snapshots; zeros for a zero snapshot.
 
-    Element positions are in wavelengths: the same for all snapshots, or those of each of n (an array of fixed size in metres).
+    Element positions are in wavelengths: one set for all snapshots, or one for each (an array of fixed size in metres).
     """
     snapshot = jnp.asarray(snapshot)
     positions = jnp.asarray(element_positions, snapshot.real.dtype)
@@ -109,21 +112,21 @@ def snapshot_to_pas(
 
 @pytree
 class Beams:
-    """How the squared spectrum of an array follows from the mean product y y^H of its snapshots: linearly, by its lags.
+    """Linear map from the mean product y y^H of an array's snapshots to its squared spectrum, in terms of lags.
 
     Lags are the differences of element positions.
     """
 
     basis: Float[Array, "pixels terms"]
-    """One, twice the cosine and minus twice the sine of 2 pi lag.k, pixels in row-major order."""
+    """1, twice the cosine and minus twice the sine of 2 pi lag.k; pixels in row-major order."""
     lag: Int[Array, "elements elements"]
-    """Which lag every pair of elements has, ..."""
+    """Index of the lag of every pair of elements, ..."""
     once: Bool[Array, "elements elements"]
-    """... and whether it counts: of two pairs with opposite lags one does."""
+    """... and whether the pair counts: only one of two pairs with opposite lags does."""
 
 
 def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
-    """Returns the beams of an array whose element positions (wavelengths) are known on the host."""
+    """Returns the lag basis of an array whose element positions (wavelengths) are available on the host."""
     positions = np.asarray(element_positions, np.float64)
     lags = np.round(positions[None] - positions[:, None], 9) + 0.0
     first = np.argmax(np.abs(lags) > 0, -1)
@@ -140,9 +143,9 @@ def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
 @jax.jit
 def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams: Beams) -> Float[Array, "*n 90 360"]:
     """Returns the power angular spectra, each scaled to a maximum of 1, of mean products y y^H of random snapshots: the root of
-    the mean of |a^H y|^2. Covariances have a trace of about 1.
+    the mean of |a^H y|^2. Covariances should have a trace of about 1.
 
-    Where nothing is random it agrees with `snapshot_to_pas`, to the root of single precision.
+    Without randomness this agrees with `snapshot_to_pas`, to the square root of single precision.
     """
     count, flat = beams.basis.shape[1] // 2, covariance.reshape(-1, *covariance.shape[-2:])
     counted = jnp.where(beams.once, flat, 0).reshape(flat.shape[0], -1)
@@ -155,23 +158,23 @@ def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams:
 def wide_covariance_to_pas(
     covariance: Complex[Array, "n elements elements"], element_positions: Float[Array, "n elements 3"]
 ) -> Float[Array, "n 90 360"]:
-    """Returns what `covariance_to_pas` does where every covariance has element positions (wavelengths) of its own.
+    """Returns `covariance_to_pas` for covariances with individual element positions (wavelengths).
 
-    An array of fixed size in metres has others at every frequency.
+    An array of fixed size in metres has different ones at every frequency.
     """
     grid = jnp.asarray(pas_directions(), covariance.real.dtype)
 
     def one(own: Complex[Array, "elements elements"], positions: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
         steering = steering_vector(positions, grid)
-        turned = jnp.matmul(steering.conj(), own, precision=EXACT)
-        power = jnp.sum(turned.real * steering.real - turned.imag * steering.imag, -1)
+        weighted = jnp.matmul(steering.conj(), own, precision=EXACT)
+        power = jnp.sum(weighted.real * steering.real - weighted.imag * steering.imag, -1)
         return _root(power)
 
     return normalise(jax.vmap(one)(covariance, element_positions))
 
 
 def _root(power: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns the root of powers, 0 for the faintest: of nothing there is nothing to see, and no gradient is infinite."""
+    """Returns the square root of powers, 0 for the faintest, so that zero power has no infinite gradient."""
     return jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)) - FAINTEST_POWER**0.5
 
 
@@ -185,8 +188,9 @@ def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
 def _peak(pas: Float[Array, "*n h w"]) -> Float[Array, "*n 1 1"]:
     """Returns the largest pixel of every PAS.
 
-    Its derivative is that of the first such pixel. JAX's own counts the pixels that equal the maximum; compiled together with
-    what makes them, they may be rounded otherwise the second time, the count be zero and the gradient not a number.
+    Its derivative is that of the first such pixel. JAX's own counts the pixels that equal the maximum; if it is compiled
+    together with the computation of the pixels, these may be rounded differently the second time, so that the count is zero and
+    the gradient NaN.
     """
     return jnp.max(pas, axis=(-2, -1), keepdims=True)
 
@@ -202,7 +206,7 @@ def _peak_jvp(
 
 
 def lag_basis(element_positions: Float[np.ndarray, "elements 3"], tolerance: float = 1e-9) -> Float[np.ndarray, "pixels rank"]:
-    """Returns an orthonormal basis (float64) of the space that holds every squared PAS of an array, pixels in row-major order.
+    """Returns an orthonormal basis (float64) of the space of all squared PAS of an array, pixels in row-major order.
 
     |a^H y|^2 is a trigonometric polynomial whose frequencies are the differences of element positions (the array's lags);
     the 4x4 half-wavelength array has 49 of them. `tolerance` is relative to the largest singular value.
@@ -222,25 +226,25 @@ def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 ALIKE = 0.05
-"""Share by which the amplitudes of beams ahead and behind may differ: pixels are not quite symmetric."""
+"""Relative difference allowed between the amplitudes of mirrored beams ahead and behind: pixels are not exactly symmetric."""
 RINGS, SECTORS = 4, 16
-"""Beams on four rings of equal zenith angle, sixteen on each."""
+"""The codebook has beams on four rings of constant zenith angle, sixteen on each."""
 
 
 @functools.cache
 def codebook() -> Int[np.ndarray, " beams"]:
-    """Returns the pixels, in row-major order, that the codebook's beams point at."""
+    """Returns the pixels (row-major indices) in the directions of the codebook's beams."""
     rows = (np.arange(RINGS) + 0.5) * (PAS_HEIGHT - 1) / RINGS
     columns = np.arange(SECTORS) * (PAS_WIDTH - 1) / SECTORS
     return (rows.round().astype(int)[:, None] * PAS_WIDTH + columns.round().astype(int)).reshape(-1)
 
 
 def best_beams(spectra: Float[np.ndarray, "n 90 360"]) -> Int[np.ndarray, " n"]:
-    """Returns which beam hears most in every spectrum. A planar array in the local y-z plane hears the same ahead and behind:
-    there the beam ahead, at local +x, where directional elements look."""
-    heard = spectra.reshape(len(spectra), -1)[:, codebook()]
-    best = heard.argmax(1)
+    """Returns the index of the strongest beam of every spectrum. A planar array in the local y-z plane receives the same ahead
+    and behind; of such a pair, the beam ahead (towards local +x, the boresight of directional elements) is chosen."""
+    received = spectra.reshape(len(spectra), -1)[:, codebook()]
+    best = received.argmax(1)
     ring, sector = np.divmod(best, SECTORS)
     twin = ring * SECTORS + (SECTORS // 2 - sector) % SECTORS
-    ahead, row = pas_directions().reshape(-1, 3)[codebook(), 0], np.arange(len(heard))
-    return np.where((heard[row, twin] >= (1 - ALIKE) * heard[row, best]) & (ahead[twin] > ahead[best]), twin, best)
+    ahead, row = pas_directions().reshape(-1, 3)[codebook(), 0], np.arange(len(received))
+    return np.where((received[row, twin] >= (1 - ALIKE) * received[row, best]) & (ahead[twin] > ahead[best]), twin, best)

@@ -1,7 +1,7 @@
-"""What engineers read from a channel: power, beamforming gain, K-factor, delay spread, and how alike two snapshots are.
+"""Channel quantities: received power, beamforming gain, K-factor, delay and angular spread, and correlation of snapshots.
 
-Pure functions; `snapshot` is the complex voltages of the receiver's elements, `Arrivals` what arrives over
-every path. Leading axes are free.
+All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Arrivals` the amplitudes and
+geometry of all paths. Leading axes are batch axes.
 """
 
 from typing import NamedTuple
@@ -14,36 +14,36 @@ from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steer
 
 
 class Arrivals(NamedTuple):
-    """What reaches a receiver over K paths."""
+    """Amplitudes and geometry of K paths at a receiver."""
 
     amplitude: Complex[Array, "*b k"]
-    """At the array's centre, carrier phase included; 0 for paths that are none."""
+    """Complex amplitude at the array's centre, including the carrier phase; 0 for padding."""
     direction: Float[Array, "*b k 3"]
-    """Unit vectors in the receiver's frame, towards where the wave comes from."""
+    """Unit vectors in the receiver's frame, towards the direction of arrival."""
     length: Float[Array, "*b k"]
     """Length of the whole path, metres."""
     departure: Float[Array, "*b k 3"] | None = None
-    """Unit vectors in the world frame, in which the wave leaves the transmitter."""
+    """Unit vectors in the world frame in which the wave leaves the transmitter."""
     arrival: Float[Array, "*b k 3"] | None = None
-    """Unit vectors in the world frame, in which it travels when it arrives."""
+    """Unit vectors in the world frame in which the wave travels on arrival."""
     polarised: Complex[Array, "*b k 2"] | None = None
-    """Amplitudes that isotropic elements would see, polarised along theta-hat and along phi-hat of the receiver's frame."""
+    """Amplitudes at isotropic elements polarised along theta-hat and along phi-hat of the receiver's frame."""
     interaction: Int[Array, "*b k 5"] | None = None
-    """What the wave meets, in its order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
+    """Types of interaction in order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
     material: Int[Array, "*b k 5"] | None = None
-    """Index of the material that it meets there; -1 beyond the last."""
+    """Index of the material at each interaction; -1 beyond the last."""
     curved: Float[Array, "*b"] | None = None
-    """1 where waves reach the array as spheres, 0 where they are plane (`propagation.transport.element_voltages`)."""
+    """1 for spherical waves at the array, 0 for plane waves (`propagation.transport.element_voltages`)."""
     points: Float[Array, "*b k 5 3"] | None = None
-    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
 
 
 FAINTEST = 1e-30
-"""Amplitude that stands for nothing; its square would vanish in single precision."""
+"""Amplitude that counts as zero; its square would underflow in single precision."""
 SMALLEST = 1e-30
-"""Power that stands for nothing, so that decibels stay finite."""
+"""Power that counts as zero, so that decibels stay finite."""
 NOT_HEARD_DB = -250.0
-"""Received powers at or below it say that no path was found, not how weak one is."""
+"""Received powers at or below this value (dB) mean that no path was found; they do not measure a weak one."""
 
 
 def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -52,13 +52,18 @@ def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns the mean power an element receives, relative to the transmitted power (dB): the negative path loss."""
+    """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss."""
     return decibels(jnp.mean(squared_magnitude(snapshot), -1))
 
 
 def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the power that an isotropic element receives over a line of sight (metres, hertz), relative to the transmitted
-    power (dB; Friis)."""
+    """Returns the power received by an isotropic element over a free line of sight, relative to the transmitted power (dB;
+    Friis).
+
+    Args:
+        distance: metres.
+        frequency_hz: of the carrier.
+    """
     return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
 
 
@@ -68,29 +73,37 @@ def beyond_free_space_db(
     rx_position: Float[Array, "*rx 3"],
     frequency_hz: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
-    """Returns received powers relative to those over a line of sight (dB): how deep in the shadow transmitters stand."""
+    """Returns received powers relative to those of a free line of sight (dB), a measure of how deeply a link is shadowed.
+
+    Args:
+        power_db: relative to the transmitted power.
+        tx_position, rx_position: world frame, metres.
+        frequency_hz: of the carrier.
+    """
     distance = jnp.sqrt(jnp.sum((tx_position - rx_position) ** 2, -1) + 1e-4)
     return power_db - free_space_db(distance, frequency_hz)
 
 
 def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the power of the best conventional beam over that of one element (dB, at most 10 log10 of the elements' number).
+    """Returns the power of the best conventional beam relative to one element (dB), at most 10 log10 of the number of elements.
 
-    `peak` is the largest |a^H y| over all directions.
+    Args:
+        snapshot: complex voltages of the elements.
+        peak: largest |a^H y| over all directions.
     """
     mean = jnp.mean(squared_magnitude(snapshot), -1)
     return decibels(peak**2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
 
 
 def k_factor_db(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the power of the strongest path over that of all others (dB; Rice)."""
+    """Returns the Rician K-factor: the power of the strongest path over that of all others (dB)."""
     power = squared_magnitude(arrivals.amplitude)
     strongest = jnp.max(power, -1)
     return decibels(strongest / jnp.maximum(jnp.sum(power, -1) - strongest, SMALLEST))
 
 
 def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the r.m.s. delay spread (seconds), weighted by power."""
+    """Returns the power-weighted r.m.s. delay spread (seconds)."""
     power = squared_magnitude(arrivals.amplitude)
     weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
     delay = arrivals.length / SPEED_OF_LIGHT
@@ -99,8 +112,8 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
 
 
 def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
-    """Returns the spreads of azimuth and zenith of arrival (in this order) in the receiver's frame, degrees, weighted by power
-    (3GPP TR 38.901, annex A); 0 where nothing arrives."""
+    """Returns the power-weighted circular spreads of azimuth and zenith of arrival (in this order) in the receiver's frame,
+    degrees (3GPP TR 38.901, annex A); 0 without any path."""
     power = squared_magnitude(arrivals.amplitude)
     total = jnp.sum(power, -1, keepdims=True)
     weight = power / jnp.maximum(total, SMALLEST)
@@ -115,8 +128,16 @@ def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
 def doppler_hz(
     arrivals: Arrivals, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
 ) -> Float[Array, "*b k"]:
-    """Returns the Doppler shifts of all paths (hertz) while transmitter and receiver move (metres a second, world frame)."""
-    assert arrivals.departure is not None and arrivals.arrival is not None, "arrivals of traced paths have them"
+    """Returns the Doppler shifts of all paths (hertz).
+
+    Args:
+        arrivals: of traced paths, with directions of departure and arrival.
+        frequency_hz: of the carrier.
+        tx_velocity, rx_velocity: metres per second, world frame.
+    """
+    assert arrivals.departure is not None and arrivals.arrival is not None, (
+        "only arrivals of traced paths have these directions"
+    )
     along_departure = jnp.sum(arrivals.departure * tx_velocity, -1)
     return frequency_hz / SPEED_OF_LIGHT * (along_departure - jnp.sum(arrivals.arrival * rx_velocity, -1))
 
@@ -124,23 +145,23 @@ def doppler_hz(
 def unit_snapshots(
     snapshots: Complex[Array, "*b elements"],
 ) -> tuple[Complex[Array, "*b elements"], Float[Array, "*b 1"]]:
-    """Returns snapshots of norm 1, zeros where there were zeros, and their norms."""
+    """Returns snapshots scaled to norm 1 (zero snapshots stay zero) and their norms."""
     norm = jnp.sqrt(jnp.sum(squared_magnitude(snapshots), -1, keepdims=True))
     return snapshots / jnp.where(norm > 0, norm, 1), norm
 
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal but for a common phase and scale; 0 for one of nothing."""
-    # Of unit vectors: the square of a product of faint ones would vanish in single precision.
+    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot."""
+    # Computed from unit vectors: the squared product of weak snapshots would underflow in single precision.
     (unit_a, _), (unit_b, _) = unit_snapshots(a), unit_snapshots(b)
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 
 def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
-    """Returns the spectrum, maximum 1, that an array sees of one transmitter's paths if their powers are added instead of their
-    amplitudes. Element positions are in wavelengths."""
+    """Returns the spectrum, scaled to a maximum of 1, that an array measures of one transmitter if the powers of its paths are
+    added instead of their amplitudes. Element positions are in wavelengths."""
     strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))
-    power = squared_magnitude(arrivals.amplitude / jnp.where(strongest > FAINTEST, strongest, 1))  # the root of nothing's
+    power = squared_magnitude(arrivals.amplitude / jnp.where(strongest > FAINTEST, strongest, 1))  # relative: no underflow
     steering = steering_vector(elements, arrivals.direction)
     weighted = steering * (power / jnp.maximum(jnp.sum(power), FAINTEST**0.5))[:, None]
     covariance = jnp.matmul(steering.T, weighted.conj(), precision=EXACT)

@@ -1,7 +1,7 @@
-"""Quaternions, covariances, frames, and direction <-> (azimuth, zenith) <-> PAS pixel.
+"""Quaternions, covariances, coordinate frames, and direction <-> (azimuth, zenith) <-> PAS pixel.
 
 Pixel coordinates are continuous: pixel (row i, column j) of a PAS samples the point x = j, y = i. Columns cover azimuth
--pi..pi with both ends included, so the azimuth has a period of `AZIMUTH_PERIOD` = 359 pixels, not 360.
+-pi..pi with both ends included, so the period of the azimuth is `AZIMUTH_PERIOD` = 359 pixels, not 360.
 """
 
 from typing import Literal
@@ -32,21 +32,21 @@ def rotation_matrix(quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) -> Inexact[Array, "*n 3"]:
-    """Returns world vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) turns local vectors into
-    world ones."""
+    """Returns world vectors, real or complex, in the local frame; the quaternion `orientation` (wxyz) rotates local vectors
+    into world ones."""
     return jnp.matmul(vectors, rotation_matrix(orientation), precision=EXACT)
 
 
 def turned(orientation: Float[Array, "4"], rotation: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Returns a quaternion (wxyz, of any length) after a small rotation of the world, a vector in radians: right to its third
-    power."""
+    """Returns a quaternion (wxyz, of any length) after a small rotation of the world frame (rotation vector, radians), with an
+    error of third order."""
     w, v = orientation[0], orientation[1:]
     half = rotation / 2
     return jnp.concatenate([(w - jnp.sum(half * v))[None], v + w * half + jnp.cross(half, v)])
 
 
 def covariance_factor(log_scales: Float[Array, "*n 3"], quats: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Returns M with covariance M M^T: the own axes as columns, scaled by the standard deviations (metres)."""
+    """Returns M with covariance M M^T: the principal axes as columns, scaled by the standard deviations (metres)."""
     return rotation_matrix(quats) * jnp.exp(log_scales)[..., None, :]
 
 
@@ -86,5 +86,5 @@ def pixel_to_angles(
 
 
 def smooth_length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
-    """Returns the length (metres), rounded up to a millimetre so that it is differentiable everywhere."""
+    """Returns vector lengths (metres), smoothed on the scale of a millimetre so that they are differentiable everywhere."""
     return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)

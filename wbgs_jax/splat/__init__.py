@@ -1,6 +1,6 @@
 """Splatting onto the receiver's hemisphere: projection.py -> tiles.py -> composite.py, composed by render.py.
 
-`reference.py` is the dense, readable oracle of the same image.
+`reference.py` is a dense, readable reference implementation of the same image.
 """
 
 from wbgs_jax.splat.projection import Splats, project

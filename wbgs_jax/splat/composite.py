@@ -1,17 +1,18 @@
-"""Front-to-back blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see reference.py).
+"""Front-to-back alpha blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see reference.py).
 
-A job holds `CHUNK` Gaussians of one tile. Its footprints are computed once and shared by all queries, and an unrolled multiply
-chain blends it. Two forms of the same image; the platform that the code is lowered for decides (docs/performance.md):
+A job holds `CHUNK` Gaussians of one tile. Its footprints are computed once and shared by all queries; an unrolled chain of
+products blends them. There are two implementations of the same image, chosen by the platform that the code is lowered for
+(docs/performance.md):
 
-* by tiles, here: some tiles go through their jobs together, from near to far, and what they hold stays in a CPU's cache;
-* by jobs, on NVIDIA GPUs (fused_kernels.py): thousands are blended at once, each on its own, and then joined tile by tile.
+* by tiles (this module): a group of tiles steps through its jobs from near to far, so that the working set stays in a CPU's
+  cache;
+* by jobs, on NVIDIA GPUs (fused_kernels.py): thousands of jobs are blended independently and then joined tile by tile.
 
-The backward passes recompute the chain instead of storing it and turn its pixel sums into matrix products.
+The backward passes recompute the chain instead of storing it and turn its sums over pixels into matrix products.
 
-What a hand-written backward pass does not allow, refused in a sentence of our own.
-
-JAX refuses it too, but in words about a function that nobody asked for, or about a loop within it. Both functions below are
-the identity, and cost nothing when code runs.
+The hand-written backward pass allows neither forward-mode nor second derivatives. JAX rejects these too, but its messages refer
+to an internal function or to a loop inside it. `reverse_mode_only` and `not_differentiable` therefore raise a clear error; both
+are the identity and cost nothing at run time.
 """
 
 from typing import Any, NoReturn
@@ -40,8 +41,8 @@ def _refuse(*_: Any, **__: Any) -> NoReturn:
 
 
 _tangent = Primitive("reverse_mode_only")
-"""(x, its tangent) -> the tangent. Reverse mode transposes it away; forward mode comes to evaluate it, to compile it, or to map
-it over tangents of one x."""
+"""(x, its tangent) -> the tangent. Reverse mode transposes it away. Forward mode evaluates it, compiles it, or maps it over
+several tangents of one x; all three raise."""
 
 
 def _map(arguments: Any, axes: Any) -> Any:
@@ -66,7 +67,7 @@ ad.primitive_transposes[_tangent] = lambda cotangent, x, tangent: [None, cotange
 
 @jax.custom_jvp
 def reverse_mode_only(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns x; forward-mode differentiation is a TypeError, of jitted code when it is compiled."""
+    """Returns x. Forward-mode differentiation raises a TypeError; under jit this happens at compile time."""
     return x
 
 
@@ -77,7 +78,7 @@ def _reverse_mode_only_jvp(primals, tangents):
 
 @jax.custom_jvp
 def not_differentiable(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns x; differentiation of any kind is a TypeError."""
+    """Returns x. Differentiation of any kind raises a TypeError."""
     return x
 
 
@@ -85,8 +86,8 @@ not_differentiable.defjvp(_refuse)
 
 
 TILE_GROUP = 25
-"""Tiles that a CPU blends together, at most: many for its vector units, few for its caches, and few enough that XLA does not
-share every small step between threads, which costs more than it gains."""
+"""Maximum number of tiles that a CPU blends together: enough to fill its vector units, few enough for its caches, and few
+enough that XLA does not split every small step between threads, which costs more than it saves."""
 
 
 @jax.jit
@@ -97,32 +98,39 @@ def composite(
     signal: Float[Array, "n b"],
     jobs: TileJobs,
 ) -> Float[Array, "b 90 360"]:
-    """Returns N splats blended for B queries. `attenuation` (delta) must lie in [0, 1); `jobs` must not have overflowed.
+    """Returns N splats blended for B queries.
 
     Differentiable once, in reverse mode, with respect to the four float arguments.
 
+    Args:
+        means2d: centres, pixels.
+        conics: inverse 2D covariances (xx, xy, yy), 1 / px^2.
+        attenuation: delta of every Gaussian and query, in [0, 1).
+        signal: Sig of every Gaussian and query.
+        jobs: tile lists, which must not have overflowed.
+
     Raises:
         TypeError: forward-mode differentiation or a second derivative, which the hand-written backward pass does not allow;
-            of a jitted function when it is compiled, from `jax.linearize` when its result is called.
+            for a jitted function at compile time, for `jax.linearize` when its result is called.
     """
     arrays = jnp.concatenate([means2d, conics], -1), attenuation, signal
-    precision = jnp.result_type(*arrays)  # they differ where a query is in double precision, and a field in single
+    precision = jnp.result_type(*arrays)  # they differ if the queries are in double precision and the field is in single
     own = (reverse_mode_only(array.astype(precision)) for array in arrays)
     return assembled(_blend_tiles(*own, jobs), jobs.tiling)
 
 
 def assembled(tiles: Float[Array, "tiles b pixels"], tiling: Tiling) -> Float[Array, "b 90 360"]:
-    """Returns images made of tiles."""
+    """Returns images (pixels) assembled from their tiles."""
     grid = tiles.reshape(tiling.rows, tiling.columns, -1, tiling.height, tiling.width)
     return grid.transpose(2, 0, 3, 1, 4).reshape(-1, tiling.rows * tiling.height, PAS_WIDTH)[:, :PAS_HEIGHT]
 
 
-# The two forms
+# The two implementations
 
 
 def _forward_shapes(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs) -> list[Any]:
-    """Of the tiles' image, and of what is in front of every job: image and transmittance. The form by tiles leaves the last two
-    zero; what is not read costs nothing."""
+    """Returns the shapes of the tiles' image and of the image and transmittance in front of every job. The implementation by
+    tiles leaves the last two zero; outputs that are not read cost nothing."""
     b, tiling = attenuation.shape[1], jobs.tiling
     shapes = [(tiling.tiles, b, tiling.pixels), *[(jobs.tile.shape[0], b, tiling.lanes)] * 2]
     return [jax.ShapeDtypeStruct(shape, attenuation.dtype) for shape in shapes]
@@ -134,15 +142,15 @@ def _forward_by_tiles(geometry: Any, attenuation: Any, signal: Any, jobs: TileJo
 
 
 def _has_kernels(attenuation: Any) -> bool:
-    """Whether kernels compute this: numbers of single precision, and of as many queries as the program knows. In exported
-    files, which do not, they would not outlive a version of JAX."""
+    """Returns whether the Pallas kernels apply: single precision and a static number of queries. Exported files have a symbolic
+    number of queries and use plain operations, since compiled kernels would not work with another version of JAX."""
     return attenuation.dtype == jnp.float32 and isinstance(attenuation.shape[1], int)
 
 
 def _forward_by_jobs(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs) -> list[Any]:
     if not _has_kernels(attenuation):
         return _forward_by_tiles(geometry, attenuation, signal, jobs)
-    from wbgs_jax.splat import fused_kernels  # here: a CPU has no need of the language of its kernels
+    from wbgs_jax.splat import fused_kernels  # imported here because a CPU does not need Pallas
 
     image, *front = fused_kernels.forward(geometry, attenuation, signal, jobs)
     return [image[..., : jobs.tiling.pixels], *front]
@@ -152,18 +160,18 @@ def _backward_shapes(geometry: Any, attenuation: Any, signal: Any, *_: Any) -> l
     return [geometry, attenuation, signal]
 
 
-def _backward_by_tiles(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs, seen: Any, cotangent: Any) -> list[Any]:
-    return list(blend_by_tiles_backward(geometry, attenuation, signal, jobs, seen[0], cotangent))
+def _backward_by_tiles(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs, blended: Any, cotangent: Any) -> list[Any]:
+    return list(blend_by_tiles_backward(geometry, attenuation, signal, jobs, blended[0], cotangent))
 
 
-def _backward_by_jobs(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs, seen: Any, cotangent: Any) -> list[Any]:
+def _backward_by_jobs(geometry: Any, attenuation: Any, signal: Any, jobs: TileJobs, blended: Any, cotangent: Any) -> list[Any]:
     if not _has_kernels(attenuation):
-        return _backward_by_tiles(geometry, attenuation, signal, jobs, seen, cotangent)
+        return _backward_by_tiles(geometry, attenuation, signal, jobs, blended, cotangent)
     from wbgs_jax.splat import fused_kernels
 
     dead = jobs.tiling.lanes - jobs.tiling.pixels
-    image, cotangent = (jnp.pad(tiles, ((0, 0), (0, 0), (0, dead))) for tiles in (seen[0], cotangent))
-    return list(fused_kernels.backward(geometry, attenuation, signal, jobs, image, seen[1], seen[2], cotangent))
+    image, cotangent = (jnp.pad(tiles, ((0, 0), (0, 0), (0, dead))) for tiles in (blended[0], cotangent))
+    return list(fused_kernels.backward(geometry, attenuation, signal, jobs, image, blended[1], blended[2], cotangent))
 
 
 _forward = per_platform("splat_forward", _forward_shapes, _forward_by_tiles, cuda=_forward_by_jobs)
@@ -175,16 +183,16 @@ def _blend_tiles(geometry, attenuation, signal, jobs: TileJobs) -> Float[Array, 
     return _forward(geometry, attenuation, signal, jobs)[0]
 
 
-def _blend_tiles_fwd(*own_and_jobs):
-    *arrays, jobs = own_and_jobs
+def _blend_tiles_fwd(*arrays_and_jobs):
+    *arrays, jobs = arrays_and_jobs
     own = tuple(map(not_differentiable, arrays))
-    seen = _forward(*own, jobs)
-    return seen[0], (own, jobs, seen)
+    blended = _forward(*own, jobs)
+    return blended[0], (own, jobs, blended)
 
 
 def _blend_tiles_bwd(residuals, cotangent):
-    own, jobs, seen = residuals
-    return *_backward(*map(not_differentiable, own), jobs, seen, cotangent), None
+    own, jobs, blended = residuals
+    return *_backward(*map(not_differentiable, own), jobs, blended, cotangent), None
 
 
 _blend_tiles.defvjp(_blend_tiles_fwd, _blend_tiles_bwd)
@@ -194,7 +202,8 @@ _blend_tiles.defvjp(_blend_tiles_fwd, _blend_tiles_bwd)
 
 
 def _gather(geometry, attenuation, signal, gaussian: Int[Array, "jobs chunk"], tile: Int[Array, " jobs"], tiling: Tiling):
-    """Per slot and job: geometry (u, v, conic) relative to the tile's centre, attenuation and signal of every query."""
+    """Returns, by slot and job, the geometry (u, v, conic) relative to the tile's centre, and every query's attenuation and
+    signal."""
     gaussian = gaussian.T
     index = jnp.maximum(gaussian, 0)
     own = geometry[index]
@@ -212,7 +221,7 @@ def _q(geometry: Float[Array, "*n 5"], tiling: Tiling) -> Float[Array, "*n pixel
 
 
 def _blend(slots, tiling: Tiling, image: Float[Array, "jobs b pixels"], transmittance: Float[Array, "jobs b pixels"]):
-    """Image and transmittance behind one job of every tile, given those in front of it."""
+    """Returns image and transmittance behind one job of every tile, given those in front of it."""
     geometry, attenuation, signal = slots
     # The barrier keeps XLA from fusing the exponential into every query's chain and computing it B times.
     g = lax.optimization_barrier(footprint(_q(geometry, tiling)))
@@ -224,10 +233,11 @@ def _blend(slots, tiling: Tiling, image: Float[Array, "jobs b pixels"], transmit
 
 
 def _blend_bwd(slots, tiling: Tiling, cotangent, behind, transmittance):
-    """Backward of one job of every tile.
+    """Returns the backward pass of one job of every tile.
 
-    `behind` is what these jobs and all later ones add to the pixel, so dI/dalpha = Sig T - (what lies behind) / (1 - alpha).
-    Returns `behind` and `transmittance` for the next job, and per slot the gradients of geometry, attenuation and signal.
+    `behind` is the contribution of these jobs and all later ones to the pixel, so dI/dalpha = Sig T - behind / (1 - alpha) with
+    the Gaussian's own contribution taken out of `behind`. The result is `behind` and `transmittance` for the next job and, by
+    slot, the gradients of geometry, attenuation and signal.
     """
     _, jobs, b = slots[1].shape
     monomials, one = tiling.monomials().astype(cotangent.dtype), jnp.ones((tiling.pixels, 1), cotangent.dtype)
@@ -257,7 +267,7 @@ def _blend_bwd(slots, tiling: Tiling, cotangent, behind, transmittance):
 
 
 def _geometry_gradient(geometry: Float[Array, "*n 5"], moments: Float[Array, "*n 6"]) -> Float[Array, "*n 5"]:
-    """Gradients of (u, v, conic xx, xy, yy) from the moments of -2 dL/dq about the tile's centre."""
+    """Returns the gradients of (u, v, conic xx, xy, yy) from the moments of -2 dL/dq about the tile's centre."""
     u, v, a, b, c = jnp.moveaxis(geometry, -1, 0)
     m0, mx, my, mxx, mxy, myy = jnp.moveaxis(moments, -1, 0)
     dx, dy = mx - u * m0, my - v * m0
@@ -267,26 +277,26 @@ def _geometry_gradient(geometry: Float[Array, "*n 5"], moments: Float[Array, "*n
 
 
 def _no_gradient(attenuation: Float[Array, "n b"]) -> Float[Array, "n_1 f"]:
-    """Zeros for every Gaussian's geometry, attenuation and signal, and one row more."""
+    """Returns zero gradients of every Gaussian's geometry, attenuation and signal, with one extra row."""
     n, b = attenuation.shape
     return jnp.zeros((n + 1, 5 + 2 * b), attenuation.dtype)
 
 
 def _sum_by_gaussian(total: Float[Array, "n_1 f"], gaussian: Int[Array, "jobs chunk"], per_slot: Float[Array, "chunk jobs f"]):
-    """Add the gradients of slots to those of their Gaussians; empty slots go to a row past the end."""
+    """Returns the total with the gradients of slots added to those of their Gaussians; empty slots go to the extra row."""
     owner = jnp.where(gaussian >= 0, gaussian, total.shape[0] - 1).T
     return total.at[owner.reshape(-1)].add(per_slot.reshape(-1, total.shape[1]))
 
 
 def _tile_groups(jobs: TileJobs) -> Int[Array, "groups tiles"]:
-    """Tiles with lists of similar length go together."""
+    """Returns groups of tiles with lists of similar length."""
     tiles = jobs.tiling.tiles
     size = max(size for size in range(1, TILE_GROUP + 1) if tiles % size == 0)
     return jnp.argsort(-jobs.count).reshape(-1, size)
 
 
 def _next_jobs(jobs: TileJobs, tiles: Int[Array, " tiles"], level: Int[Array, ""]) -> Int[Array, "tiles chunk"]:
-    """The Gaussians of the tiles' jobs of a level; -1 where a tile has no such job."""
+    """Returns the Gaussians of the tiles' jobs at one level; -1 where a tile has no such job."""
     live = level < jobs.count[tiles]
     gaussian = jobs.gaussian[jnp.where(live, jobs.first[tiles] + level, 0)]
     return jnp.where(live[:, None], gaussian, -1)
@@ -295,7 +305,7 @@ def _next_jobs(jobs: TileJobs, tiles: Int[Array, " tiles"], level: Int[Array, ""
 def blend_by_tiles(
     geometry: Float[Array, "n 5"], attenuation: Float[Array, "n b"], signal: Float[Array, "n b"], jobs: TileJobs
 ) -> Float[Array, "tiles b pixels"]:
-    """Returns the image of every tile; geometry is centre and conic."""
+    """Returns the image of every tile. `geometry` holds the centre (pixels) and the conic of each Gaussian."""
     groups, tiling = _tile_groups(jobs), jobs.tiling
 
     def blend_group(tiles):
@@ -318,7 +328,7 @@ def blend_by_tiles_backward(
     image: Float[Array, "tiles b pixels"],
     cotangent: Float[Array, "tiles b pixels"],
 ) -> tuple[Float[Array, "n 5"], Float[Array, "n b"], Float[Array, "n b"]]:
-    """Returns the gradients of geometry, attenuation and signal, given that of the image."""
+    """Returns the gradients of geometry, attenuation and signal, given the image and its gradient."""
 
     def group_bwd(total, tiles):
         own = cotangent[tiles]

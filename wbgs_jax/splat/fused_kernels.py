@@ -1,23 +1,22 @@
-"""Blending in four Pallas kernels, for NVIDIA GPUs from Ampere on (by Triton): what `composite.py` runs there.
+"""Alpha blending in four Pallas kernels (Triton backend) for NVIDIA GPUs from Ampere on: what `composite.py` runs there.
 
-A device that has room for thousands of threads wants every job at once, and XLA would write each of a job's intermediate
-results to memory. So here
+A GPU with room for many thousands of threads needs all jobs at once, and XLA would write every intermediate result of a job to
+memory. Therefore
 
-* `_blend_kernel` blends every job on its own, from a blank tile: its image, and what passes through it;
-* `_chain_kernel` joins the jobs of a tile, near to far, and leaves in every job's place what is in front of it;
-* `_backward_kernel` blends a job again behind what is in front of it, and leaves the gradients of its slots;
-* `_collect_kernel` adds those of every Gaussian.
+* `_blend_kernel` blends every job independently, starting from a blank tile, and stores its image and transmittance;
+* `_chain_kernel` joins the jobs of a tile from near to far and stores image and transmittance in front of every job;
+* `_backward_kernel` blends a job again, behind what is in front of it, and stores the gradients of its slots;
+* `_collect_kernel` sums those gradients for every Gaussian.
 
-A program, one warp, keeps a tile's pixels in lanes, and the footprints of a job's 16 Gaussians in registers for all queries.
-Lanes past the last pixel compute numbers that nothing reads. A fixed number of programs shares the jobs that there are, so that
-spare room in the lists costs nothing. Sums over pixels would take most of the time of a backward pass: the moments of
-footprints are a matrix product, on tensor cores, and the others are taken of 16 arrays at once.
+A program is one warp. It keeps a tile's pixels in lanes and the footprints of a job's 16 Gaussians in registers for all
+queries. Lanes past the last pixel compute values that are never read. A fixed number of programs shares the jobs in use, so
+spare capacity in the lists costs nothing. Sums over pixels would dominate the backward pass: the moments of the footprints are
+a matrix product on tensor cores, and the other sums are taken over 16 arrays at once.
 
-Nothing is added atomically: all sums have one order, and a program gives the same bits whenever it runs.
+Nothing is added atomically: all sums have a fixed order, and a program gives the same bits on every run.
 
-What Triton does not do by itself: it contracts no products and sums, and is careful with numbers too small to matter.
-
-Where kernels are interpreted, by plain operations on any device, these are the formulas that the instructions stand for.
+Triton neither contracts products and sums into fused multiply-adds here nor flushes subnormal numbers, so `fma`, `exp2` and
+`reciprocal` are written as PTX instructions. In interpreted mode (plain operations on any device) they are ordinary formulas.
 """
 
 import contextlib
@@ -42,13 +41,13 @@ _interpreting = ContextVar("interpreting", default=False)
 
 
 def interpreting() -> bool:
-    """Whether kernels that are traced now are to be interpreted."""
+    """Returns whether kernels traced now are to be interpreted."""
     return _interpreting.get()
 
 
 @contextlib.contextmanager
 def interpreted() -> Iterator[None]:
-    """Lets kernels that are traced within be computed by plain operations: slowly, and on any device."""
+    """Makes kernels traced within this context run as plain operations: slowly, but on any device."""
     token = _interpreting.set(True)
     try:
         yield
@@ -75,36 +74,36 @@ def fma(a: Any, b: Any, c: Any) -> Any:
 
 
 def exp2(x: Any) -> Any:
-    """Returns 2^x; what is below 1e-38 is zero."""
+    """Returns 2^x; results below 1e-38 are flushed to zero."""
     return jnp.exp2(x) if interpreting() else _instruction("ex2.approx.ftz.f32", x)
 
 
 def reciprocal(x: Any) -> Any:
-    """Returns 1 / x, to the last digit but one."""
+    """Returns 1 / x with an error of about one unit in the last place."""
     return 1 / x if interpreting() else _instruction("rcp.approx.ftz.f32", x)
 
 
 def product(columns: Float[Array, "k m"], matrix: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    """Returns columns^T matrix as exactly as float32 can: on tensor cores by three products in TF32."""
+    """Returns columns^T matrix at float32 accuracy; on tensor cores by three TF32 products."""
     precision: Any = lax.Precision.HIGHEST if interpreting() else lax.DotAlgorithmPreset.TF32_TF32_F32_X3
     return lax.dot_general(columns, matrix, (((0,), (0,)), ((), ())), precision=precision)
 
 
 PROGRAMS = 132 * 32
-"""Programs that share all jobs: as many as an H100 has room for. A smaller GPU runs them in turns."""
+"""Programs that share all jobs: as many as an H100 can hold at once. A smaller GPU runs them in several waves."""
 QUERIES = 8
-"""Queries of a program at most, one after another; other programs take the next ones."""
+"""Maximum number of queries of a program, handled one after another; other programs take the next ones."""
 LEVELS = 8
-"""Jobs of a tile that a chain loads at once, so that it does not wait for memory at every one."""
+"""Jobs of a tile that are loaded at once while chaining, which hides the memory latency."""
 HALF = CHUNK // 2
 GEOMETRY = 5
-"""Numbers that a footprint is made of: the first columns of a Gaussian's row; attenuation and signal of all queries follow."""
+"""Numbers that describe a footprint: the first columns of a Gaussian's row. Attenuation and signal of all queries follow."""
 COLUMNS = 8
-"""Numbers of a row of gradients of that, the last ones zero."""
+"""Columns of a row of footprint gradients; the last ones are zero."""
 ENTRIES = 16
 """Slots of a Gaussian whose gradients are loaded at once."""
 MONOMIALS = 16
-"""Columns of the matrix whose products are moments: 1, x, y, x^2, xy, y^2, and zeros up to what tensor cores take."""
+"""Columns of the matrix of monomials 1, x, y, x^2, xy, y^2, padded with zeros to a size that tensor cores accept."""
 LOG2 = float(np.log(2))
 
 
@@ -114,7 +113,7 @@ def forward(
     signal: Float[Array, "n b"],
     jobs: TileJobs,
 ) -> tuple[Float[Array, "tiles b lanes"], Float[Array, "jobs b lanes"], Float[Array, "jobs b lanes"]]:
-    """Returns the tiles' image, and the image and transmittance in front of every job."""
+    """Returns the tiles' image, and image and transmittance in front of every job."""
     b, tiling = attenuation.shape[1], jobs.tiling
     of_jobs = jax.ShapeDtypeStruct((jobs.tile.shape[0], b, tiling.lanes), jnp.float32)
     of_tiles = jax.ShapeDtypeStruct((tiling.tiles, b, tiling.lanes), jnp.float32)
@@ -139,7 +138,7 @@ def backward(
     transmittance: Float[Array, "jobs b lanes"],
     cotangent: Float[Array, "tiles b lanes"],
 ) -> tuple[Float[Array, "n 5"], Float[Array, "n b"], Float[Array, "n b"]]:
-    """Returns the gradients of geometry, attenuation and signal. `cotangent` is zero in lanes past the last pixel."""
+    """Returns the gradients of geometry, attenuation and signal. `cotangent` must be zero in lanes past the last pixel."""
     (n, b), slots = attenuation.shape, jobs.tile.shape[0] * CHUNK
     rows, to_arguments = jax.vjp(_rows, geometry, attenuation, signal)
     own = jobs.gaussian, jobs.tile, _total(jobs), rows
@@ -178,21 +177,21 @@ def _grid(jobs: TileJobs, b: int) -> tuple[int, int]:
 
 
 def _total(jobs: TileJobs) -> Any:
-    """Returns the number of jobs that there are."""
+    """Returns the number of jobs in use."""
     return (jobs.first[-1] + jobs.count[-1])[None]
 
 
 def _rows(
     geometry: Float[Array, "n 5"], attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]
 ) -> Float[Array, "n_1 c"]:
-    """Returns a row for every Gaussian, and one of zeros for empty slots: the centre (u, v), the A, B, C of its footprint's
-    exponential exp(-q/2) = 2^(A dx^2 + B dx dy + C dy^2), attenuation and signal of every query."""
+    """Returns one row per Gaussian, and a row of zeros for empty slots: the centre (u, v), the coefficients A, B, C of the
+    footprint's exponential exp(-q/2) = 2^(A dx^2 + B dx dy + C dy^2), and the attenuation and signal of every query."""
     exponents = geometry * jnp.array([1, 1, -0.5 / LOG2, -1 / LOG2, -0.5 / LOG2], geometry.dtype)
     return jnp.pad(jnp.concatenate([exponents, attenuation, signal], -1), ((0, 1), (0, 0)))
 
 
 def _columns(b: int) -> int:
-    """Returns the smallest power of two that is no less than the number of queries."""
+    """Returns the smallest power of two that is at least the number of queries."""
     return 1 << (b - 1).bit_length()
 
 
@@ -234,10 +233,10 @@ def _chain_kernel(first_ref, count_ref, image_ref, through_ref, out_ref, front_r
         level = [block * LEVELS + i for i in range(LEVELS)]
         live = [jnp.broadcast_to(own < count, (lanes,)) for own in level]
         jobs = [first + jnp.minimum(own, count - 1) for own in level]
-        known = list(zip(jobs, live, strict=True))
-        images = [plt.load(image_ref.at[job, query, :], mask=mask, other=0.0) for job, mask in known]
-        throughs = [plt.load(through_ref.at[job, query, :], mask=mask, other=1.0) for job, mask in known]
-        for (job, mask), own, through in zip(known, images, throughs, strict=True):
+        masked_jobs = list(zip(jobs, live, strict=True))
+        images = [plt.load(image_ref.at[job, query, :], mask=mask, other=0.0) for job, mask in masked_jobs]
+        throughs = [plt.load(through_ref.at[job, query, :], mask=mask, other=1.0) for job, mask in masked_jobs]
+        for (job, mask), own, through in zip(masked_jobs, images, throughs, strict=True):
             plt.store(front_ref.at[job, query, :], image, mask=mask)
             plt.store(transmittance_ref.at[job, query, :], transmittance, mask=mask)
             image, transmittance = image + transmittance * own, transmittance * through
@@ -261,7 +260,7 @@ def _backward_kernel(
         def of_query(query, d_footprints):
             cotangent, transmittance = plt.load(cotangent_ref.at[tile, query, :]), plt.load(transmittance_ref.at[job, query, :])
             behind, d_found = plt.load(image_ref.at[tile, query, :]) - plt.load(front_ref.at[job, query, :]), []
-            for half in range(0, CHUNK, HALF):  # one after the other, so that registers suffice
+            for half in range(0, CHUNK, HALF):  # one half after the other, to stay within the registers
                 to_attenuation, to_signal = [], []
                 for k in range(half, half + HALF):
                     attenuation = plt.load(rows_ref.at[rows[k], GEOMETRY + query])
@@ -279,7 +278,7 @@ def _backward_kernel(
             return tuple(d_found)
 
         d_footprints = lax.fori_loop(*queries, of_query, (jnp.zeros(tiling.lanes, jnp.float32),) * CHUNK)
-        # Of the exponents, but for log 2: on its support an exponential is the footprint and what was cut off it.
+        # Gradients of the exponents up to a factor log 2: on its support, the exponential is footprint / GAIN + EDGE.
         d_exponents = [jnp.where(g > 0, d * (g + EDGE * GAIN), 0.0) for g, d in zip(footprints, d_footprints, strict=True)]
         moments = product(_stacked(d_exponents), plt.load(monomials_ref.at[:, :]))
         which = lax.broadcasted_iota(jnp.int32, moments.shape, 1)
@@ -315,7 +314,7 @@ def _collect_kernel(gaussian_ref, end_ref, slot_ref, of_exponents_ref, of_featur
             for block in range(blocks):
                 found = plt.load(of_exponents_ref.at[jnp.full_like(slot, block), slot, column])
                 d_exponents = d_exponents + jnp.sum(jnp.where(live, found, 0.0), axis=0)
-            # A half of a job has the gradients of its attenuations, then of its signals.
+            # Half a job stores the gradients of its attenuations first, then those of its signals.
             place = slot // HALF * CHUNK + slot % HALF + kind * HALF
             found = plt.load(of_features_ref.at[jnp.broadcast_to(query, place.shape), place])
             return d_exponents, d_features + jnp.sum(jnp.where(live, found, 0.0), axis=0)
@@ -329,24 +328,24 @@ def _collect_kernel(gaussian_ref, end_ref, slot_ref, of_exponents_ref, of_featur
     _shared_out(gaussian_ref.shape[0], of_gaussian)
 
 
-# What they share
+# Helpers
 
 
 def _shared_out(count: Any, work: Callable[[Any], None]) -> None:
-    """Does this program's share of the work."""
+    """Runs this program's share of the work."""
     share, programs = pl.program_id(0), pl.num_programs(0)
     turns = (count - share + programs - 1) // programs
     lax.fori_loop(0, turns, lambda turn, _: work(share + turn * programs), None)
 
 
 def _own_queries(b: int) -> tuple[Any, Any]:
-    """Returns the first of this program's queries, and the first that is no longer one."""
+    """Returns the range (first, end) of this program's queries."""
     first = pl.program_id(1) * QUERIES
     return first, jnp.minimum(first + QUERIES, b)
 
 
 def _footprints(tiling: Tiling, gaussian_ref: Any, rows_ref: Any, job: Any, tile: Any) -> tuple[list[Any], list[Any]]:
-    """Returns the row of each of a job's slots, and the footprints (lanes,)."""
+    """Returns the row of each slot of a job, and its footprint (lanes,)."""
     lane, n = lax.broadcasted_iota(jnp.int32, (tiling.lanes,), 0), rows_ref.shape[0] - 1
     x, y = _centred(lane % tiling.width, tiling.width), _centred(lane // tiling.width, tiling.height)
     rows, footprints = [], []
@@ -367,14 +366,15 @@ def _centred(pixel: Any, size: int) -> Any:
 
 
 def _relative(tiling: Tiling, u: Any, v: Any, tile: Any) -> tuple[Any, Any]:
-    """Returns centres relative to a tile's, by the nearest alias of their azimuth."""
+    """Returns centres relative to a tile's centre, at the nearest alias in azimuth."""
     u = u - (tile % tiling.columns).astype(jnp.float32) * tiling.width - (tiling.width - 1) / 2
     v = v - (tile // tiling.columns).astype(jnp.float32) * tiling.height - (tiling.height - 1) / 2
     return u - AZIMUTH_PERIOD * jnp.floor(u / AZIMUTH_PERIOD + 0.5), v
 
 
 def _stacked(rows: list[Any]) -> Any:
-    """Returns some arrays (lanes,), a power of two, as the columns of one: registers under new names, nothing moves."""
+    """Returns arrays of shape (lanes,), whose number is a power of two, as the columns of one array. Nothing moves: the
+    registers only get new names."""
     count = len(rows)
     while len(rows) > 1:
         half = len(rows) // 2

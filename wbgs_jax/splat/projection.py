@@ -8,10 +8,9 @@ choices keep the image well defined everywhere:
   own alias;
 * a low-pass of `LOW_PASS` px^2 is added to the 2D covariance, as in 3D Gaussian splatting.
 
-The footprint of a splat: a Gaussian that goes continuously to zero at `SUPPORT` standard deviations.
-
-With q the Mahalanobis distance squared, G(q) = max(0, exp(-q/2) - e0) / (1 - e0), e0 = exp(-SUPPORT^2 / 2). A plain Gaussian
-cut off by tile lists or by a threshold would make image and gradients depend on the tiling or jump; this one does neither.
+A footprint is a Gaussian that goes continuously to zero at `SUPPORT` standard deviations. With q the squared Mahalanobis
+distance, G(q) = max(0, exp(-q/2) - e0) / (1 - e0), e0 = exp(-SUPPORT^2 / 2). A plain Gaussian cut off by tile lists or by a
+threshold would make image and gradients jump or depend on the tiling.
 """
 
 import math
@@ -35,15 +34,15 @@ from wbgs_jax.radio.geometry import (
 from wbgs_jax.types import Gaussians, Receiver
 
 SUPPORT = 3.0
-"""Footprints end at this many standard deviations: part of the image's definition, not of the tiling."""
+"""Standard deviations at which footprints end: part of the definition of the image, independent of the tiling."""
 LOW_PASS = 0.3
-"""Pixels squared."""
+"""Variance added to both axes of the 2D covariance, pixels squared."""
 TILE_ROOM = 12
-"""Pixels left and right of a tile's centre ..."""
+"""Pixels on either side of a tile's centre that are kept free, ..."""
 MAX_AZIMUTH_SIGMA = (AZIMUTH_PERIOD / 2 - TILE_ROOM) / SUPPORT
-"""... that are kept free, so that wrapping to the centre of a tile equals wrapping to a pixel of it."""
+"""... so that wrapping relative to the centre of a tile equals wrapping relative to any of its pixels. Pixels."""
 MIN_RANGE = 1e-3
-"""Metres. Distances to the receiver and to its zenith axis are bounded from below by this, for finite Jacobians."""
+"""Metres. Lower bound on distances to the receiver and to its zenith axis, which keeps Jacobians finite."""
 
 
 @pytree
@@ -80,11 +79,15 @@ def project(
 ) -> Splats:
     """Returns Gaussians projected onto the PAS of a receiver.
 
-    `means2d_offset` (pixels, normally zeros) is added to the centres: its gradient is the positional gradient that density
-    control needs.
+    Args:
+        gaussians: world frame, metres.
+        receiver: its position and orientation define the local frame.
+        projection: mapping from angles to pixels.
+        means2d_offset: pixels, normally zeros; added to the centres. Its gradient is the positional gradient that density
+            control needs.
     """
     local = to_local(gaussians.means - receiver.position, receiver.orientation)
-    # Empty slots are moved to a harmless place so that neither values nor gradients of theirs can be NaN.
+    # Empty slots are moved to a harmless position so that neither their values nor their gradients can be NaN.
     alive = gaussians.alive[:, None]
     local = _off_axis(jnp.where(alive, local, jnp.ones_like(local)))
     factor = covariance_factor(jnp.where(alive, gaussians.log_scales, 0), jnp.where(alive, gaussians.quats, 1))
@@ -111,7 +114,7 @@ def to_local_matrix(factor: Float[Array, "n 3 3"], orientation: Float[Array, "4"
 
 
 def _off_axis(local: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Returns centres off the zenith axis, where the azimuth has no derivative: there x and y get none."""
+    """Returns centres moved off the zenith axis, where the azimuth has no derivative; x and y get no gradient there."""
     horizontal, vertical = local[:, :2], local[:, 2:]
     near = jnp.linalg.norm(jax.lax.stop_gradient(horizontal), axis=-1, keepdims=True) < MIN_RANGE
     beside = jax.lax.stop_gradient(horizontal) + jnp.array([MIN_RANGE, 0], local.dtype)
@@ -140,20 +143,20 @@ def _covariance2d(
 
 
 CUT = SUPPORT**2
-"""Mahalanobis distance squared at which a footprint ends."""
+"""Squared Mahalanobis distance at which a footprint ends."""
 EDGE = math.exp(-CUT / 2)
-"""What a plain Gaussian has there ..."""
+"""Value of a plain Gaussian there ..."""
 GAIN = 1 / (1 - EDGE)
-"""... and what makes up for it at the centre."""
+"""... and the factor that restores 1 at the centre after it is subtracted."""
 
 
 def mahalanobis2(dx: Float[Array, "*#n"], dy: Float[Array, "*#n"], conic: Float[Array, "*#n 3"]) -> Float[Array, "*n"]:
-    """Returns q of offsets (pixels) from the centre."""
+    """Returns the squared Mahalanobis distance q of offsets (pixels) from the centre."""
     return conic[..., 0] * dx * dx + conic[..., 2] * dy * dy + 2 * conic[..., 1] * dx * dy
 
 
 def footprint(q: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns G(q) in 0..1."""
+    """Returns the footprint G(q), in 0..1."""
     return jnp.maximum(jnp.exp(-0.5 * q) - EDGE, 0) * GAIN
 
 

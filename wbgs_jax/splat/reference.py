@@ -1,9 +1,9 @@
-"""The dense reference renderer: equation 6 of the paper, Gaussian by Gaussian over all pixels. Slow, short, differentiable.
+"""Dense reference renderer: equation 6 of the paper, Gaussian by Gaussian over all pixels. Slow, short, differentiable.
 
     I(p) = sum_i  T_i(p) alpha_i(p) Sig_i,     T_i(p) = prod_{j<i} (1 - alpha_j(p)),     alpha_i(p) = delta_i G_i(p)
 
-over the Gaussians from near to far. delta in [0, 1) is the attenuation a Gaussian inflicts on what lies behind it (the paper
-writes the surviving factor, 1 - alpha here, as delta), and G its footprint. As in the authors' code and in 3D Gaussian
+over the Gaussians from near to far. delta in [0, 1) is the attenuation that a Gaussian inflicts on everything behind it (the
+paper's delta is the surviving factor, 1 - alpha here), and G is its footprint. As in the authors' code and in 3D Gaussian
 splatting, a Gaussian radiates with the same weight with which it occludes.
 """
 

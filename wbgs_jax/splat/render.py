@@ -1,6 +1,6 @@
 """Gaussians -> PAS: composes projection.py, tiles.py and composite.py.
 
-The receiver is fixed, so everything geometric (projection, depth order, tile lists) is built once as a `GeometryPlan` and
+The receiver is fixed, so everything geometric (projection, depth order, tile lists) is computed once as a `GeometryPlan` and
 shared by any number of queries, which differ only in attenuation and signal.
 """
 
@@ -19,7 +19,7 @@ from wbgs_jax.types import Gaussians, Receiver
 
 @pytree
 class GeometryPlan:
-    """What a fixed receiver sees of the Gaussians, independent of transmitter and frequency."""
+    """The projected Gaussians of a fixed receiver and their tile lists, independent of transmitter and frequency."""
 
     splats: Splats
     jobs: TileJobs
@@ -34,9 +34,16 @@ def geometry_plan(
 ) -> GeometryPlan:
     """Returns the projected and sorted Gaussians.
 
-    Gradients reach the Gaussians through a plan only where it is made inside the differentiated function; order and tile lists
-    carry none. Without `limits` the tile lists are sized on the host (not under jit). With them the call is pure and jittable,
-    and the caller must look at `plan.jobs.overflow`.
+    Gradients reach the Gaussians through a plan only if it is built inside the differentiated function; depth order and tile
+    lists carry none.
+
+    Args:
+        gaussians: world frame, metres.
+        receiver: fixed receiver.
+        limits: capacities of the tile lists. Without them the lists are sized on the host (not under jit). With them the call
+            is pure and jittable, and the caller must check `plan.jobs.overflow`.
+        projection: mapping from angles to pixels.
+        means2d_offset: pixels, added to the centres (`project`).
     """
     splats = project(gaussians, receiver, projection, means2d_offset)
     if limits is None:
@@ -45,10 +52,18 @@ def geometry_plan(
 
 
 def measure_limits(splats: Splats, slack: float = 1.25, tiling: Tiling | None = None) -> TileLimits:
-    """Returns the limits that splats need, found on the host by building the lists until they fit; in the tiles that are
-    fastest on the device which computes here, or in others."""
+    """Returns the limits that splats need, found on the host by building the lists until they fit.
+
+    Args:
+        splats: projected Gaussians.
+        slack: factor on the required counts.
+        tiling: tile size; by default the fastest one on the default device.
+
+    Raises:
+        ValueError: called under jit.
+    """
     if isinstance(splats.depths, jax.core.Tracer):
-        raise ValueError("the tile lists cannot be sized under jit: pass limits=..., found outside with measure_limits")
+        raise ValueError("the tile lists cannot be sized under jit: pass limits=..., computed outside with measure_limits")
     limits = fit_limits(0, 0, tiling=tiling)
     while True:
         jobs = build_tile_jobs(splats, limits)
@@ -61,9 +76,12 @@ def measure_limits(splats: Splats, slack: float = 1.25, tiling: Tiling | None = 
 def render_splats(
     plan: GeometryPlan, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]
 ) -> Float[Array, "b 90 360"]:
-    """Returns the plan's Gaussians blended for B queries: attenuation (delta, [0, 1)) and signal (Sig) per Gaussian and query.
+    """Returns the plan's Gaussians blended for B queries.
 
-    An overflowed plan renders NaN, never a wrong image.
+    Args:
+        plan: of one receiver. If its tile lists overflowed, the image is NaN, never wrong.
+        attenuation: delta of every Gaussian and query, in [0, 1).
+        signal: Sig of every Gaussian and query.
     """
     check_array("attenuation", attenuation, (plan.splats.depths.shape[0], "b"))
     check_array("signal", signal, attenuation.shape)

@@ -1,7 +1,7 @@
-"""Which Gaussians touch which tile, near to far: one sort of (tile, depth rank) keys, cut into jobs of equal length.
+"""Lists the Gaussians that touch each tile, near to far: one sort of (tile, depth rank) keys, cut into jobs of equal length.
 
-The limits are static so that the step compiles once. What does not fit is never dropped silently: `TileJobs` carries the
-required counts and an overflow flag, the caller throws the result away and repeats with larger `TileLimits`.
+The limits are static so that the step compiles once. Entries that do not fit are never dropped silently: `TileJobs` carries the
+required counts and an overflow flag; the caller discards the result and repeats with larger `TileLimits`.
 """
 
 import itertools
@@ -23,23 +23,23 @@ from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
 from wbgs_jax.splat.projection import CUT, TILE_ROOM, Splats
 
 CHUNK = 16
-"""Gaussians in a job."""
+"""Gaussians per job."""
 NO_ENTRY = np.uint32(0xFFFFFFFF)
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image is cut into tiles of equal size: the last row of tiles may reach beyond it."""
+    """Division of an image into tiles of equal size; the last row of tiles may extend beyond it."""
 
     height: int
     """Pixels."""
     width: int
-    """Pixels; divides the image's width, and is no more than twice `TILE_ROOM`."""
+    """Pixels; divides the image's width and is at most twice `TILE_ROOM`."""
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 1 or PAS_WIDTH % self.width or self.width > 2 * TILE_ROOM:
             raise ValueError(
-                f"tiles of {self.height} x {self.width} pixels: the width must divide {PAS_WIDTH}, {2 * TILE_ROOM} at most"
+                f"tiles of {self.height} x {self.width} pixels: the width must divide {PAS_WIDTH}, at most {2 * TILE_ROOM}"
             )
 
     @property
@@ -64,7 +64,7 @@ class Tiling:
 
     @property
     def lanes(self) -> int:
-        """Lanes of a GPU that hold a tile's pixels: a power of two."""
+        """GPU lanes that hold a tile's pixels: a power of two."""
         return 1 << (self.pixels - 1).bit_length()
 
     def offsets(self) -> tuple[Float[np.ndarray, " pixels"], Float[np.ndarray, " pixels"]]:
@@ -73,25 +73,25 @@ class Tiling:
         return x - (self.width - 1) / 2, y - (self.height - 1) / 2
 
     def monomials(self) -> Float[np.ndarray, "pixels 6"]:
-        """Returns 1, x, y, x^2, xy, y^2 of the offsets: a product with them takes the moments of a footprint."""
+        """Returns 1, x, y, x^2, xy, y^2 of the offsets: the product of a footprint with them gives its moments."""
         x, y = self.offsets()
         return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
 
 
 CPU_TILING, GPU_TILING = Tiling(9, 8), Tiling(8, 8)
-"""Vectors of eight pixels, nine of which cut an image evenly; and two pixels for each thread of a GPU's warp."""
+"""For a CPU, vectors of eight pixels in tiles that divide an image evenly; for a GPU, two pixels per thread of a warp."""
 
 
 @dataclass(frozen=True)
 class TileLimits:
-    """Static sizes of the tile lists: what a plan may require of them."""
+    """Static capacities of the tile lists."""
 
     entries: int
     """(Gaussian, tile) pairs before culling."""
     jobs: int
     """Jobs of `CHUNK` Gaussians."""
     tile_height: int = CPU_TILING.height
-    """Pixels; every size draws the same image, at another speed (`device_tiling`)."""
+    """Pixels; every size gives the same image, at a different speed (`device_tiling`)."""
     tile_width: int = CPU_TILING.width
     """Pixels."""
 
@@ -101,26 +101,26 @@ class TileLimits:
         return Tiling(self.tile_height, self.tile_width)
 
     def scaled(self, factor: float) -> "TileLimits":
-        """Returns limits that hold so many times as much."""
+        """Returns limits with `factor` times the capacity."""
         entries, jobs = (-(-math.ceil(size * factor) // 256) * 256 for size in (self.entries, self.jobs))
         return replace(self, entries=entries, jobs=jobs)
 
     def grown_to(self, others: "TileLimits") -> "TileLimits":
-        """Returns limits that hold what these and others do, in tiles of the same size."""
+        """Returns limits with the larger capacities of these and others, for tiles of this size."""
         return replace(self, entries=max(self.entries, others.entries), jobs=max(self.jobs, others.jobs))
 
 
 @pytree
 class SlotLists:
-    """Where Gaussians stand in the jobs: what sums over their slots need to go Gaussian by Gaussian, in the same order always.
-    Only NVIDIA GPUs do so; elsewhere the slots are zeros that nothing reads."""
+    """Positions of the Gaussians in the jobs, for deterministic sums over the slots of each Gaussian.
+    Only NVIDIA GPUs use them; elsewhere the slots are zeros and are never read."""
 
     gaussian: Int[Array, " n"]
-    """Whose entries come first, second, ...: near to far."""
+    """Gaussian whose entries come first, second, ...: near to far."""
     end: Int[Array, " n"]
-    """Where their entries end; those of the next begin there."""
+    """Index at which its entries end and those of the next one begin."""
     slot: Int[Array, " entries"]
-    """Job times `CHUNK` plus place in the job, of every entry; -1: in no job."""
+    """Job times `CHUNK` plus position in the job, of every entry; -1: in no job."""
 
 
 @pytree
@@ -176,15 +176,15 @@ def build_tile_jobs(splats: Splats, limits: TileLimits) -> TileJobs:
     (slot,) = _slots(keys, listed, starts, first, order)
     required_jobs = first[-1] + count[-1]
     overflow = (ends[-1] > limits.entries) | (required_jobs > limits.jobs)
-    # Nothing must follow lists that do not fit: a GPU would read and write past their end.
+    # Overflowed lists are emptied: a GPU would read and write past their end.
     first, count = (jnp.where(overflow, 0, own) for own in (first, count))
     slots = SlotLists(order, ends, jnp.where(overflow, -1, slot))
     return TileJobs(gaussian, tile, first, count, ends[-1], required_jobs, overflow, slots, tiling)
 
 
 def _near_to_far(depths: Float[Array, " n"]) -> Int[Array, " n"]:
-    """Returns the Gaussians in the order of their distance, which is no less than zero: its bits, read as an integer, have the
-    same order, and are sorted several times faster than floats are."""
+    """Returns the Gaussians in the order of their distance. It is never negative, so its bits, read as an integer, have the
+    same order and sort several times faster than floats."""
     bits = lax.bitcast_convert_type(depths, {4: jnp.uint32, 8: jnp.uint64}[depths.dtype.itemsize])
     return lax.sort((bits, jnp.arange(len(depths), dtype=jnp.int32)), num_keys=1)[1]
 
@@ -211,8 +211,8 @@ def _tile_boxes(means: Float[Array, "n 2"], radii: Float[Array, "n 2"], tiling: 
 def _keys(
     means: Float[Array, "n 2"], conics: Float[Array, "n 3"], boxes: _Boxes, limits: TileLimits
 ) -> tuple[UInt32[Array, " entries"], Int[Array, " n"]]:
-    """Returns keys tile * n + depth rank of all (splat, tile) pairs, splat by splat, and where those of every splat end;
-    `NO_ENTRY` where footprint and tile do not overlap, and in the rest."""
+    """Returns the keys tile * n + depth rank of all (splat, tile) pairs, splat by splat, and the end of every splat's keys;
+    `NO_ENTRY` where footprint and tile do not overlap and in unused entries."""
     n, entries, tiling = means.shape[0], limits.entries, limits.tiling
     width = boxes.columns + boxes.alias_columns
     count = width * boxes.rows
@@ -226,7 +226,7 @@ def _keys(
     column = jnp.where(is_alias, boxes.alias_column0[rank] + step - boxes.columns[rank], boxes.column0[rank] + step)
     centre_x = means[rank, 0] + jnp.where(is_alias, boxes.alias[rank], 0)
     q = _nearest_mahalanobis2(column * tiling.width - centre_x, row * tiling.height - means[rank, 1], conics[rank], tiling)
-    # The margin covers rounding: a wrongly kept entry costs time, a wrongly dropped one would be an error.
+    # The margin covers rounding: an entry kept wrongly costs time, one dropped wrongly would be an error.
     keep = (entry < end[-1]) & (q < CUT * 1.001)
     tile = (row * tiling.columns + column).astype(jnp.uint32)
     return jnp.where(keep, tile * jnp.uint32(n) + rank.astype(jnp.uint32), NO_ENTRY), end
@@ -235,7 +235,8 @@ def _keys(
 def _nearest_mahalanobis2(
     left: Float[Array, " e"], top: Float[Array, " e"], conic: Float[Array, "e 3"], tiling: Tiling
 ) -> Float[Array, " e"]:
-    """Returns the smallest q over a tile's pixels (a continuous rectangle), given the offset of the first from the centre."""
+    """Returns the smallest q over a tile (a continuous rectangle), given the offset of its first pixel from the splat's
+    centre."""
     right, bottom = left + tiling.width - 1, top + tiling.height - 1
     a, b, c = jnp.moveaxis(jnp.where(conic[:, :1] > 0, conic, jnp.array([1, 0, 1], conic.dtype)), -1, 0)
 
@@ -255,7 +256,7 @@ def _nearest_mahalanobis2(
 def _cut_into_jobs(
     ranked: Int[Array, " entries"], starts: Int[Array, " tiles_1"], limits: TileLimits
 ) -> tuple[Int[Array, "jobs chunk"], Int[Array, " jobs"], Int[Array, " tiles"], Int[Array, " tiles"]]:
-    """Returns the Gaussians and the tile of every job, the first job of every tile and their number."""
+    """Returns the Gaussians and the tile of every job, and the first job of every tile and its number of jobs."""
     count = -(-(starts[1:] - starts[:-1]) // CHUNK)
     end = jnp.cumsum(count)
     job = jnp.arange(limits.jobs, dtype=jnp.int32)
@@ -267,7 +268,7 @@ def _cut_into_jobs(
 
 
 def _slots_of_entries(keys: Any, listed: Any, starts: Any, first: Any, order: Any) -> list[Any]:
-    """Returns the slots of `SlotLists`: a key is looked up in the list, which has it once."""
+    """Returns the slots of `SlotLists` by looking up each key in the sorted list, where it occurs once."""
     (place,) = _places_unrolled(listed, keys)
     tile = jnp.minimum(keys // jnp.uint32(len(order)), len(first) - 1).astype(jnp.int32)
     return [jnp.where(keys < NO_ENTRY, first[tile] * CHUNK + place - starts[tile], -1)]
@@ -278,12 +279,12 @@ def _no_slots(keys: Any, *_: Any) -> list[Any]:
 
 
 def _places_in_a_loop(listed: Any, keys: Any) -> list[Any]:
-    """Returns where keys stand in a sorted list, or would."""
+    """Returns the insertion points of keys in a sorted list."""
     return [jnp.searchsorted(listed, keys).astype(jnp.int32)]
 
 
 def _places_unrolled(listed: Any, keys: Any) -> list[Any]:
-    """Returns the same, by one kernel: of a loop every step would wait for the host of a GPU, some 20 times."""
+    """Returns the same with a single kernel; on a GPU, each of the loop's roughly 20 steps would wait for the host."""
     return [jnp.searchsorted(listed, keys, method="scan_unrolled").astype(jnp.int32)]
 
 
@@ -296,12 +297,12 @@ _slots = per_platform(
 
 
 def device_tiling() -> Tiling:
-    """Returns the tiles that are fastest on the device which computes here."""
+    """Returns the fastest tile size on the default device."""
     return CPU_TILING if jax.default_backend() == "cpu" else GPU_TILING
 
 
 def fit_limits(required_entries: int, required_jobs: int, slack: float = 1.25, tiling: Tiling | None = None) -> TileLimits:
-    """Returns limits from geometric buckets that hold the counts with some slack, so that small changes do not recompile.
+    """Returns limits from geometric buckets that hold the counts times `slack`, so that small changes do not recompile.
 
     The counts are those of `tiling`, by default `device_tiling()`.
     """
@@ -315,14 +316,14 @@ def fit_limits(required_entries: int, required_jobs: int, slack: float = 1.25, t
 
 
 def slots_for(gaussians: int) -> int:
-    """Returns the number of slots that hold so many Gaussians; it grows by 2^(1/4) from 64, so that few changes recompile."""
+    """Returns a number of slots that holds the Gaussians; sizes grow by 2^(1/4) from 64, so that few changes recompile."""
     sizes = (-(-int(64 * 2 ** (step / 4)) // 16) * 16 for step in itertools.count())
     return next(size for size in sizes if size >= gaussians)
 
 
 def grown_slots(slots: int, gaussians: int, most: int) -> int:
-    """Returns the number of slots for Gaussians that have become so many: as many as before where they suffice, else twice as
-    many, and never more than the most that there may be need. A field compiles once for each doubling."""
+    """Returns the number of slots for a grown number of Gaussians: unchanged if it suffices, otherwise doubled, limited by the
+    maximum that may ever be needed (`most`). A field compiles once for each doubling."""
     if gaussians <= slots:
         return slots
     return max(min(2 * slots, -(-most // 16) * 16), slots_for(gaussians) if gaussians > min(2 * slots, most) else 0)
