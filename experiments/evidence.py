@@ -1,8 +1,8 @@
 """Numbers of the pages, from result files: `make tables` fills them in, and a test fails where page and file disagree.
 
 docs/evidence/<page>.txt holds pieces of a page with blanks for its numbers, and below each piece, indented, what fills the
-blanks: a result file, a place in it by dots, and the decimals where they are not three. A piece stands in the page exactly once; a
-line break counts as a space, and a row of a table is given whole.
+blanks: a result file, a place in it by dots, and the decimals where they are not three. A piece stands in the page exactly
+once; a line break counts as a space, and a row of a table is given whole.
 
     the default field scores {} there, and {} with its mesh
         quality_example1_wideband_cpu_cpu.json median_ssim

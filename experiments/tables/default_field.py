@@ -22,11 +22,11 @@ DATA = {
 HEAD = ["data", "SSIM median", "mean", "5 %", "10 %", "in sight", "out of sight", "truth against itself",
         "angle (degrees)", "best beam (dB)", "best of 3", "power (dB)", "90 % intervals hold", "training (min)"]  # fmt: skip
 NOTE = (
-    "`wbgs-jax train` and `eval`, the `cpu` preset, nothing else said; one seed. SSIM of all held-out transmitters: median,"
+    "`wbgs-jax train` and `eval`, the `cpu` preset, default settings; one seed. SSIM of all held-out transmitters: median,"
     " mean, 5th and 10th percentile, medians in and out of sight of the receiver, and the truth's own repeatability. Angle:"
     " median error of the strongest direction; beams: mean loss of received power when the predicted best beam of a codebook is"
     " used, or the best of the three predicted best; power: mean absolute error of the received power."
-    " All but scene 2 were trained before the search for clutter."
+    " All but scene 2 were trained before the absorption grid was added."
 )
 POWER_NOTE = (
     "Mean absolute error of the received power (dB) by frequency (GHz); below, the power of the nearest training transmitter:"

@@ -157,8 +157,8 @@ def test_the_volume_is_compared_with_others_of_its_seed(tmp_path):
 
 def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "DRAWS", 20)
-    text = page.page(everything, tmp_path)
-    for module in page.PAGES:
+    text = page.page(everything, tmp_path) + page.long_page(everything, tmp_path)
+    for module in (*page.PAGES, *page.LONG):
         assert f"## {module.TITLE}" in text
     shown = set(re.findall(rf"\({tmp_path.name}/(\S+?)\)", text))
     assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
