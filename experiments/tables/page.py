@@ -19,14 +19,15 @@ from experiments.tables import (
     figure7,
     figure8,
     headline,
+    power,
     table1,
     table2,
     table3,
 )
 
-PAGES = (headline, default_field, few, table3, figure4, figure6, baselines)
+PAGES = (headline, default_field, few, table3, figure4, figure6)
 """Sections of the first page."""
-LONG = (table1, table2, figure7, figure8)
+LONG = (power, table1, table2, figure7, figure8, baselines)
 """Sections of the second page: tables by scene and frequency."""
 
 
