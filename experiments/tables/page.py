@@ -25,9 +25,9 @@ from experiments.tables import (
     table3,
 )
 
-PAGES = (headline, default_field, few, table3, figure4, figure6)
+PAGES = (headline, default_field, table3, figure4, figure6)
 """Sections of the first page."""
-LONG = (power, table1, table2, figure7, figure8, baselines)
+LONG = (few, power, table1, table2, figure7, figure8, baselines)
 """Sections of the second page: tables by scene and frequency."""
 
 
