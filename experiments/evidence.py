@@ -2,7 +2,7 @@
 
 docs/evidence/<page>.txt holds pieces of a page with blanks for its numbers, and below each piece, indented, what fills the
 blanks: a result file, a place in it by dots, and the decimals where they are not three. A piece stands in the page exactly
-once; a line break counts as a space, and a row of a table is given whole.
+once; a line break counts as a space; the first and the last bar of a piece are those of a table's row.
 
     the default field scores {} there, and {} with its mesh
         quality_example1_wideband_cpu_cpu.json median_ssim
@@ -89,7 +89,7 @@ def fill_piece(text: str, piece: str, numbers: list[str]) -> str:
         UserError: the piece does not stand in the page exactly once.
     """
     literal = [r"\s+".join(map(re.escape, re.split(r"\s+", part))) for part in piece.split("{}")]
-    row = ("^", "$") if piece.startswith("|") else ("", "")
+    row = ("^" * piece.startswith("|"), "$" * piece.endswith("|"))
     found = list(re.finditer(NUMBER.join(literal).join(row), text, re.MULTILINE))
     if len(found) != 1:
         raise UserError(f"docs/evidence: {piece!r} stands {len(found)} times in its page; mend one of the two")
