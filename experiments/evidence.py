@@ -1,9 +1,17 @@
-"""Numbers of the pages, from result files: `make tables` fills marked places, and a test fails where page and file disagree.
+"""Numbers of the pages, from result files: `make tables` fills them in, and a test fails where page and file disagree.
 
-<!-- quality_example1_wave_cpu_cpu.json median_ssim -->0.528<!-- / -->       a value; its place in the file by dots
-<!-- quality_x.json baselines.nearest_tx.median_ssim 2 -->0.79<!-- / -->     ... with two decimals instead of three
-<!-- quick/scene1_wave_seed0.json median_ssim -->0.9<!-- / -->               ... of the row of that name in quick.jsonl
-<!-- series schedules -->                                                    all tables of a series, up to its
+docs/evidence/<page>.txt holds pieces of a page with blanks for its numbers, and below each piece, indented, what fills the
+blanks: a result file, a place in it by dots, and the decimals where they are not three. A piece stands in the page exactly
+once; a line break counts as a space; the first and the last bar of a piece are those of a table's row.
+
+    the default field scores {} there, and {} with its mesh
+        quality_example1_wideband_cpu_cpu.json median_ssim
+        quality_example1_hybrid_cpu_cpu.json median_ssim 2
+
+Marks within a page do the same, for rows that a command prints, and for all tables of a series:
+
+<!-- quality_example1_wave_cpu_cpu.json median_ssim -->0.528<!-- / -->
+<!-- series schedules -->
 <!-- / -->
 """
 
@@ -18,6 +26,7 @@ from wbgs_jax._util.files import atomic_write, read_json
 
 ROOT = Path(__file__).parents[1]
 VALUE = re.compile(r"<!-- (?P<file>\S+\.json) (?P<place>\S+)(?: (?P<decimals>\d))? -->[^<\n]*<!-- / -->")
+NUMBER = r"(-?\d[\d,]*(?:\.\d+)?)"
 TABLES = re.compile(r"<!-- series (?P<name>\w+) -->\n.*?<!-- / -->", re.DOTALL)
 
 
@@ -26,18 +35,43 @@ def pages(root: Path = ROOT) -> list[Path]:
     return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
 
 
-def filled(text: str, folder: Path = FOLDER) -> str:
-    """Returns a page with all marked places as the result files have them.
+def pieces_of(page: Path) -> str:
+    """Returns the text of docs/evidence for a page; empty where there is none."""
+    docs = page.parent / "docs" if page.name == "README.md" else page.parent
+    path = docs / "evidence" / f"{page.stem}.txt"
+    return path.read_text() if path.exists() else ""
+
+
+def parse_pieces(text: str) -> list[tuple[str, list[str]]]:
+    """Returns the pieces of a page, each with the sources of its blanks.
 
     Raises:
-        UserError: a place names a file, a value or a series that there is not.
+        UserError: a piece has more or fewer blanks than sources.
     """
+    pieces: list[tuple[str, list[str]]] = []
+    for line in text.splitlines():
+        if line[:1].isspace() and line.strip() and pieces:
+            pieces[-1][1].append(line.strip())
+        elif line.strip():
+            pieces.append((line.strip(), []))
+    for piece, sources in pieces:
+        if piece.count("{}") != len(sources):
+            raise UserError(f"docs/evidence: {piece!r} has {piece.count('{}')} blanks and {len(sources)} sources")
+    return pieces
+
+
+def filled(text: str, folder: Path = FOLDER, pieces: str = "") -> str:
+    """Returns a page with all its quoted numbers as the result files have them; `pieces`: see `pieces_of`.
+
+    Raises:
+        UserError: a file, a value, a series or a piece of the page is missing.
+    """
+    for piece, sources in parse_pieces(pieces):
+        text = fill_piece(text, piece, [formatted(folder, *source.split()) for source in sources])
 
     def value(found: re.Match[str]) -> str:
-        number = look_up(folder, found["file"], found["place"])
-        decimals = int(found["decimals"] or 3)
         mark = found[0].split("-->", 1)[0] + "-->"
-        return f"{mark}{number:,.{decimals}f}<!-- / -->"
+        return f"{mark}{formatted(folder, found['file'], found['place'], found['decimals'] or '3')}<!-- / -->"
 
     def tables(found: re.Match[str]) -> str:
         name = found["name"]
@@ -46,6 +80,29 @@ def filled(text: str, folder: Path = FOLDER) -> str:
         return f"<!-- series {name} -->\n{SERIES[name].render(Results('quick', folder))}\n<!-- / -->"
 
     return TABLES.sub(tables, VALUE.sub(value, text))
+
+
+def fill_piece(text: str, piece: str, numbers: list[str]) -> str:
+    """Returns the page with numbers in the blanks of a piece.
+
+    Raises:
+        UserError: the piece does not stand in the page exactly once.
+    """
+    literal = [r"\s+".join(map(re.escape, re.split(r"\s+", part))) for part in piece.split("{}")]
+    row = ("^" * piece.startswith("|"), "$" * piece.endswith("|"))
+    found = list(re.finditer(NUMBER.join(literal).join(row), text, re.MULTILINE))
+    if len(found) != 1:
+        raise UserError(f"docs/evidence: {piece!r} stands {len(found)} times in its page; mend one of the two")
+    match = found[0]
+    for group in reversed(range(len(numbers))):
+        start, end = match.span(group + 1)
+        text = text[:start] + numbers[group] + text[end:]
+    return text
+
+
+def formatted(folder: Path, file: str, place: str, decimals: str = "3") -> str:
+    """Returns a number of a result file as pages write it."""
+    return f"{look_up(folder, file, place):,.{int(decimals)}f}"
 
 
 def look_up(folder: Path, file: str, place: str) -> float:
@@ -70,7 +127,7 @@ def fill_pages(root: Path = ROOT, folder: Path = FOLDER) -> list[Path]:
     changed = []
     for page in pages(root):
         text = page.read_text()
-        if (new := filled(text, folder)) != text:
+        if (new := filled(text, folder, pieces_of(page))) != text:
             with atomic_write(page) as stream:
                 stream.write(new.encode())
             changed.append(page)

@@ -1,6 +1,7 @@
 """Write the page of results and the table of all results: `python -m experiments.tables [--profile quick]`.
 
-docs/results.md and its pictures in docs/images (both with _<profile> appended for other profiles than quick), the curves that
+docs/results.md, docs/results_tables.md and their pictures in docs/images (all with _<profile> appended for other profiles than
+quick), the curves that
 docs/wave.md shows, experiments/results/results.csv and headline.json, and the marked numbers of README.md and all pages
 (`evidence.py`).
 """
@@ -14,7 +15,7 @@ import tyro
 from experiments import evidence, result_table
 from experiments.results import FOLDER, Results
 from experiments.tables import faults, summary
-from experiments.tables.page import page
+from experiments.tables.page import long_page, page
 from experiments.tables.plots import save
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import atomic_write
@@ -36,11 +37,11 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(Command, prog="python -m experiments.tables", args=arguments)
     suffix = "" if command.profile == "quick" else f"_{command.profile}"
     results = Results(command.profile, command.results)
-    text = page(results, command.docs / f"images{suffix}")
-    path = command.docs / f"results{suffix}.md"
-    with atomic_write(path) as stream:
-        stream.write(text.encode())
-    print(path)
+    for name, text in (("results", page), ("results_tables", long_page)):
+        path = command.docs / f"{name}{suffix}.md"
+        with atomic_write(path) as stream:
+            stream.write(text(results, command.docs / f"images{suffix}").encode())
+        print(path)
     print(result_table.write(command.results))
     if not suffix:
         print(summary.write(results))

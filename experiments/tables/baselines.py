@@ -46,7 +46,7 @@ def without_learning(results: Results) -> str:
         others = [cell(baseline_average(results, Job(scene, BASELINES), name)) for name in NAMES_OF_BASELINES]
         rows.append([scene, *fields, *others, cell(ceiling(scene, GHZ_10)), cell(truth_repeats(scene, GHZ_10))])
     note = (
-        "Predictors that learn nothing, on all held-out transmitters: the mean of all training spectra, that of the nearest"
+        "Untrained predictors, on all held-out transmitters: the mean of all training spectra, that of the nearest"
         " training transmitter, their average weighted by 1/d², and the array's answer to the straight line. The phase-blind"
         " ceiling is that of the true paths with random phases. Averages over ten frequencies of the median SSIM."
     )

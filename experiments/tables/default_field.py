@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.markdown import markdown
-from experiments.paper import GHZ_10, SCENES
+from experiments.paper import SCENES
 from experiments.results import Results
 from experiments.tables.cells import NOT_RUN, cell
 from wbgs_jax._util.files import read_json
@@ -22,34 +22,30 @@ DATA = {
 HEAD = ["data", "SSIM median", "mean", "5 %", "10 %", "in sight", "out of sight", "truth against itself",
         "angle (degrees)", "best beam (dB)", "best of 3", "power (dB)", "90 % intervals hold", "training (min)"]  # fmt: skip
 NOTE = (
-    "`wbgs-jax train` and `eval`, the `cpu` preset, nothing else said; one seed. SSIM of all held-out transmitters: median,"
+    "`wbgs-jax train` and `eval`, the `cpu` preset, default settings; one seed. SSIM of all held-out transmitters: median,"
     " mean, 5th and 10th percentile, medians in and out of sight of the receiver, and the truth's own repeatability. Angle:"
     " median error of the strongest direction; beams: mean loss of received power when the predicted best beam of a codebook is"
     " used, or the best of the three predicted best; power: mean absolute error of the received power."
-    " All but scene 2 were trained before the search for clutter."
-)
-POWER_NOTE = (
-    "Mean absolute error of the received power (dB) by frequency (GHz); below, the power of the nearest training transmitter:"
+    " All but scene 2 were trained before the absorption grid was added."
 )
 
 
 def render(results: Results, images: Path) -> str:
-    """Two tables: all figures of every data set, and received power by frequency."""
-    reports = {name: _report(results.folder, file) for name, file in DATA.items()}
-    rows = [[name, *_figures(report)] for name, report in reports.items()]
-    power = [row for name, report in reports.items() if name.startswith("scene") for row in _power_rows(name, report)]
-    return "\n\n".join([NOTE, markdown(HEAD, rows), POWER_NOTE, markdown(["data", *(f"{f:g}" for f in GHZ_10)], power)])
+    """All figures of every data set."""
+    rows = [[name, *_figures(report(results.folder, file))] for name, file in DATA.items()]
+    return f"{NOTE}\n\n{markdown(HEAD, rows)}"
 
 
-def _report(folder: Path, name: str) -> dict[str, Any] | None:
+def report(folder: Path, name: str) -> dict[str, Any] | None:
+    """Returns the evaluation of a data set; None where it was not run."""
     path = folder / f"quality_{name}_hybrid_cpu_cpu.json"
     return read_json(path) if path.exists() else None
 
 
 def average_of_medians(folder: Path, scene: str) -> float | None:
     """Returns the average over frequencies of the median SSIM of a released scene; None where it was not run."""
-    report = _report(folder, f"scene{scene}")
-    return None if report is None else statistics.fmean(row["median_ssim"] for row in report["per_frequency"])
+    found = report(folder, f"scene{scene}")
+    return None if found is None else statistics.fmean(row["median_ssim"] for row in found["per_frequency"])
 
 
 def _figures(report: dict[str, Any] | None) -> list[str]:
@@ -66,15 +62,4 @@ def _figures(report: dict[str, Any] | None) -> list[str]:
         f"{report['power']['power_mae_db']:.2f}" if "power" in report else "",
         f"{100 * sure['coverage']:.0f} %" if sure else "",
         f"{report['provenance']['training_seconds'] / 60:.0f}",
-    ]
-
-
-def _power_rows(name: str, report: dict[str, Any] | None) -> list[list[str]]:
-    if report is None or "power" not in report:
-        return [[name, NOT_RUN, *[""] * (len(GHZ_10) - 1)]]
-    power = report["power"]
-    nearest = power["baselines"]["nearest_tx"]
-    return [
-        [label, *(f"{row['power_mae_db']:.2f}" for row in figures["per_frequency"])]
-        for label, figures in ((name, power), ("nearest TX", nearest))
     ]

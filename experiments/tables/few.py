@@ -13,8 +13,8 @@ TITLE = "Few spectra: one command beside every simple method"
 NOTE = (
     "`wbgs-jax train` with its defaults on parts of data sets, drawn at random or along a track; median SSIM on the test"
     " transmitters of the data, worst and median over seeds. Field alone: without the simple methods that share its answers."
-    " Below: rows that score lower by more than 0.02 than the best simple method on the very same test spectra, which nobody"
-    " knows beforehand. Hold: share of the scores in 90 % intervals, of rows that have such."
+    " Below: rows that score lower by more than 0.02 than the best simple method on the very same test spectra; that"
+    " method is not known beforehand. Hold: share of the scores in 90 % intervals, of rows that have such."
 )
 OTHERS = [name.replace("_", " ") for name in SIMPLE]
 HEAD = ["case", "spectra", "seeds", "worst", "median", "field alone", *OTHERS, "below", "hold"]

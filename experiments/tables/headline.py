@@ -41,8 +41,8 @@ CURVE = {
 """What is on the curve: a field, and its variants with one, five and ten times the spectra."""
 UNSEEN = [float(f) for f in GHZ_21 if f not in COMBINATIONS["D"]]
 NOTE = (
-    "**Gain over WRF-GS** with equal numbers of spectra seen; *pooled* is one WRF-GS model for all frequencies that is told"
-    " none of them. Averages over ten frequencies of the medians over transmitters; in parentheses the paper's, which trains"
+    "**Gain over WRF-GS** with equal numbers of spectra seen; *pooled* is one WRF-GS model for all frequencies without a"
+    " frequency input. Averages over ten frequencies of the medians over transmitters; in parentheses the paper's, which trains"
     " all models in full. The paired test is Wilcoxon's, over held-out transmitters."
 )
 CURVE_NOTE = (
@@ -52,8 +52,8 @@ CURVE_NOTE = (
 )
 UNSEEN_NOTE = (
     "**Unseen frequencies**: half of the 21 frequencies of scene 1 in training (combination D) against all of them. Where a"
-    " field that is not told the frequency does as well (last row, and table 3), spectra change so little with it, beyond"
-    " what phases do, that a small change here says little about generalisation ([why](decisions.md))."
+    " field without a frequency input does as well (last row, and table 3), spectra change so little with the frequency, apart"
+    " from interference, that a small change here is weak evidence of generalisation ([why](decisions.md))."
 )
 
 
@@ -147,7 +147,7 @@ def zero_shot_drop(results: Results) -> str:
     rows = [
         [as_paper, *drop_cells(*mixed, ZERO_SHOT_DROP)],
         ["like with like: both at held-out transmitters, frequencies that D has not seen", *drop_cells(*alike)],
-        ["as the paper, with a field that is not told the frequency", *drop_cells(*pooled)],
+        ["as the paper, with a field without a frequency input", *drop_cells(*pooled)],
     ]
     return markdown(["comparison", "trained on D", "trained on all", "change (paper)"], rows)
 

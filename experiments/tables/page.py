@@ -1,6 +1,7 @@
-"""The page of results: every table and figure of the paper from the results that there are, and where they come from.
+"""The two pages of results: tables and figures of the paper from the results that exist, and where they come from.
 
-Nothing in it is typed in: what has not been run says so.
+The first page holds what a reader needs, the second one the long tables by frequency. No figure is typed in; what has not been
+run is marked.
 """
 
 from collections import Counter
@@ -18,64 +19,76 @@ from experiments.tables import (
     figure7,
     figure8,
     headline,
+    power,
     table1,
     table2,
     table3,
 )
 
-PAGES = (headline, default_field, few, table1, table2, table3, figure4, figure6, figure7, figure8, baselines)
-"""In the order of the paper, for readers."""
+PAGES = (headline, default_field, table3, figure4, figure6)
+"""Sections of the first page."""
+LONG = (few, power, table1, table2, figure7, figure8, baselines)
+"""Sections of the second page: tables by scene and frequency."""
 
 
 def page(results: Results, images: Path) -> str:
-    """The whole document."""
+    """The first page."""
     parts = ["# Results", introduction(results.profile), provenance(results)]
-    for module in PAGES:
+    return joined(parts, PAGES, results, images)
+
+
+def long_page(results: Results, images: Path) -> str:
+    """The second page."""
+    return joined(["# Results by scene and frequency", LONG_INTRODUCTION], LONG, results, images)
+
+
+def joined(parts: list[str], modules: tuple, results: Results, images: Path) -> str:
+    """Text and sections as one document."""
+    for module in modules:
         parts += [f"## {module.TITLE}", module.render(results, images)]
     return "\n\n".join(parts) + "\n"
 
 
-INTRODUCTION = """The tables and figures of [*Wideband RF Radiance Field Modeling Using Frequency-embedded 3D Gaussian
-Splatting*](https://arxiv.org/abs/2505.20714), run again on [this repository's data](dataset.md). A model is trained on spectra
-of one scene and asked for spectra at transmitter positions, or frequencies, that it has not seen. Scores are median SSIM
-(scikit-image, 7 x 7 window). **In parentheses stands the paper's value**, where it gives one. The paper's scenes are not
-published and the data here are others: compare orders and ratios, not single values.
+INTRODUCTION = """This page shows how well the fields predict spectra at transmitter positions, or frequencies, that were not
+used in training. It repeats the tables and figures of [*Wideband RF Radiance Field Modeling Using Frequency-embedded 3D
+Gaussian Splatting*](https://arxiv.org/abs/2505.20714) on [this repository's data](dataset.md); tables by scene and frequency
+stand on [a second page](results_tables{suffix}.md). Scores are median SSIM (scikit-image, 7 x 7 window). **In parentheses:
+the paper's value.** The paper's scenes are not published and the data here are others: compare orders and ratios, not single
+values.
 
 * **wideband (ours)**: the paper's field with this project's inputs and projection, which gain more than anything else
   ([decisions](decisions.md)); one model for all frequencies of a scene.
-* **WRF-GS**: what the paper compares with, a splatting field without frequency; *one model for every frequency*, all of which
-  together see as many spectra as ours does. Rebuilt here with the same inputs as ours; not its authors' code
+* **WRF-GS**: the paper's comparison, a splatting field without frequency; *one model for every frequency*, all of which
+  together see as many spectra as ours. Rebuilt here with the same inputs as ours; not its authors' code
   ([baselines](baselines.md)).
-* **WRF-GS, pooled**: one model for all frequencies that is not told which one it is asked for: our field without its frequency
-  inputs.
+* **WRF-GS, pooled**: our field without its frequency inputs, one model for all frequencies.
 * **5x samples**: trained on five times the usual number of spectra.
-* **coherent (ours)**: the [coherent field](wave.md); one model for all frequencies. It is told more than the others: complex
-  snapshots in training, the exact mesh and the walls' thickness, the list that the materials come from, and the physics that
-  made the data. Its rows in tables 1 and 2 and figures 7 and 8 predate its learning of how far surfaces
-  may be off.
+* **coherent (ours)**: the [coherent field](wave.md), one model for all frequencies. It has more information than the others:
+  complex snapshots in training, the exact mesh and the walls' thickness, a list that contains the true materials, and the
+  physics that made the data. Its rows in tables 1 and 2 and figures 7 and 8 predate its learned uncertainty of surface
+  positions.
 * **NeRF2-style**: a volume marched along rays, with the frequency as an input; rebuilt here too.
-* **Predictors that learn nothing**, and the **phase-blind ceiling**: the mean spectrum over random phases of all true paths,
-  about the best that can be said without phases; measured on 50 transmitters of each scene ([dataset card](dataset.md)).
+* **Untrained predictors** and the **phase-blind ceiling**, the mean spectrum over random phases of all true paths, about the
+  best possible without phases: see the [dataset card](dataset.md#ceilings). The ceiling was measured on 50 transmitters of
+  each scene.
 * **Truth against itself**: 40 transmitters of each scene, traced again with three times the rays. Scores above this level
-  cannot be told apart.
+  cannot be distinguished.
 
 Effort (profile `{name}`): {effort}.
-Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over
-seeds. They, and the p-values, take neighbouring transmitters for independent, which they are not quite. Where several seeds
-were run a value is their median. Except where a table says otherwise, all models of a scene train on the same transmitters and
-are tested on the same others. Optimisers, rates, layers and loss were chosen on a validation part of the training transmitters;
-inputs and octaves are older, chosen on held-out transmitters of scenes 1 and 4.
 
-```
-make experiments PROFILE={name}    # runs what is missing, goes on where it was cut; MINUTES=60 sets a limit
-make tables PROFILE={name}         # writes this page
-python -m experiments.runner --profile {name} --only table1 --scenes 1 4 --dry-run
-```"""
+Intervals (95 %) are bootstrapped over transmitters, because spectra of one transmitter are no independent samples, and over
+seeds. Intervals and p-values treat neighbouring transmitters as independent, which they are not quite. The value of several
+seeds is their median. Unless a table names an exception, all models of a scene have the same training and test transmitters.
+Optimisers, rates, layers and loss were chosen on a validation part of the training transmitters; inputs and octaves are
+older, chosen on held-out transmitters of scenes 1 and 4. [How the experiments are run](experiments.md)."""
+
+LONG_INTRODUCTION = """Reference tables of the [results](results.md), where models, scores and intervals are defined."""
 
 
 def introduction(name: str) -> str:
-    """What is compared, with which effort, and how to run it again."""
-    return INTRODUCTION.format(name=name, effort=profile_text(PROFILES[name]))
+    """What is compared, and with which effort."""
+    suffix = "" if name == "quick" else f"_{name}"
+    return INTRODUCTION.format(name=name, suffix=suffix, effort=profile_text(PROFILES[name]))
 
 
 def profile_text(profile: Profile) -> str:

@@ -33,7 +33,7 @@ def render(results: Results, images: Path) -> str:
         " spectrum of the same transmitter at the nearest trained frequency.",
         False: "**Held-out transmitters**: place and frequency are both new.",
     }
-    seeds = "One seed; in table 1 seeds differ by up to 0.02, so that neighbouring cells can hardly be told apart."
+    seeds = "One seed; in table 1 seeds differ by up to 0.02, so that neighbouring cells can hardly be distinguished."
     return "\n\n".join([seeds, *(f"{note}\n\n{table(results, all_tx)}" for all_tx, note in notes.items())])
 
 

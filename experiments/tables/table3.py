@@ -40,7 +40,7 @@ def render(results: Results, images: Path) -> str:
     rows.append(["phase-blind ceiling", "", best[0], "", "", best[1], "", ""])
     note = (
         "All frequencies: trained at 21, held-out transmitters. Cross frequency: trained at the 11 of combination D with all"
-        " transmitters, asked at the other 10. Without either embedding the field gives every frequency the same answer: it is"
+        " transmitters, scored at the other 10. Without either embedding the field gives every frequency the same answer: it is"
         " one model for pooled spectra. Where it is as good, what changes with the frequency is mostly interference, which no"
         " field without phases can follow ([decisions](decisions.md))."
     )

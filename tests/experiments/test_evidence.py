@@ -4,9 +4,8 @@ import json
 
 import pytest
 
-from experiments import evidence
 from experiments.catalogue import SERIES
-from experiments.evidence import ROOT, fill_pages, filled, pages
+from experiments.evidence import ROOT, fill_pages, filled, pages, parse_pieces, pieces_of
 from wbgs_jax._util.errors import UserError
 
 PAGE = "scores <!-- x.json a.b -->{}<!-- / --> or <!-- x.json a.b 1 -->{}<!-- / -->, steps <!-- x.json n 0 -->{}<!-- / -->\n"
@@ -21,11 +20,38 @@ def folder(tmp_path):
 @pytest.mark.parametrize("page", pages(), ids=lambda path: path.name)
 def test_pages_and_files_agree(page):
     """`make tables` mends a page."""
-    assert filled(page.read_text()) == page.read_text()
+    assert filled(page.read_text(), pieces=pieces_of(page)) == page.read_text()
 
 
 def test_the_readme_quotes_files():
-    assert len(evidence.VALUE.findall((ROOT / "README.md").read_text())) >= 6
+    assert sum(len(sources) for _, sources in parse_pieces(pieces_of(ROOT / "README.md"))) >= 6
+
+
+def test_every_file_of_pieces_has_a_page():
+    assert {path.stem for path in (ROOT / "docs" / "evidence").glob("*")} <= {page.stem for page in pages()}
+
+
+PIECES = "{} or\n    x.json a.b\n\n| row | {} | {} |\n    x.json a.b 1\n    x.json n 0\n"
+
+
+def test_blanks_of_a_page_are_filled(folder):
+    page = "scores {}\nor more\n| row | {} | {} |\n| row | 1 | 1 | 1 |\n"
+    right = page.format("0.123", "0.1", "12,000")
+    assert filled(page.format("0.9", "3.1", "-1,000.5"), folder, PIECES) == right == filled(right, folder, PIECES)
+
+
+@pytest.mark.parametrize(
+    ("page", "pieces", "message"),
+    [
+        ("a 1 b 1", "a {}\n", "1 blanks and 0 sources"),
+        ("a 1, a 2", "a {}\n    x.json a.b\n", "2 times"),
+        ("a one", "a {}\n    x.json a.b\n", "0 times"),
+        ("a 1", "a {}\n    y.json a.b\n", "not in"),
+    ],
+)
+def test_pieces_that_do_not_fit(folder, page, pieces, message):
+    with pytest.raises(UserError, match=message):
+        filled(page, folder, pieces)
 
 
 def test_what_was_edited_by_hand_is_put_right(folder):

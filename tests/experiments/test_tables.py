@@ -12,7 +12,20 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.profiles import PROFILES
 from experiments.results import Results
 from experiments.tables import __main__ as command_line
-from experiments.tables import baselines, cells, default_field, few, figure8, headline, page, summary, table1, table2, table3
+from experiments.tables import (
+    baselines,
+    cells,
+    default_field,
+    few,
+    figure8,
+    headline,
+    page,
+    power,
+    summary,
+    table1,
+    table2,
+    table3,
+)
 from wbgs_jax._util.files import write_json
 
 LEVELS = {
@@ -157,12 +170,12 @@ def test_the_volume_is_compared_with_others_of_its_seed(tmp_path):
 
 def test_the_page_is_whole_and_has_its_pictures(everything, tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "DRAWS", 20)
-    text = page.page(everything, tmp_path)
-    for module in page.PAGES:
+    text = page.page(everything, tmp_path) + page.long_page(everything, tmp_path)
+    for module in (*page.PAGES, *page.LONG):
         assert f"## {module.TITLE}" in text
     shown = set(re.findall(rf"\({tmp_path.name}/(\S+?)\)", text))
     assert shown == {path.name for path in tmp_path.iterdir()} and len(shown) == 6
-    for module in (default_field, few):  # whose files are no results of jobs
+    for module in (default_field, few, power):  # whose files are no results of jobs
         text = text.replace(module.render(everything, tmp_path), "")
     assert cells.NOT_RUN not in text
     assert "`abc123`" in text and "nan" not in text
@@ -180,7 +193,7 @@ def test_the_default_field_is_shown_with_its_percentiles_and_powers(tmp_path):
     text = default_field.render(Results("quick", tmp_path), tmp_path)
     figures = ["0.900", "0.850", "0.500", "0.600", "0.950", "", "0.970", "1.2", "0.50", "0.25", "2.00", "90 %", "10"]
     assert row(text, "scene 3") == figures
-    assert row(text.split(default_field.POWER_NOTE)[1], "nearest TX")[-1] == "10.50"
+    assert row(power.render(Results("quick", tmp_path), tmp_path), "nearest TX")[-1] == "10.50"
     assert row(text, "scene 1")[0] == cells.NOT_RUN
 
 

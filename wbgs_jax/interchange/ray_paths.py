@@ -158,8 +158,8 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
 
 
 def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
-    """Returns the paths predicted by a field (`fields.base.paths_of`) from T transmitters at one frequency to a single element at
-    the centre of the receiver's array.
+    """Returns the paths predicted by a field (`fields.base.paths_of`) from T transmitters at one frequency to a single element
+    at the centre of the receiver's array.
 
     Transmissions have no position (NaN): a field records which walls a path crosses, and where it is reflected or diffracted.
 
