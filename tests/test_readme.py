@@ -11,6 +11,7 @@ import pytest
 from builders.synthetic import tiny_scene
 
 import wbgs_jax as wb
+from experiments import result_table
 from wbgs_jax.commands import train
 from wbgs_jax.fields import base
 
@@ -42,8 +43,12 @@ def python_blocks(page: Path) -> list[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the names that the pages use stand for tiny things: scene 1, two runs, and two traced rooms."""
     here = tmp_path_factory.mktemp("pages")
-    for name in ("wbgs_jax", "experiments"):
-        (here / name).symlink_to(ROOT / name)
+    (here / "wbgs_jax").symlink_to(ROOT / "wbgs_jax")
+    results = here / "experiments" / "results"
+    results.mkdir(parents=True)
+    for rows in result_table.FOLDER.glob("*.jsonl"):
+        (results / rows.name).symlink_to(rows)
+    result_table.write(results)
     (here / "released").mkdir()
     (here / "runs").mkdir()
     scene = tiny_scene(TRANSMITTERS)
