@@ -30,6 +30,7 @@ from wbgs_jax.data.scene import in_sight
 from wbgs_jax.data.splits import with_validation_trained
 from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, Trained, as_observed, observe, observe_links, render_pas
@@ -286,7 +287,7 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
     }
 
 
-def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
+def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     said = power_of(seen, dataset)

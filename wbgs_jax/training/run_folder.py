@@ -36,7 +36,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.fields.base import check_config, field_from_arrays
+from wbgs_jax.fields.base import Params, check_config, field_from_arrays
 from wbgs_jax.inference import intervals, kriging
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence, read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import Beside, read_neighbours
@@ -100,7 +100,7 @@ class TrainedField:
 
     config: RunConfig
     field: Field
-    params: Any
+    params: Params
     step: int
     seconds: float
     """Training time."""
