@@ -49,8 +49,8 @@ coherent = wb.wave.make_field(wb.Mesh(*map(jnp.asarray, (corners, faces, part, p
 
 for field in (splatted, volume, coherent):
     params = field.init(jax.random.key(0))
-    plan = type(field).plan if field is coherent else jax.jit(type(field).plan, static_argnums=3)
-    plan = plan(field, params, receiver, wb.TileLimits(4096, 1024) if field is splatted else None)
+    plan = type(field).plan if field is coherent else jax.jit(type(field).plan, static_argnames="capacity")
+    plan = plan(field, params, receiver, capacity=wb.TileLimits(4096, 1024) if field is splatted else None)
     pas = jax.jit(type(field).render)(field, params, plan, query).pas
     assert pas.shape == (1, 90, 360) and float(pas.max()) > 0.01 and bool(jnp.isfinite(pas).all()), field.name
 """

@@ -183,8 +183,8 @@ def test_prepared_links_are_rendered_as_others_are(rng):
     np.testing.assert_array_equal(prepared.tx_index, [3, 7])
     prepared = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, prepared), links)
     others = jax.jit(WaveField.render)(field, params, plan, query)
-    powers = [seen._replace(pas=seen.pas**2) for seen in (prepared, others)]  # near zero roots are of rounding
-    for a, b in zip(*powers, strict=True):
+    powers = [seen._replace(pas=seen.pas**2, paths=None) for seen in (prepared, others)]  # near zero roots are of rounding
+    for a, b in zip(*map(jax.tree.leaves, powers), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * np.abs(b).max())
 
 

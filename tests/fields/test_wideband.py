@@ -185,10 +185,11 @@ def test_limits_hold_all_receivers_and_grow(rng, points):
     field = start(points)
     params = trained(rng, field)
     receivers = [RECEIVER, make_receiver((1.0, 0.5, 1.5))]
-    capacity = field.capacity(params, jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers))
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
+    capacity = field.capacity(params, together)
     for receiver in receivers:
         assert not plan_within(field, params, receiver, capacity=capacity).geometry.jobs.overflow
-    grown = capacity.grown_to(field.capacity(params, None, np.array([capacity.entries + 1, 3])))
+    grown = capacity.grown_to(field.capacity(params, together, np.array([capacity.entries + 1, 3])))
     assert grown.entries > capacity.entries and grown.jobs == capacity.jobs
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import outputs_of
+from wbgs_jax.fields.base import Params, outputs_of
 from wbgs_jax.types import Query, make_receiver
 
 Powers = Callable[[Float[Array, "k 3"], Any], Float[Array, "k users"]]
@@ -46,7 +46,7 @@ def tenth_percentile(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
     return jnp.quantile(power_db, 0.1, axis=-1)
 
 
-def power_at_users(field: Field, params: Any, users: Any, frequencies_hz: Any) -> Powers:
+def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any) -> Powers:
     """Returns the powers (dB, mean over the frequencies) of users by an antenna that may stand anywhere, both isotropic:
     differentiable in reverse mode with respect to its place.
 

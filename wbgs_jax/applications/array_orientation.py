@@ -16,7 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import outputs_of, paths_of
+from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.radio.antenna import Antenna, antenna_field, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
 from wbgs_jax.radio.channel import Arrivals, decibels
@@ -40,7 +40,7 @@ def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
     return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
 
 
-def arrivals_anywhere(field: Field, params: Any, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
+def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
     """Returns what reaches an isotropic element at a place from n transmitters, over every path; its frame is the world's.
 
     Args:

@@ -19,7 +19,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks, shrinking
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Observation, as_observed, outputs_of
+from wbgs_jax.fields.base import Observation, Params, as_observed, outputs_of
 from wbgs_jax.inference.predictor import check_power
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
@@ -69,7 +69,7 @@ class Locator:
     ...)."""
 
     field: Field
-    params: Any
+    params: Params
     plans: tuple[Any, ...]
     """Of every receiver."""
     frequencies_hz: Float[Array, " f"]

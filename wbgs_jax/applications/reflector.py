@@ -19,7 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import NARROWEST_M, Powers, soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import outputs_of, paths_of
+from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.propagation.paths import TRANSMITTED
 from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
@@ -122,7 +122,7 @@ def reflector(
     size: tuple[float, float],
     frequencies_hz: Any,
     field: Field | None = None,
-    params: Any = None,
+    params: Params = None,
 ) -> Reflector:
     """Returns a metal plate between a transmitter and users, whose powers are a function of its pose.
 
@@ -147,7 +147,7 @@ def reflector(
     return Reflector(jnp.asarray(ends[0]), jnp.asarray(ends[1:]), jnp.asarray(size, jnp.float32), frequencies, legs)
 
 
-def straight_powers(field: Field, params: Any, ends: Any, frequencies_hz: Any) -> Powers:
+def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any) -> Powers:
     """Returns the powers (dB, mean over the frequencies) that go straight from any place to some ends, through whatever walls
     stand between: no reflections, no diffraction.
 

@@ -30,6 +30,7 @@ from wbgs_jax.data.scene import in_sight
 from wbgs_jax.data.splits import with_validation_trained
 from wbgs_jax.evaluation.baselines import baselines, can_lend, nearest_links
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, PowerConfidence, expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_links, render_pas
@@ -303,7 +304,7 @@ def own_scores(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     return {key: value for name in kinds for key, value in SCORES[name](seen, dataset.observations[name][index]).items()}
 
 
-def watch(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
+def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
     """Returns the figure that the curves of a training show of some held-out links."""
     seen = observe_links(field, params, dataset, index)
     said = power_of(seen, dataset)

@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax._util.statistics import standard_error
-from wbgs_jax.fields.base import Observation
+from wbgs_jax.fields.base import Observation, Params
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
@@ -91,11 +91,15 @@ class Opinions(NamedTuple):
 class Mixing(Protocol):
     """A field that mixes three opinions by shares that are found after its training."""
 
-    def opinions(self, params: Any, plan: Any, links: Query | Links) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+    def opinions(
+        self, params: Params, plan: Any, links: Query | Links
+    ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
         """Returns what spectra and powers of B links are said to be, and what tells whom to trust."""
         ...
 
-    def with_shares(self, params: Any, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0) -> Any:
+    def with_shares(
+        self, params: Params, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0
+    ) -> Any:
         """Returns parameters with other shares, where they are given, and another floor that noise has put under spectra."""
         ...
 

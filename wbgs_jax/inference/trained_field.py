@@ -20,6 +20,7 @@ from wbgs_jax.data.splits import (
     unseen_frequencies,
 )
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, PowerConfidence
 from wbgs_jax.inference.kriging import SAME_PLACE_M, Beside
 from wbgs_jax.types import Receiver
@@ -77,7 +78,7 @@ class TrainedField:
 
     config: RunConfig
     field: Field
-    params: Any
+    params: Params
     step: int
     seconds: float
     """Training time."""

@@ -15,7 +15,7 @@ import dataclasses
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from wbgs_jax.config import Settings
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features
 from wbgs_jax.inference.mixture import Mixture
 from wbgs_jax.inference.predictor import as_observed, predict_spectra
@@ -160,7 +161,7 @@ def is_few(dataset: Dataset) -> bool:
     return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < ENOUGH
 
 
-def learn_few(field: Field, params: Any, dataset: Dataset, training: Training, say: Say) -> Few:
+def learn_few(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> Few:
     """Returns what goes with a trained field."""
     no_paths = knows_no_paths(dataset, type(field))
     known, held = cross_validated(field, params, dataset, training, say)
@@ -172,7 +173,7 @@ def learn_few(field: Field, params: Any, dataset: Dataset, training: Training, s
     return Few(found.mixture, _confidence(dataset, held, found), found.line)
 
 
-def cross_validated(field: Field, params: Any, dataset: Dataset, training: Training, say: Say) -> tuple[Known, HeldOut]:
+def cross_validated(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> tuple[Known, HeldOut]:
     """Returns all known spectra, and what fields answer that were not trained on some of them."""
     index = training_links(dataset)
     held = _validation(field, params, dataset, index)
@@ -183,7 +184,7 @@ def cross_validated(field: Field, params: Any, dataset: Dataset, training: Train
     return Known(index, dataset.eight_bit(index)), held
 
 
-def _validation(field: Field, params: Any, dataset: Dataset, known: Int[np.ndarray, " m"]) -> HeldOut:
+def _validation(field: Field, params: Params, dataset: Dataset, known: Int[np.ndarray, " m"]) -> HeldOut:
     """Returns what a field answers to its validation part, every transmitter a group of its own."""
     index = dataset.validation
     pas = as_observed(field, params, predict_spectra(field, params, dataset, index)) if len(index) else np.zeros((0, 90, 360))

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wbgs_jax._util.pytree import pytree, replaced
 from wbgs_jax.config import DensityConfig
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.splat import grown_slots
@@ -63,12 +64,12 @@ class DensityControl(Hook):
     config: DensityConfig
     stream: int = 3
 
-    def statistics(self, params: Any) -> DensityStatistics:
+    def statistics(self, params: Params) -> DensityStatistics:
         """Returns zero statistics of all slots."""
         n = params.gaussians.means.shape[0]
         return DensityStatistics(jnp.zeros(n), jnp.zeros((n, 3)), jnp.zeros(n))
 
-    def probe(self, params: Any) -> Float[Array, "n 2"]:
+    def probe(self, params: Params) -> Float[Array, "n 2"]:
         """Returns zero offsets."""
         return jnp.zeros((params.gaussians.means.shape[0], 2))
 
@@ -92,7 +93,7 @@ class DensityControl(Hook):
     def apply(
         self,
         field: Field,
-        params: Any,
+        params: Params,
         statistics: DensityStatistics,
         context: Context,
         step: int,
@@ -105,7 +106,7 @@ class DensityControl(Hook):
             edit = edit._replace(statistics=self.statistics(edit.params))
         return reset_attenuation(edit, self.config) if self._resets(step) else edit
 
-    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+    def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
         """Returns the shapes of the parameters with more slots, where few are left and Gaussians may still be added."""
         slots, most = len(params.gaussians.means), self.config.max_gaussians
         alive = int(np.asarray(params.gaussians.alive).sum())
@@ -118,7 +119,7 @@ class DensityControl(Hook):
         return replaced(shapes, gaussians=gaussians), grown / slots
 
 
-def control_density(params: Any, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator) -> Edit:
+def control_density(params: Params, statistics: DensityStatistics, config: DensityConfig, rng: np.random.Generator) -> Edit:
     """Returns parameters with Gaussians cloned, split and pruned; the number of slots may grow."""
     gaussians = jax.tree.map(np.asarray, params.gaussians)
     statistics = jax.tree.map(np.asarray, statistics)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import components_of
+from wbgs_jax.fields.base import Params, components_of
 from wbgs_jax.fields.mixture import (
     Mixing,
     Opinions,
@@ -50,17 +50,19 @@ class ExpertWeights(Hook):
         return step >= steps
 
     def apply(
-        self, field: Field, params: Any, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
+        self, field: Field, params: Params, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
         """Returns the parameters with these shares; as they are where a component is missing, or nothing is held out."""
         batches, mixing = context.validation(), field.ability(Mixing)
         same = Edit(params, (), lambda tree: tree, {})
         if mixing is None or not batches or len(components_of(field)) < len(field.components):
             return same
-        raw = mixing.field.with_shares(params)
+        raw = mixing.put(params, mixing.field.with_shares(mixing.of(params)))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
         plans = {number: field.plan(raw, receiver, context.prepared) for number, receiver in receivers.items()}
-        seen = [jax.tree.map(np.asarray, opinions_on(field, raw, plans[_receiver_of(batch)], batch)) for batch in batches]
+        own = {number: mixing.of(plan) for number, plan in plans.items()}
+        found = (opinions_on(mixing.field, mixing.of(raw), own[_receiver_of(batch)], batch) for batch in batches)
+        seen = [jax.tree.map(np.asarray, one) for one in found]
         said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
         floor, spectra = 0.0, coherent_alone()
@@ -70,8 +72,8 @@ class ExpertWeights(Hook):
         known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
-        found = mixing.field.with_shares(params, spectra, power, floor)
-        return same._replace(params=found, report={"shares": report, "noise_floor": floor})
+        weighted = mixing.field.with_shares(mixing.of(params), spectra, power, floor)
+        return same._replace(params=mixing.put(params, weighted), report={"shares": report, "noise_floor": floor})
 
 
 def _receiver_of(batch: Batch) -> int:
@@ -79,7 +81,7 @@ def _receiver_of(batch: Batch) -> int:
 
 
 @jax.jit
-def opinions_on(field: Any, params: Any, plan: Any, batch: Batch) -> Seen:
+def opinions_on(field: Mixing, params: Params, plan: Any, batch: Batch) -> Seen:
     """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
     spectra, power, told = field.opinions(params, plan, batch.links)
     return Seen(spectra, power, told, batch.pas, batch.received_db)

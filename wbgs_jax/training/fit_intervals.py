@@ -5,8 +5,6 @@ few sets of features, each with the ones before, the largest is taken that lower
 small validation parts can tell of few features only.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import (
     FEATURES,
     LEVEL,
@@ -47,7 +46,7 @@ _features, _power_features = jax.jit(features), jax.jit(power_features)
 
 
 def learn_confidence(
-    field: Field, params: Any, dataset: Dataset, neighbours: Neighbours | None
+    field: Field, params: Params, dataset: Dataset, neighbours: Neighbours | None
 ) -> tuple[Confidence | None, PowerConfidence | None]:
     """Returns how sure spectra and received powers are; None where field or data know nothing of them, or for too few
     validation links.
@@ -62,7 +61,12 @@ def learn_confidence(
 
 
 def _of_spectra(
-    field: Field, params: Any, seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"], neighbours: Neighbours | None
+    field: Field,
+    params: Params,
+    seen: Observation,
+    dataset: Dataset,
+    index: Int[np.ndarray, " n"],
+    neighbours: Neighbours | None,
 ) -> Confidence | None:
     if not dataset.has_spectra:
         return None

@@ -8,7 +8,7 @@ parts are asked.
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,7 @@ from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import training_links
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.kriging import Neighbours
 from wbgs_jax.inference.predictor import as_observed, corrected, predict_spectra
 from wbgs_jax.metrics import ssim
@@ -59,7 +60,7 @@ class Learned(NamedTuple):
     """The same of the training part alone, for whoever looks at the validation part."""
 
 
-def learn_neighbours(field: Field, params: Any, dataset: Dataset) -> Learned:
+def learn_neighbours(field: Field, params: Params, dataset: Dataset) -> Learned:
     """Returns the neighbours that improve a trained field.
 
     Data of several receivers, of received powers, with fewer than `FEWEST` validation or more than `MOST` known spectra have
@@ -101,7 +102,7 @@ def _why_not(dataset: Dataset, known: int) -> str:
 class _Known:
     """Known links, whose images are made once for all choices."""
 
-    def __init__(self, field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " m"]):
+    def __init__(self, field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " m"]):
         self._made: dict[Kind, Num[Array, "m 90 360"]] = {}
         self._asked, self.dataset, self.index = (field, params), dataset, index
 

@@ -19,6 +19,7 @@ import optax
 
 from wbgs_jax._util.pytree import replaced
 from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch
 
@@ -33,7 +34,7 @@ def silent(stage: str) -> None:
 class Edit(NamedTuple):
     """What a hook did."""
 
-    params: Any
+    params: Params
     statistics: Any
     """What the hook has watched, from here on."""
     moments: Callable[[Any], Any] | None
@@ -67,11 +68,11 @@ class Hook(ABC):
     stream: int
     """Number of its stream of random numbers."""
 
-    def statistics(self, params: Any) -> Any:
+    def statistics(self, params: Params) -> Any:
         """Returns zeros, to be accumulated over steps; () if it watches nothing."""
         return ()
 
-    def probe(self, params: Any) -> Any:
+    def probe(self, params: Params) -> Any:
         """Returns zeros that the field's loss is to add where the hook wants to know the gradient; None: nowhere."""
         return None
 
@@ -84,16 +85,18 @@ class Hook(ABC):
         """Returns whether something is to be done after this step of so many."""
 
     @abstractmethod
-    def apply(self, field: Any, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+    def apply(
+        self, field: Field, params: Params, statistics: Any, context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
         """Returns the changed parameters."""
 
-    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+    def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
         """Returns parameters of the shapes that the hook may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
         None where nothing is near after this step of so many."""
         return None
 
 
-def probe_of(hooks: Sequence[Hook], params: Any) -> Any:
+def probe_of(hooks: Sequence[Hook], params: Params) -> Any:
     """Returns the probe of the first hook that has one; None if none has."""
     return next((probe for hook in hooks if (probe := hook.probe(params)) is not None), None)
 
@@ -110,12 +113,12 @@ class OfPart(Hook):
         """Number of its stream of random numbers."""
         return self.inner.stream
 
-    def statistics(self, params: Any) -> Any:
+    def statistics(self, params: Params) -> Any:
         """Returns zeros, to be accumulated over steps; () where there is no such component."""
         own = getattr(params, self.part)
         return () if own is None else self.inner.statistics(own)
 
-    def probe(self, params: Any) -> Any:
+    def probe(self, params: Params) -> Any:
         """Returns that of the component."""
         own = getattr(params, self.part)
         return None if own is None else self.inner.probe(own)
@@ -129,7 +132,9 @@ class OfPart(Hook):
         """Returns whether something is to be done after this step of so many."""
         return self.inner.due(step, steps)
 
-    def apply(self, field: Field, params: Any, statistics: Any, context: Context, step: int, rng: np.random.Generator) -> Edit:
+    def apply(
+        self, field: Field, params: Params, statistics: Any, context: Context, step: int, rng: np.random.Generator
+    ) -> Edit:
         """Returns all parameters, those of the component changed."""
         own = getattr(params, self.part)
         if own is None:
@@ -144,7 +149,7 @@ class OfPart(Hook):
         whole = None if edit.field is None else put(field, edit.field)
         return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
 
-    def next_size(self, params: Any, step: int, steps: int) -> tuple[Any, float] | None:
+    def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
         """Returns the shapes of all parameters that the hook may soon change to, and that growth."""
         own = getattr(params, self.part)
         found = None if own is None else self.inner.next_size(own, step, steps)
@@ -153,7 +158,7 @@ class OfPart(Hook):
         return replaced(jax.eval_shape(lambda tree: tree, params), **{self.part: found[0]}), found[1]
 
 
-def map_moments(moments: Any, params: Any, function: Callable[[Any], Any]) -> Any:
+def map_moments(moments: Any, params: Params, function: Callable[[Any], Any]) -> Any:
     """Returns the optimiser's state with every tree in it that is like the parameters transformed. In the tree of a group the
     leaves of all others are masked."""
     leaves, structure = jax.tree.flatten(params)

@@ -36,7 +36,7 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import Field, get_field
-from wbgs_jax.fields.base import field_from_arrays
+from wbgs_jax.fields.base import Params, field_from_arrays
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
 from wbgs_jax.training.calibration.pipeline import Search
@@ -244,7 +244,7 @@ class Run:
         )
         return self.devices.own(results)
 
-    def _program(self, params: Any, capacity: Any) -> Any:
+    def _program(self, params: Params, capacity: Any) -> Any:
         """Returns what distinguishes the compiled epochs of a run."""
         return capacity, tuple(_shapes(params)), jax.tree.structure(self.field)
 
@@ -400,7 +400,7 @@ class TrainResult:
     """What a training run leaves."""
 
     field: Field
-    params: Any
+    params: Params
     steps: int
     seconds: float
     """Wall-clock training time, summed over resumed parts."""

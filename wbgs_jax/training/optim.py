@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.fields import Field, Group
+from wbgs_jax.fields.base import Params
 
 ADAMS_RMS = 0.2
 """Root mean square of an entry of Muon's steps, in learning rates: about that of Adam's, so that one rate serves both (Liu et
@@ -45,10 +46,10 @@ def _stacked(inner: optax.GradientTransformation) -> optax.GradientTransformatio
     their own would take ten seconds to compile. Zeros stay zeros, so that steps are the same, but in units of the stack's
     longest side."""
 
-    def init(params: Any) -> Any:
+    def init(params: Params) -> Any:
         return inner.init({"matrices": _stack(params)})
 
-    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+    def update(updates: Any, state: Any, params: Params = None) -> tuple[Any, Any]:
         known = None if params is None else {"matrices": _stack(params)}
         steps, state = inner.update({"matrices": _stack(updates)}, state, known)
         leaves, structure = jax.tree.flatten(updates)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from wbgs_jax._util.devices import averaged
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.fields import Aux, Field
+from wbgs_jax.fields.base import Params
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.training.hooks import Hook, probe_of
 
@@ -25,7 +26,7 @@ from wbgs_jax.training.hooks import Hook, probe_of
 class TrainState:
     """Everything that changes during training."""
 
-    params: Any
+    params: Params
     optimizer: Any
     statistics: tuple[Any, ...]
     """What every hook has watched since it last acted."""
@@ -50,7 +51,7 @@ class EpochReport:
     """The epoch ended early, by overflow or a loss or gradient that is not finite."""
 
 
-def init_state(params: Any, optimizer: optax.GradientTransformation, hooks: tuple[Hook, ...] = ()) -> TrainState:
+def init_state(params: Params, optimizer: optax.GradientTransformation, hooks: tuple[Hook, ...] = ()) -> TrainState:
     """Returns the state before the first step."""
     statistics = tuple(hook.statistics(params) for hook in hooks)
     return TrainState(params, optimizer.init(params), statistics, jnp.zeros((), jnp.int32))
@@ -58,7 +59,7 @@ def init_state(params: Any, optimizer: optax.GradientTransformation, hooks: tupl
 
 def loss_and_gradients(
     field: Field,
-    params: Any,
+    params: Params,
     prepared: Any,
     data: TrainingData,
     index: Int[Array, " b"],

@@ -16,6 +16,7 @@ import numpy as np
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax.config import SearchConfig
+from wbgs_jax.fields import Field
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
@@ -75,7 +76,7 @@ class Search(Hook):
 
     def apply(
         self,
-        field: Calibratable,
+        field: Field,
         params: WaveParams,
         statistics: tuple[()],
         context: Context,
@@ -84,6 +85,7 @@ class Search(Hook):
     ) -> Edit:
         """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
         bodies that are not there and with its surfaces moved if the mesh is doubtful."""
+        assert isinstance(field, Calibratable), "the search is of fields of rays alone"
         config, data, prepared, say = self.config, context.data, context.prepared, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
