@@ -143,23 +143,18 @@ def test_of_very_many_materials_the_smaller_ones_are_one(scene):
     np.testing.assert_allclose(materials.thickness[materials.material], [0.1 * (i % 2) for i in range(100)])
 
 
-def test_what_a_receiver_does_not_hear_is_no_link(tmp_path):
-    scene = tiny_scene(4, n_rx=3, kind="power")
-    scene.power_db[1], scene.power_db[0, 2, 1] = np.nan, -300  # as some simulators say it
+@pytest.mark.parametrize(("kind", "nothing"), [("snapshot", np.nan), ("power", -300)])  # as some simulators say it
+def test_what_a_receiver_does_not_hear_is_no_link(kind, nothing, tmp_path):
+    scene = tiny_scene(4, n_rx=3, kind=kind)
+    heard = scene.snapshots if kind == "snapshot" else scene.power_db
+    heard[1], heard[0, 2, 1] = np.nan, nothing
     save_scene(tmp_path / "s.npz", scene)
     dataset = load_dataset(tmp_path / "s.npz")
-    assert len(dataset) == 3 * 3 * 3 - 1 and np.isfinite(dataset.power_db).all()
+    assert len(dataset) == 3 * 3 * 3 - 1
+    assert np.isfinite(dataset.snapshots if kind == "snapshot" else dataset.power_db).all()
     assert set(dataset.tx_index) == {0, 1, 2}
     np.testing.assert_array_equal(dataset.tx_positions[dataset.tx_index == 1][0], scene.tx_positions[2])
     assert dataset.receiver_index[dataset.tx_index == 0].tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
-
-
-def test_what_nobody_measured_is_no_link(tmp_path):
-    scene = tiny_scene(4, n_rx=3)
-    scene.snapshots[1], scene.snapshots[0, 2, 1] = np.nan, np.nan
-    save_scene(tmp_path / "s.npz", scene)
-    dataset = load_dataset(tmp_path / "s.npz")
-    assert len(dataset) == 3 * 3 * 3 - 1 and np.isfinite(dataset.snapshots).all() and set(dataset.tx_index) == {0, 1, 2}
 
 
 def test_a_place_on_both_sides_of_the_split_is_noted(tmp_path):

@@ -25,5 +25,6 @@ def test_pairs_are_of_the_same_links(rng):
 def test_a_side_that_is_far_worse_is_not_taken(rng, monkeypatch):
     monkeypatch.setattr(account, "stored_gains", lambda _: [np.stack([np.full(120, 0.9), rng.normal(0.5, 0.05, 120)])])
     monkeypatch.setattr(account, "COUNTS", (3, 10))
+    monkeypatch.setattr(account, "DRAWS", 6)
     found = simulate(rng)
     assert all(rate == 0 for rates in found.values() for rate in rates.values())

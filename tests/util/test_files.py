@@ -3,7 +3,6 @@
 import pytest
 
 from wbgs_jax._util import files
-from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_json, write_json
 
@@ -59,16 +58,6 @@ def test_missing_or_broken_json_is_a_user_error(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(UserError, match=r"v\.json"):
         read_json(path)
-
-
-def test_run_command_turns_a_user_error_into_one_line_and_exit_code_2(capsys):
-    def main():
-        raise UserError("no such scene; give another")
-
-    with pytest.raises(SystemExit) as exit_info:
-        run_command(main)
-    assert exit_info.value.code == 2
-    assert capsys.readouterr().err == "error: no such scene; give another\n"
 
 
 def test_what_a_killed_writer_left_is_removed_and_what_another_one_writes_is_not(tmp_path, monkeypatch):
