@@ -130,16 +130,16 @@ def test_no_links_no_spectra(data, kind, unit):
 
 
 def test_power_has_no_angular_spectrum(data):
-    with pytest.raises(UserError, match="box holds received powers, which have no angular spectrum; ") as error:
+    with pytest.raises(UserError, match="box contains received powers, which have no angular spectrum; ") as error:
         data["power", "wavelengths"].pas(np.arange(2))
     assert "\n" not in str(error.value)
 
 
 def test_inconsistent_data_sets_are_refused(data):
     dataset = data["snapshot", "wavelengths"]
-    with pytest.raises(ValueError, match="box has 0 kinds of observations; give one"):
+    with pytest.raises(ValueError, match="box has 0 kinds of observations; pass exactly one"):
         dataclasses.replace(dataset, snapshots=None)
-    with pytest.raises(ValueError, match="box has 2 kinds of observations; give one"):
+    with pytest.raises(ValueError, match="box has 2 kinds of observations; pass exactly one"):
         dataclasses.replace(dataset, power_db=np.zeros(len(dataset)))
     with pytest.raises(ValueError, match="receiver_index must lie between 0 and 2"):
         dataclasses.replace(dataset, receiver_index=dataset.receiver_index + 1)
