@@ -92,7 +92,7 @@ def describe(spec: SceneSpec) -> str:
     lines = [describe_room(objects, ["solid" if p.closed else "sheet" for p in spec.parts])]
     flaws = spec.flaws if isinstance(spec, OwnScene) else ()
     if flaws:
-        lines.append(f"warning: {flaws[0]}" + (f" (and {len(flaws) - 1} similar flaws)" if len(flaws) > 1 else ""))
+        lines.append(f"warning: {flaws[0]}" + (f" (similar flaws: {len(flaws) - 1})" if len(flaws) > 1 else ""))
     return "\n".join(lines)
 
 

@@ -172,7 +172,7 @@ def test_a_concave_face_is_cut_right_and_refused_where_an_exporter_fanned_it_out
 
 def test_a_missing_or_unknown_file(tmp_path):
     refused("scene file .*none.glb does not exist", tmp_path / "none.glb")
-    refused("a scene is one of .glb, .gltf, .obj, .ply, .xml", tmp_path / "room.step")
+    refused(r"is not a supported scene file \(.glb, .gltf, .obj, .ply, .xml\)", tmp_path / "room.step")
 
 
 @pytest.mark.parametrize("scale", [1000.0, 100.0, 0.001])
@@ -198,7 +198,7 @@ def test_flaws_of_a_scene_of_the_simulator_are_warnings(tmp_path):
     spec = load(file, None)
     assert len(spec.flaws) == 2 and "coincide" in spec.flaws[0]
     last = describe(spec).splitlines()[-1]
-    assert last.startswith("warning: objects ") and "'wall_west'" in last and last.endswith("(1 more of such places)")
+    assert last.startswith("warning: objects ") and "'wall_west'" in last and last.endswith("(similar flaws: 1)")
 
 
 def test_many_objects_are_not_all_described(tmp_path, monkeypatch):
