@@ -1,9 +1,9 @@
-"""How well predictors of a known kind could do at best on a scene, so that a model's score can be read.
+"""Ceilings: the best possible scores of certain kinds of predictors on a scene, as a reference for a model's score.
 
-Against the coherent truth (all paths with their phases) two kinds are measured, as SSIM of one transmitter's image:
-* the coherent sum of the paths with at most 0, 1, 2 or 3 interactions: what a model of that order could reach;
-* the mean image over random path phases: directions and powers known exactly, phases not. Models that blend real, positive
-  intensities cannot expect more.
+Two kinds are compared with the coherent ground truth (all paths with their phases), as SSIM of one transmitter's image:
+* the coherent sum of the paths with at most 0, 1, 2 or 3 interactions: the limit of a model of that order;
+* the mean image over random path phases: directions and powers exact, phases unknown. Models that blend real, positive
+  intensities cannot be expected to exceed it.
 """
 
 from typing import TYPE_CHECKING
@@ -51,6 +51,6 @@ def scaled_images(
 
 
 def scaled(snapshots: Complex[np.ndarray, "n elements"]) -> Complex[Array, "n elements"]:
-    """Returns snapshots with a maximum of 1: what is compared has no scale, and squares of weak ones stay normal numbers."""
+    """Returns snapshots scaled to a maximum of 1: the comparison is scale-free, and squares of weak ones do not underflow."""
     peak = np.abs(snapshots).max(-1, keepdims=True)
     return jnp.asarray(snapshots / np.where(peak > 0, peak, 1), jnp.complex64)

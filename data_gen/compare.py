@@ -1,4 +1,4 @@
-"""Two truths of one room, frequency by frequency: what another solver, other surfaces or other rays change.
+"""Compares two ground truths of one room by frequency: the effect of another solver, other surfaces or other rays.
 
 python -m data_gen.compare wbgs_jax/data/released/scene2.npz wbgs_jax/data/released/scene2_simulator.npz
 """
@@ -25,7 +25,7 @@ HEADING = ("GHz", "TX", "median correlation", "10th percentile", "median SSIM", 
 
 @dataclass(frozen=True)
 class Options:
-    """Compare the snapshots and spectra of the transmitters that two scene files have in common."""
+    """Compare snapshots and spectra of the transmitters common to two scene files."""
 
     first: Annotated[Path, tyro.conf.Positional]
     """Scene file (.npz)."""
@@ -34,13 +34,13 @@ class Options:
 
 
 def compare(first: SceneFile, second: SceneFile) -> str:
-    """Returns a table: a row for every frequency that both have. Power is the median of second over first.
+    """Returns a table with a row for every common frequency. Power is the median ratio of the second to the first.
 
     Raises:
-        UserError: no transmitter and frequency in common, or other arrays.
+        UserError: there is no common transmitter or frequency, or the arrays differ.
     """
     if first.element_unit != second.element_unit or not np.array_equal(first.element_positions, second.element_positions):
-        raise UserError(f"{first.name} and {second.name} have other arrays; their snapshots cannot be compared")
+        raise UserError(f"{first.name} and {second.name} have different arrays; their snapshots cannot be compared")
     tx = _common(first.tx_positions, second.tx_positions)
     frequencies = _common(first.frequencies_hz[:, None], second.frequencies_hz[:, None])
     if not len(tx) or not len(frequencies):
@@ -49,14 +49,14 @@ def compare(first: SceneFile, second: SceneFile) -> str:
 
 
 def _common(first: np.ndarray, second: np.ndarray) -> Int[np.ndarray, "n 2"]:
-    """Returns where equal rows are in both."""
+    """Returns the indices of equal rows in both arrays."""
     where = {tuple(row): i for i, row in enumerate(second.tolist())}
     found = [(i, where[tuple(row)]) for i, row in enumerate(first.tolist()) if tuple(row) in where]
     return np.array(found, int).reshape(-1, 2)
 
 
 def _row(first: SceneFile, second: SceneFile, tx: Int[np.ndarray, "n 2"], i: int, k: int) -> list[str]:
-    """Returns the cells of frequency `i` of the first and `k` of the second, of the first receiver."""
+    """Returns the cells of frequency `i` of the first file and `k` of the second, for the first receiver."""
     hz = first.frequencies_hz[i]
     y, other = (
         s.observations["snapshots"][t, 0, f].astype(np.complex128) for s, t, f in ((first, tx[:, 0], i), (second, tx[:, 1], k))

@@ -1,4 +1,4 @@
-"""How many rays are enough: the snapshots and spectra of fewer rays against those of the most.
+"""Convergence in the number of rays: snapshots and spectra of fewer rays compared with those of the most.
 
 python -m data_gen.convergence --scene 2 --effort 0.25 0.5 1 4
 """
@@ -33,34 +33,34 @@ TX_SEED = 0
 
 @dataclass(frozen=True)
 class Options:
-    """Compare snapshots and spectra of several numbers of rays with those of the largest."""
+    """Compare snapshots and spectra of several numbers of rays with those of the largest number."""
 
     scene: int = 1
     """Number of the scene."""
     frequencies: tuple[float, ...] = (1.0, 10.0, 94.0)
     """GHz."""
     effort: tuple[float, ...] = (0.25, 0.5, 1.0, 4.0)
-    """All numbers of rays times this, ascending; 1 is that of the released scenes, the last is the yardstick."""
+    """Factors on all numbers of rays, ascending; 1 is that of the released scenes, the last one is the reference."""
     tx: int = 16
-    """Number of transmitters, drawn at random by a fixed seed."""
+    """Number of transmitters, drawn at random with a fixed seed."""
     diffraction: bool = True
     """First-order diffraction."""
     depth: int = SolverSettings.max_depth
-    """Interactions a path may have."""
+    """Maximum number of interactions of a path."""
 
 
 def settings(effort: float, diffraction: bool = True, depth: int = SolverSettings.max_depth) -> SolverSettings:
-    """Returns the solver's settings with all numbers of rays times `effort`."""
+    """Returns the solver's settings with all numbers of rays multiplied by `effort`."""
     usual = SolverSettings(diffraction=diffraction, max_depth=depth)
     rays = ("samples_per_src", "rays_per_face", "rays_per_mirrored_face")
     more = {name: max(1, round(getattr(usual, name) * effort)) for name in rays}
-    batch = max(1, int(usual.tx_per_call / max(effort, 1)))  # memory grows with rays x transmitters
+    batch = max(1, int(usual.tx_per_call / max(effort, 1)))  # memory grows with rays times transmitters
     room = round(usual.max_paths_per_src * max(effort, 1))
     return dataclasses.replace(usual, tx_per_call=batch, max_paths_per_src=room, **more)
 
 
 def convergence(options: Options) -> list[str]:
-    """Returns the lines of the table: one for every number of rays at every frequency."""
+    """Returns the rows of the table, one for every number of rays at every frequency."""
     from data_gen.solve import Simulator
 
     spec = get_scene(options.scene)
@@ -69,7 +69,7 @@ def convergence(options: Options) -> list[str]:
     snapshots, costs = [], []
     for effort in options.effort:
         simulator = Simulator(spec, settings(effort, options.diffraction, options.depth))
-        simulator.paths(tx[: simulator.settings.tx_per_call], frequencies)  # compiles
+        simulator.paths(tx[: simulator.settings.tx_per_call], frequencies)  # compilation is not timed
         start = time.perf_counter()
         snapshots.append(traced(simulator, tx, frequencies))
         costs.append((time.perf_counter() - start) / len(tx))
@@ -85,7 +85,7 @@ def some_tx(spec: "SceneSpec", count: int, seed: int) -> Float[np.ndarray, "tx 3
 def traced(
     simulator: "Simulator", tx: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]
 ) -> Complex[np.ndarray, "freq tx elements"]:
-    """Returns the snapshots of transmitters, as many at once as the settings say."""
+    """Returns the snapshots of transmitters, computed in batches of the size in the settings."""
     size = simulator.settings.tx_per_call
     solved = [simulator.paths(tx[i : i + size], frequencies_hz) for i in range(0, len(tx), size)]
     return np.concatenate([np.array([[p.snapshot() for p in row] for row in one]) for one in solved], 1)
@@ -113,7 +113,7 @@ def main() -> None:
     if not options.effort or min(options.effort) <= 0 or options.tx < 1:
         raise UserError("--effort and --tx must be positive")
     ensure_backend()
-    print("| scene | GHz | effort | median correlation | lowest | median SSIM | 10th percentile | seconds a TX |")
+    print("| scene | GHz | effort | median correlation | lowest | median SSIM | 10th percentile | seconds per TX |")
     print("|---|---|---|---|---|---|---|---|")
     print("\n".join(convergence(options)))
 

@@ -4,7 +4,7 @@
     python -m data_gen.generate --scene 1 --frequency-set 21
     python -m data_gen.generate --scene room.glb --materials materials.toml --rx 1,2,1.5 --tx-grid 0,0,1:4,3,2:9,7,3
 
-A killed run loses at most the batches in progress: the same command goes on where it stopped and ends with the same bytes.
+A killed run loses at most the batches in progress: the same command continues where it stopped and produces the same bytes.
 """
 
 import os
@@ -32,7 +32,7 @@ from wbgs_jax.data.splits import tx_disjoint_split
 TEST_FRACTION = 0.2
 SPLIT_SEED = 0
 MAX_WORKERS = 4
-"""More would want more memory than a laptop has."""
+"""More would need more memory than a laptop has."""
 
 
 def generate(options: Options) -> Path:
@@ -53,7 +53,11 @@ def generate(options: Options) -> Path:
 
 
 def writable(out: Path) -> Path:
-    """Returns the path of a file to be written, its folder made; what is in the way is told now, not after hours."""
+    """Returns the path of a file to be written and creates its folder, so that errors occur now and not after hours.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out.parent).close()
@@ -63,7 +67,7 @@ def writable(out: Path) -> Path:
 
 
 def _processes(options: Options, backend: str) -> tuple[int, int | None]:
-    """Returns the numbers of processes and threads of each (None: as many as Dr.Jit likes)."""
+    """Returns the number of processes and of threads in each (None: Dr.Jit's default)."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or (1 if backend == CUDA else min(max(cores // 2, 1), MAX_WORKERS))
     return workers, options.threads or (None if workers == 1 else -(-cores // workers))
@@ -74,10 +78,10 @@ def _compute(job: jobs.Job, folder: Path, workers: int, threads: int | None, clu
     if not todo:
         return
     with CountProgress(f"{job.spec.name}, batches", job.n_batches, job.n_batches - len(todo)) as progress:
-        heard, done = False, list[int]()
+        received, done = False, list[int]()
         for batch in jobs.run(job, todo, folder, workers, threads, cluster):
             done.append(batch)
-            heard = heard or jobs.check_heard(job, folder, done)
+            received = received or jobs.check_heard(job, folder, done)
             progress.advance()
 
 
@@ -105,14 +109,14 @@ def _assemble(job: jobs.Job, folder: Path, backend: str) -> SceneFile:
 
 
 def draw_split(n_tx: int) -> Int[np.ndarray, " tx"]:
-    """Returns the split of a scene file (int8): a fifth of the transmitters, drawn by a fixed seed, are test."""
+    """Returns the split of a scene file (int8): a fifth of the transmitters, drawn with a fixed seed, are test."""
     split = np.zeros(n_tx, np.int8)
     split[tx_disjoint_split(np.arange(n_tx), TEST_FRACTION, SPLIT_SEED)[1]] = TEST
     return split
 
 
 def _provenance(job: jobs.Job, backend: str) -> dict[str, Any]:
-    # Nothing that differs between two runs: no times, no paths, no host.
+    # Nothing that differs between runs: no times, no paths, no host name.
     spec, settings = job.spec, job.settings
     interactions = ["line of sight", "specular reflection", "refraction", *["diffraction"] * settings.diffraction]
     interactions += ["diffuse reflection"] * settings.rough
@@ -131,11 +135,11 @@ def _provenance(job: jobs.Job, backend: str) -> dict[str, Any]:
 
 
 def say_written(work: Callable[[], Path]) -> None:
-    """Does work that goes on where it was interrupted, and says what file it wrote."""
+    """Runs resumable work and prints the path of the file that it wrote."""
     try:
         print(f"wrote {work()}")
     except KeyboardInterrupt:
-        raise UserError("interrupted; the same command goes on from here") from None
+        raise UserError("interrupted; the same command continues from here") from None
 
 
 def main() -> None:

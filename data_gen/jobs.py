@@ -1,9 +1,9 @@
-"""The long part of a generation, cut into batches that survive an interruption.
+"""The long-running part of a generation, divided into batches that survive interruptions.
 
-A batch is some transmitters at all frequencies. Its result is a file in a work folder, written whole or not at all; the
-folder's name contains a checksum of everything that decides a result, so a run finds what an earlier one with the same
-settings left, and never anything else. Batches are independent: neither their order nor the number of processes nor an
-interruption changes a bit.
+A batch is a group of transmitters at all frequencies. Its result is a file in a work folder, written atomically. The folder's
+name contains a checksum of everything that determines a result, so that a run finds exactly the results of earlier runs with
+the same settings. Batches are independent: results do not depend, bit for bit, on their order, the number of processes, or
+interruptions.
 """
 
 import hashlib
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from data_gen.solve import Simulator, TxPaths
 
 SILENT = 64
-"""Transmitters of whom one is heard, unless something is wrong with the scene."""
+"""Number of transmitters of which at least one has a path, unless there is an error in the scene."""
 PACKAGES = ("sionna-rt", "mitsuba", "drjit", "numpy")
-"""Packages whose version may change a result."""
+"""Packages whose versions may affect results."""
 
 Results = dict[str, np.ndarray]
-"""Arrays by name, the first axis that of the transmitters: `snapshots` (tx, freq, elements) complex64, `n_paths` (tx, freq),
+"""Arrays by name, with transmitters along the first axis: `snapshots` (tx, freq, elements) complex64, `n_paths` (tx, freq),
 `line_of_sight` (tx, freq) bool, `delay_spread_s` (tx, freq) and `ceilings` (tx, freq, ceilings), NaN where not measured."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that decides the snapshots."""
+    """Everything that determines the snapshots."""
 
     spec: SceneSpec
     settings: SolverSettings
@@ -48,7 +48,7 @@ class Job:
     frequencies_hz: tuple[float, ...]
     array: ArraySettings = field(default_factory=ArraySettings)
     ceiling_tx: tuple[int, ...] = ()
-    """Which transmitters the ceilings are measured on."""
+    """Indices of the transmitters for which the ceilings are measured."""
 
     def batch(self, index: int) -> range:
         """Returns the indices of the transmitters of one batch."""
@@ -71,12 +71,12 @@ class Job:
 
 
 def batch_file(folder: Path, batch: int) -> Path:
-    """Returns where the result of a batch lies."""
+    """Returns the path of the result of a batch."""
     return folder / f"{batch:04d}.npz"
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of the packages that may change a result."""
+    """Returns the versions of the packages that may affect results."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
@@ -84,13 +84,17 @@ def run(
     job: Job, todo: list[int], folder: Path, workers: int, threads: int | None, cluster: str | None = None
 ) -> Iterator[int]:
     """Computes batches in `workers` processes with `threads` threads each, or on the workers of a Dask cluster, and yields
-    every one when its file is written. A batch whose worker is killed is computed by another one."""
+    each one when its file is written. If a worker is killed, its batch is computed by another one.
+
+    Raises:
+        UserError: a batch failed.
+    """
     backend = find_backend()
     if workers == 1 and cluster is None:
         _start(job, backend, threads)
         yield from (_work(batch, folder) for batch in todo)
         return
-    # On other machines the library may lie elsewhere.
+    # On other machines the library may be in another place.
     there = backend if cluster in (None, LOCAL) else None
     with connected(cluster or LOCAL, workers) as client:
         for batch, _, error in finished(client, _work_there, todo, job, folder.resolve(), there, threads):
@@ -98,8 +102,8 @@ def run(
                 raise error
             if error is not None:
                 raise UserError(
-                    f"batch {batch} failed ({type(error).__name__}: {error}); with less memory in use, or fewer --workers, "
-                    "the same command goes on from there"
+                    f"batch {batch} failed ({type(error).__name__}: {error}); free some memory or use fewer --workers, and the "
+                    "same command continues from there"
                 ) from error
             yield batch
 
@@ -107,13 +111,13 @@ def run(
 _simulator: "Simulator"
 _job: Job
 _digest = ""
-"""Of the job that a worker is ready for."""
+"""Checksum of the job for which a worker is initialised."""
 
 
 def _start(job: Job, backend: tuple[str, str], threads: int | None) -> None:
     global _simulator, _job
     use_backend(backend)
-    import drjit as dr  # only now is it safe
+    import drjit as dr  # safe only after `use_backend`
 
     from data_gen.solve import Simulator
 
@@ -144,7 +148,7 @@ def _work(batch: int, folder: Path) -> int:
 
 
 def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
-    """Returns the arrays of `Results` for one transmitter, of its paths at every frequency."""
+    """Returns the arrays of `Results` for one transmitter from its paths at every frequency."""
     from data_gen import ceilings
 
     nothing = np.full(len(ceilings.NAMES), np.nan)
@@ -163,10 +167,10 @@ def _measure(job: Job, tx: int, paths: list["TxPaths"]) -> Results:
 
 
 def check_heard(job: Job, folder: Path, done: Sequence[int]) -> bool:
-    """Returns whether any transmitter of some finished batches has a path.
+    """Returns whether any transmitter of the finished batches has a path.
 
     Raises:
-        UserError: there is none, and there are enough of them for that to be a mistake.
+        UserError: none has, and there are so many that this is probably a mistake.
     """
     if any(_load(batch_file(folder, batch))["n_paths"].any() for batch in done):
         return True
@@ -174,17 +178,17 @@ def check_heard(job: Job, folder: Path, done: Sequence[int]) -> bool:
     if silent >= min(SILENT, len(job.tx_positions)):
         raise UserError(
             f"no path between the receiver and any of {silent} transmitters, at any frequency; "
-            "check the scene (units, up axis, a closed metal box?), the receiver's place and --tx-grid"
+            "check the scene (units, up axis, a closed metal box?), the receiver's position and --tx-grid"
         )
     return False
 
 
 def collect(job: Job, folder: Path) -> Results:
-    """Puts the finished batches together: the arrays of `Results`, and `read_back_hz` (freq,)."""
+    """Returns the results of all batches combined: the arrays of `Results`, and `read_back_hz` (freq,)."""
     batches = [_load(batch_file(folder, b)) for b in range(job.n_batches)]
     read_back = [b.pop("read_back_hz") for b in batches]
     return {"read_back_hz": read_back[0], **{key: np.concatenate([b[key] for b in batches]) for key in batches[0]}}
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    return read_arrays(file, "batch", "remove it, and the same command makes it again")
+    return read_arrays(file, "batch", "remove it, and the same command computes it again")

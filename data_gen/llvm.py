@@ -1,7 +1,7 @@
-"""Chooses what Sionna RT computes on, before anything imports sionna or mitsuba: an NVIDIA GPU, or the CPU through libLLVM.
+"""Chooses the backend of Sionna RT before sionna or mitsuba is imported: an NVIDIA GPU, or the CPU through libLLVM.
 
-On the CPU, Dr.Jit needs LLVM 17 or newer (14 is refused; 15 and 16 abort inside the solver). The abort kills the process, so a
-candidate is tried in a child process first, and only one that survived is used in this one.
+On the CPU, Dr.Jit needs LLVM 17 or newer (14 is rejected; 15 and 16 abort inside the solver). An abort kills the process, so
+each candidate is first tried in a child process, and only one that succeeded there is used here.
 """
 
 import functools
@@ -15,7 +15,7 @@ from pathlib import Path
 from wbgs_jax._util.errors import UserError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""Environment variable that names the library; it is respected when set."""
+"""Environment variable with the path of the library; no other library is tried if it is set."""
 MINIMUM_VERSION = 17
 NOT_INSTALLED = "sionna-rt is not installed; install it with: pip install 'wbgs-jax[data]'"
 ADVICE = f"install one (Debian, Ubuntu: apt-get install libllvm19) or set {VARIABLE} to the library file"
@@ -40,7 +40,8 @@ _PROBE_SECONDS = 300
 
 
 def ensure_backend() -> str:
-    """Makes `import sionna.rt` safe in this process: probes what there is (some seconds, once a process), then chooses.
+    """Makes `import sionna.rt` safe in this process: probes the available backends (a few seconds, once per process) and
+    chooses.
 
     Returns:
         "cuda", or "llvm" with DRJIT_LIBLLVM_PATH set.
@@ -60,7 +61,7 @@ def use_backend(backend: tuple[str, str]) -> None:
         os.environ[VARIABLE] = library
     import mitsuba
 
-    # Otherwise Sionna would pick by itself, and differently where a GPU exists but does not work.
+    # Otherwise Sionna chooses by itself, wrongly if a GPU exists but does not work.
     mitsuba.set_variant(f"{kind}_ad_mono_polarized")
 
 
@@ -86,7 +87,7 @@ def find_backend() -> tuple[str, str]:
 
 
 def find_libraries() -> list[Path]:
-    """Returns files that look like a libLLVM that is new enough, in the usual folders, newest first, unknown versions last."""
+    """Returns libLLVM files of a sufficient version in the usual folders, newest first, unknown versions last."""
     found: dict[Path, int] = {}
     for folder in _FOLDERS:
         for pattern in _PATTERNS:
@@ -98,14 +99,15 @@ def find_libraries() -> list[Path]:
 
 
 def library_version(path: Path) -> int | None:
-    """Returns the major version in the name of a libLLVM file (libLLVM.so.19.1, libLLVM-17.so.1), links followed; or None."""
+    """Returns the major version in the name of a libLLVM file (libLLVM.so.19.1, libLLVM-17.so.1) after resolving links; or
+    None."""
     match = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", path.resolve().name)
     return int(match.group(1)) if match else None
 
 
 @functools.cache
 def probe(kind: str, library: str = "") -> bool:
-    """Returns whether a small solve in a child process survives (seconds; up to a minute the first time, when it compiles)."""
+    """Returns whether a small solve in a child process succeeds (seconds; up to a minute the first time, for compilation)."""
     environment = {VARIABLE: library} if library else {}
     return _succeeds([sys.executable, "-c", _PROBE.format(variant=kind)], environment)
 

@@ -1,4 +1,5 @@
-"""What a user's meshes are (solids or sheets), and mistakes in them that a ray tracer would not report. Metres, z up."""
+"""Classification of a user's meshes (solids or sheets), and detection of errors that a ray tracer would not report. Metres, z
+up."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -11,17 +12,17 @@ from data_gen.scenes.base import Part
 from data_gen.scenes.geometry import distance
 
 TOUCH = 1e-4
-"""Metres: surfaces that are nearer lie on each other."""
+"""Metres: surfaces nearer than this coincide."""
 FLAT = 1e-3
-"""Metres: how far a wall may be from the side of the scene that it lies in."""
+"""Metres: maximum distance of a wall from the side of the scene in which it lies."""
 MIN_VOLUME = 1e-9
-"""Cubic metres: what encloses less is two sheets back to back."""
+"""Cubic metres: a body enclosing less is two sheets back to back."""
 ROOM_SHARE = 0.9
-"""A room's own mesh has at least this part of the scene's length, width and height."""
+"""Minimum size of a room's own mesh relative to the scene's length, width and height."""
 PLACES = np.array([(0.34, 0.33, 0.33), *itertools.permutations((0.79, 0.14, 0.07))])
-"""Where in a triangle it is looked for another surface, as weights of its corners."""
+"""Points of a triangle at which another surface is searched for, as weights of its corners."""
 LARGEST = 300
-"""So many triangles of an object are looked at, the largest."""
+"""Maximum number of triangles of an object that are examined, the largest first."""
 
 
 def is_solid(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> bool:
@@ -31,7 +32,7 @@ def is_solid(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> bool:
 
 
 def kind(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> str:
-    """Returns the kind (`KINDS`) of a part of this mesh in a scene of these bounds, in whose six sides sheets are the shell."""
+    """Returns the kind (`KINDS`) of a part with this mesh; sheets in one of the six sides of the scene's bounds are shell."""
     if is_solid(mesh, bounds):
         return "solid"
     in_side = (np.abs(mesh.bounds - bounds[:, None]) < FLAT).all(1)
@@ -39,14 +40,14 @@ def kind(mesh: trimesh.Trimesh, bounds: Float[np.ndarray, "2 3"]) -> str:
 
 
 def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Returns a solid with its normals outward, whichever way a mirrored or careless export turned them."""
+    """Returns a solid with outward normals, correcting mirrored or inconsistent exports."""
     mesh = mesh.copy()
     trimesh.repair.fix_normals(mesh, multibody=True)
     return mesh
 
 
 def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, " edges"]:
-    """Returns at which of its `face_adjacency_edges` a mesh turns back onto itself, so that two triangles lie on each other."""
+    """Returns a mask of those `face_adjacency_edges` at which a mesh folds back onto itself, so that two triangles coincide."""
     vertices = np.asarray(mesh.vertices)
     start, end = vertices[mesh.face_adjacency_edges].swapaxes(0, 1)
     along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
@@ -57,14 +58,14 @@ def folds(mesh: trimesh.Trimesh) -> Bool[np.ndarray, " edges"]:
 
 
 def surface_flaws(parts: Sequence[Part]) -> Iterator[str]:
-    """Gives a sentence for every part that folds back onto itself, and for every two sheets that lie on each other.
+    """Yields a message for every part that folds back onto itself, and for every two coinciding sheets.
 
-    A solid may touch a sheet, as furniture does that stands on the floor: the face in between is seen from nowhere.
+    A solid may touch a sheet, as furniture on the floor does: the face in between is never visible.
     """
     for part in parts:
         if (found := folds(part.mesh)).any():
             where = place(part.mesh.vertices[part.mesh.face_adjacency_edges[found][0, 0]])
-            advice = "triangulate its faces on export and remove double ones"
+            advice = "triangulate its faces on export and remove duplicates"
             yield f"object {part.name!r} folds back onto itself at {where}; {advice}"
     sheets = [p for p in parts if not p.closed]
     bounds = np.array([p.mesh.bounds for p in sheets]).reshape(-1, 2, 3)
@@ -73,22 +74,22 @@ def surface_flaws(parts: Sequence[Part]) -> Iterator[str]:
             second = sheets[near]
             if second is not first and (points := _common(first.mesh, second.mesh)).any():
                 yield (
-                    f"objects {first.name!r} and {second.name!r} lie on each other, at {place(points[0])} for one; "
-                    "cut a hole where the other is, or remove one"
+                    f"objects {first.name!r} and {second.name!r} coincide, for example at {place(points[0])}; "
+                    "cut a hole where the other one is, or remove one"
                 )
 
 
 def _common(first: trimesh.Trimesh, second: trimesh.Trimesh) -> Float[np.ndarray, "points 3"]:
-    """Returns the places on the first mesh where the second is, too, and parallel to it."""
+    """Returns points of the first mesh at which the second one coincides with it."""
     largest = np.argsort(-first.area_faces, kind="stable")[:LARGEST]
     points = (PLACES @ first.triangles[largest]).reshape(-1, 3)
     normals = np.repeat(first.face_normals[largest], len(PLACES), axis=0)
     near = ((points > second.bounds[0] - TOUCH) & (points < second.bounds[1] + TOUCH)).all(1)
     points, normals = points[near], normals[near]
-    beside = distance(second, points + 10 * TOUCH * normals)  # a surface that only crosses stays near
+    beside = distance(second, points + 10 * TOUCH * normals)  # a surface that merely crosses is still near there
     return points[(distance(second, points) < TOUCH) & (beside > 9 * TOUCH)]
 
 
 def place(point: Sequence[float] | np.ndarray) -> str:
-    """Returns a point as text for people, in metres."""
+    """Returns a point as text, in metres."""
     return f"({', '.join(f'{value:.4g}' for value in point)})"

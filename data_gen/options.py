@@ -1,4 +1,4 @@
-"""The command line of the generator, and the checked job that it asks for."""
+"""Command line options of the generator, and the checked job made from them."""
 
 import dataclasses
 import re
@@ -20,37 +20,37 @@ from wbgs_jax.interchange.room_materials import check_material_frequencies
 HERE = Path(__file__).parent
 SUBSET_SEED = 0
 NAME = re.compile(r"[A-Za-z0-9_-]+")
-"""What a data set may be called: run folders are named after it."""
+"""Valid names of a dataset, which are also used for run folders."""
 CEILING_TX = 50
-"""Number of transmitters the ceilings are measured on."""
+"""Number of transmitters for which the ceilings are measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """Which scene: one of `data_gen/scenes` by its number, or a file of the user's."""
+    """Choice of a scene: one of `data_gen/scenes` by its number, or a user's own file."""
 
     scene: str = "1"
     """Number of a scene of `data_gen/scenes`, or a file of your own: .glb, .obj, .ply or .xml (docs/own_scene.md)."""
     materials: Path | None = None
     """Own scene: materials of its objects (.toml)."""
     rx: str | None = None
-    """Position of the receiver, x,y,z in metres; a numbered scene has one of its own unless given."""
+    """Position of the receiver, x,y,z in metres; by default that of a numbered scene."""
     tx_grid: str | None = None
     """Own scene: transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z."""
     up: Literal["y", "z"] | None = None
     """Own scene: the file's vertical axis."""
     scale: float | None = None
-    """Own scene: metres in one unit of the file; 1 unless given, and then sizes that make one doubt it are refused."""
+    """Own scene: metres per unit of the file; by default 1, and implausible sizes are rejected."""
     rx_orientation: tuple[float, float, float, float] | None = None
-    """Quaternion w x y z from the receiver's local frame to the world; that of the scene unless given."""
+    """Quaternion w x y z from the receiver's local frame to the world; by default that of the scene."""
 
     @property
     def own(self) -> bool:
-        """Whether the scene is a file of the user's."""
+        """Whether the scene is a user's own file."""
         return not self.scene.isdecimal()
 
     def spec(self, frequencies_hz: tuple[float, ...] = ()) -> SceneSpec:
-        """Returns the scene, checked, at these frequencies (hertz) or at its own.
+        """Returns the checked scene at the given frequencies (hertz) or at its own.
 
         Raises:
             UserError: a mistake in the scene, the receiver, the transmitters or the materials.
@@ -60,15 +60,13 @@ class SceneOptions:
 
     def _numbered_spec(self) -> SceneSpec:
         if self.materials or self.tx_grid or self.up or self.scale is not None:
-            raise UserError("--materials, --tx-grid, --up and --scale are for a scene of your own; give its file with --scene")
+            raise UserError("--materials, --tx-grid, --up and --scale are for your own scene; give its file with --scene")
         spec = get_scene(int(self.scene))
         return spec if self.rx is None else dataclasses.replace(spec, rx_position=parse_point(self.rx, "--rx"))
 
     def _own_spec(self, frequencies_hz: tuple[float, ...]) -> SceneSpec:
         if self.rx is None or self.tx_grid is None:
-            raise UserError(
-                "a scene of your own needs a receiver and transmitters: --rx x,y,z --tx-grid x0,y0,z0:x1,y1,z1:nx,ny,nz"
-            )
+            raise UserError("your own scene needs a receiver and transmitters: --rx x,y,z --tx-grid x0,y0,z0:x1,y1,z1:nx,ny,nz")
         return own_scene(
             Path(self.scene), self.materials, rx=self.rx, tx_grid=self.tx_grid, frequencies_hz=frequencies_hz, up=self.up,
             scale=self.scale,
@@ -80,44 +78,44 @@ class Options(SceneOptions):
     """Generate a scene file with Sionna RT. The same command continues an interrupted run."""
 
     out: Path | None = None
-    """Scene file to write; wbgs_jax/data/released/scene<N>.npz or <name of your file>.npz unless given."""
+    """Scene file to write; by default wbgs_jax/data/released/scene<N>.npz or <name of your file>.npz."""
     name: str | None = None
-    """What the data set is called; the scene's name unless given."""
+    """Name of the dataset; by default the scene's name."""
     frequencies: tuple[float, ...] = ()
-    """GHz; those of the frequency set unless given."""
+    """GHz; by default those of the frequency set."""
     frequency_set: Literal["10", "21"] = "10"
     """The ten frequencies of the paper's Table 4, or 1, 5, 10, ..., 100 GHz."""
     array: ArraySettings = field(default_factory=ArraySettings)
     samples: int = SolverSettings.samples_per_src
-    """Rays that search for paths, for every transmitter, besides those aimed at edges."""
+    """Uniform rays for the path search from every transmitter, in addition to those aimed at edges."""
     max_tx: int | None = None
-    """Take only this many of the transmitters, drawn at random by a fixed seed."""
+    """Use only this many of the transmitters, drawn at random with a fixed seed."""
     depth: int = SolverSettings.max_depth
-    """Interactions a path may have."""
+    """Maximum number of interactions of a path."""
     diffraction: bool = True
     """First-order diffraction."""
     solver: Solver = SolverSettings.solver
-    """The project's own search, materials and diffraction, or those that the simulator comes with."""
+    """The project's own path search, materials and diffraction, or those of the simulator."""
     scattering: tuple[float, float] = SolverSettings.scattering
     """Scattering coefficients of walls, floor and ceiling, and of furniture; 0 0 is smooth."""
     seed: int = SolverSettings.seed
-    """Of all that is drawn at random while paths are searched."""
+    """Seed of all random numbers in the path search."""
     ceilings: bool = True
-    """Measure what truncated and phase-blind predictors could reach."""
+    """Measure the ceilings of truncated and phase-blind predictors."""
     max_paths: int = SolverSettings.max_paths_per_src
-    """Room for candidate paths of one transmitter."""
+    """Capacity for candidate paths of one transmitter."""
     workers: int | None = None
-    """Processes, of about 2.5 GB each; unless given, half as many as there are cores, four at most, and one with a GPU."""
+    """Number of processes, of about 2.5 GB each; by default half the number of cores but at most four, and one with a GPU."""
     threads: int | None = None
-    """Threads of each process; unless given, as many as keep all cores busy."""
+    """Threads of each process; by default as many as keep all cores busy."""
     cluster: str | None = None
-    """Compute on a Dask cluster: "local", --workers processes on this machine, as by default, or the address of a scheduler
-    (tcp://host:8786), whose workers have to see the folder for unfinished work."""
+    """Compute on a Dask cluster: "local" for --workers processes on this machine, as by default, or the address of a scheduler
+    (tcp://host:8786), whose workers need access to the work folder."""
     work: Path = HERE / "work"
     """Folder for unfinished work."""
 
     def default_out(self) -> Path:
-        """Returns where the scene file goes unless told. A part of a released scene must not replace it."""
+        """Returns the default path of the scene file. Results with other settings must not replace a released scene."""
         if self.own:
             return Path(f"{Path(self.scene).stem}.npz")
         usual = Options()
@@ -126,25 +124,25 @@ class Options(SceneOptions):
             "seed", "ceilings",
         )  # fmt: skip
         if any(getattr(self, name) != getattr(usual, name) for name in same):
-            raise UserError("with settings of your own the released file must not be replaced; give another one with --out")
+            raise UserError("with other settings the released file must not be replaced; give another one with --out")
         suffix = "_21f" if self.frequency_set == "21" else ""
         return RELEASED / f"scene{self.scene}{suffix}.npz"
 
 
 def make_job(options: Options) -> Job:
-    """Returns everything that decides the result, checked before hours are spent.
+    """Returns the job, checked before hours are spent on it.
 
     Raises:
         UserError: a mistake in the scene, the receiver, the transmitters, the materials, the array or the frequencies.
     """
     _check_numbers(options)
     if options.frequencies and options.frequency_set != "10":
-        raise UserError("--frequencies and --frequency-set are two ways to say one thing; give one of them")
+        raise UserError("--frequencies and --frequency-set exclude each other; give one of them")
     frequencies = tuple(ghz * 1e9 for ghz in options.frequencies) or (
         FREQUENCIES_21_HZ if options.frequency_set == "21" else ()
     )
     spec = options.spec(frequencies)
-    suffix = "_21f" if options.frequency_set == "21" else ""  # another data set of the same room
+    suffix = "_21f" if options.frequency_set == "21" else ""  # another dataset of the same room
     spec = dataclasses.replace(spec, name=options.name or f"{spec.name}{suffix}")
     frequencies = frequencies or spec.frequencies_hz
     check_material_frequencies([p.material for p in spec.parts], frequencies)
@@ -165,7 +163,7 @@ def _check_numbers(options: Options) -> None:
     }
     array = options.array
     if options.name is not None and not NAME.fullmatch(options.name):
-        raise UserError(f"--name {options.name!r} is no name; give letters, digits, - and _ alone")
+        raise UserError(f"--name {options.name!r} is not a valid name; use only letters, digits, - and _")
     numbers |= {"array.rows": array.rows, "array.columns": array.columns}
     for name, value in numbers.items():
         if value is not None and not value >= (1 if isinstance(value, int) else 1e-9):
@@ -183,6 +181,6 @@ def _check_numbers(options: Options) -> None:
 def _unit(quaternion: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     length = float(np.linalg.norm(quaternion))
     if not length > 0:
-        raise UserError("--rx-orientation is zero; give a quaternion w x y z, 1 0 0 0 for none")
+        raise UserError("--rx-orientation is zero; give a quaternion w x y z, 1 0 0 0 for no rotation")
     w, x, y, z = (value / length for value in quaternion)
     return w, x, y, z

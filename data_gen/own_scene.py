@@ -1,6 +1,6 @@
 """A scene from a user's own file: its objects, their materials, the receiver and the transmitters (docs/own_scene.md).
 
-All that can be wrong is told here in one line, before hours are spent on tracing.
+All errors are reported here, in one line, before hours are spent on tracing.
 """
 
 import dataclasses
@@ -23,15 +23,16 @@ MAX_TX = 1_000_000
 
 @dataclass(frozen=True)
 class OwnScene(SceneSpec):
-    """A scene from a file. Its walls need not close a room: being in it means being in the box around everything."""
+    """A scene from a file. Its walls need not enclose a room: points are in it if they are in the bounding box of all
+    objects."""
 
     flaws: tuple[str, ...] = ()
-    """What is wrong with surfaces that are taken as they are."""
+    """Flaws of surfaces that are accepted as they are."""
     walls: dict[str, float] = field(default_factory=dict)
-    """Sheets that were closed boxes, and how deep these were, metres."""
+    """Depth in metres of the closed boxes that were converted to sheets, by name."""
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Returns which points are in the box around all objects."""
+        """Returns which points are in the bounding box of all objects."""
         low, high = self.bounds()
         return ((points > low) & (points < high)).all(1)
 
@@ -57,17 +58,17 @@ def own_scene(
 
     Args:
         file: .glb, .gltf, .obj, .ply or .xml.
-        materials: a .toml with the materials of the objects; None only for a .xml that knows them all.
+        materials: a .toml with the materials of the objects; may be None for a .xml that records all of them.
         rx: position of the receiver, "x,y,z".
         tx_grid: candidate transmitters, "x0,y0,z0:x1,y1,z1:nx,ny,nz" or the path of a .csv with the header x,y,z.
-        frequencies_hz: hertz; the ten of the released scenes unless given.
-        up, scale: vertical axis and unit of the file, as in `read_objects`; without a scale the unit is the metre, and sizes
-            that make one doubt it are refused.
+        frequencies_hz: hertz; by default the ten of the released scenes.
+        up, scale: vertical axis and unit of the file, as in `read_objects`; without a scale the unit is the metre, and
+            implausible sizes are rejected.
 
     All positions are in metres in the scene's z-up frame, after `up` and `scale`.
 
     Raises:
-        UserError: anything about the file, the materials, the frequencies, the receiver or the transmitters is wrong.
+        UserError: an error in the file, the materials, the frequencies, the receiver or the transmitters.
     """
     position, candidates = parse_point(rx, "--rx"), _transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
@@ -85,13 +86,13 @@ def own_scene(
 
 
 def describe(spec: SceneSpec) -> str:
-    """Returns how objects were understood (`describe_room`), and what is wrong with them."""
+    """Returns a description of the objects (`describe_room`) and of their flaws."""
     walls = spec.walls if isinstance(spec, OwnScene) else {}
     objects = [RoomObject(p.name, p.mesh, Slab(p.material, p.thickness), walls.get(p.name, 0.0)) for p in spec.parts]
     lines = [describe_room(objects, ["solid" if p.closed else "sheet" for p in spec.parts])]
     flaws = spec.flaws if isinstance(spec, OwnScene) else ()
     if flaws:
-        lines.append(f"warning: {flaws[0]}" + (f" ({len(flaws) - 1} more of such places)" if len(flaws) > 1 else ""))
+        lines.append(f"warning: {flaws[0]}" + (f" (similar flaws: {len(flaws) - 1})" if len(flaws) > 1 else ""))
     return "\n".join(lines)
 
 
@@ -111,11 +112,15 @@ def _parts(objects: Sequence[RoomObject]) -> tuple[Part, ...]:
 
 
 def parse_point(text: str, option: str) -> Vec3:
-    """Returns metres from "x,y,z"; anything else is a `UserError`."""
+    """Returns a point in metres parsed from "x,y,z".
+
+    Raises:
+        UserError: the text is not of this form.
+    """
     try:
         x, y, z = (float(word) for word in text.split(","))
     except ValueError:
-        raise UserError(f"{option} has {text!r} where x,y,z in metres is needed, as in 1.2,0.5,1") from None
+        raise UserError(f"{option} has {text!r} instead of x,y,z in metres, such as 1.2,0.5,1") from None
     if not np.isfinite([x, y, z]).all():
         raise UserError(f"{option} has {text!r}; give finite numbers")
     return x, y, z
@@ -129,7 +134,7 @@ def _transmitters(text: str) -> Float[np.ndarray, "candidates 3"]:
         raise UserError(f"--tx-grid is {text!r}; give x0,y0,z0:x1,y1,z1:nx,ny,nz or a .csv file with the header x,y,z")
     low, high, numbers = (parse_point(corner, "--tx-grid") for corner in corners)
     if not all(value >= 1 and value == int(value) for value in numbers) or np.prod(numbers) > MAX_TX:
-        raise UserError(f"--tx-grid has {corners[2]!r} for nx,ny,nz; give whole numbers, at most {MAX_TX} points in all")
+        raise UserError(f"--tx-grid has {corners[2]!r} for nx,ny,nz; give whole numbers, at most {MAX_TX} points in total")
     nx, ny, nz = (int(value) for value in numbers)
     return grid_3d(low, high, (nx, ny, nz))
 
@@ -143,7 +148,7 @@ def _read_csv(file: Path) -> Float[np.ndarray, "candidates 3"]:
     except ValueError as error:
         raise UserError(f"{file} has a line that is not three numbers ({error}); write x,y,z in metres") from error
     if header.replace(" ", "").strip() != "x,y,z" or points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise UserError(f"{file} needs the header x,y,z and a row of three numbers (metres) for every transmitter")
+        raise UserError(f"{file} needs the header x,y,z and one row of three numbers (metres) per transmitter")
     if len(np.unique(points, axis=0)) < len(points):
-        raise UserError(f"{file} names a transmitter twice, which could be in training and test; remove one")
+        raise UserError(f"{file} has a transmitter twice, which could be in training and test; remove one")
     return points

@@ -31,25 +31,25 @@ COLORS = {
     "concrete": "#9a9a96", "plasterboard": "#e3ddcf", "wood": "#b98a56", "glass": "#8fc3e0", "ceiling_board": "#f0f0ea",
     "chipboard": "#d9b98a", "metal": "#66707c", "brick": "#a8553f", "marble": "#d8d3d6", "plywood": "#c9a26b",
 }  # fmt: skip
-"""By material ..."""
+"""Colours by material ..."""
 OTHER_COLOR = "#b7a6c9"
-"""... and of all others."""
+"""... and of all other materials."""
 WALL_COLORS = {"concrete": "#6d6d69", "plasterboard": "#b5ac97"}
-"""Darker in the plan, where a wall is a line."""
+"""Darker colours for the plan, in which walls are lines."""
 RX_COLOR, SEEN_COLOR, HIDDEN_COLOR = "#1f4fbf", "#2e8b3d", "#c0392b"
 DPI = 110
 PLAN_CUT = 1.45
-"""Metres above the floor: the plan shows what walls are there; furniture above it is left out."""
+"""Height of the plan's section above the floor, metres; furniture above it is omitted."""
 UNLABELED = {"chair", "monitor", "nightstand", "bench", "screen", "frames", "leaves", "posts"}
-"""Words in the names of parts that are small, many and plain to see."""
+"""Words in the names of parts that need no label, because they are small, numerous and obvious."""
 
 ELEVATION, AZIMUTH = 48.0, -66.0
-"""Degrees: where the view is from, over the corner of the +x and the -y wall."""
+"""Viewing direction in degrees: from above the corner of the +x and the -y wall."""
 LIGHT = np.array([0.25, -0.5, 0.85])
 PIXELS = 1700
-"""Width of the view before it is smoothed down to half."""
+"""Width of the view before it is smoothed to half the size."""
 WALL_ALPHA = 0.45
-"""Inner walls are glassy, or they would hide the rooms behind them."""
+"""Opacity of inner walls, which would otherwise hide the rooms behind them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,9 +61,9 @@ class Options(SceneOptions):
 
 
 def draw(spec: SceneSpec, out: Path) -> None:
-    """Writes the picture of a scene: plan on the left, view without ceiling and near walls on the right."""
+    """Writes a figure of a scene: plan on the left, view without ceiling and near walls on the right."""
     size = np.ptp(spec.bounds(), axis=0)
-    beside = size[0] < 2.2 * size[1]  # a long floor has the view below the plan
+    beside = size[0] < 2.2 * size[1]  # for a long floor, the view is below the plan
     figure, (plan, view) = plt.subplots(
         *((1, 2) if beside else (2, 1)), figsize=(15, 6.4) if beside else (12, 9.5), layout="constrained"
     )
@@ -129,7 +129,7 @@ def _plan_solid(axes: Axes, part: Part) -> None:
 
 
 def _plan_sheet(axes: Axes, part: Part) -> None:
-    """Draws where a wall is at the height of the cut; a doorway is a gap."""
+    """Draws the section of a wall at the height of the plan; doorways are gaps."""
     lines = trimesh.intersections.mesh_plane(part.mesh, (0, 0, 1), (0, 0, PLAN_CUT))
     width, color = (5 if part.kind == "shell" else 3), WALL_COLORS.get(part.material, _color(part.material))
     axes.add_collection(LineCollection(list(lines[:, :, :2]), colors=color, linewidths=width, capstyle="butt", zorder=3))
@@ -147,7 +147,7 @@ def _label(axes: Axes, part: Part) -> None:
 def _view(axes: Axes, spec: SceneSpec) -> None:
     picture = _Raster(spec.bounds())
     shown = [p for p in spec.parts if p.kind != "shell" or spec.in_room(p.mesh.triangles_center + 1e-3 * picture.toward).all()]
-    for part in sorted(shown, key=lambda p: p.kind == "partition"):  # glassy things last
+    for part in sorted(shown, key=lambda p: p.kind == "partition"):  # transparent parts last
         alpha = WALL_ALPHA if part.kind == "partition" else 1.0
         shades = _shades(part, np.asarray(part.mesh.face_normals))
         for triangle, normal, shade in zip(np.asarray(part.mesh.triangles), part.mesh.face_normals, shades, strict=True):
@@ -159,9 +159,9 @@ def _view(axes: Axes, spec: SceneSpec) -> None:
 
 
 class _Raster:
-    """A picture with a depth buffer, seen from far away along a fixed direction.
+    """An image with a depth buffer, in parallel projection along a fixed direction.
 
-    matplotlib has no depth buffer, trimesh draws through OpenGL and a window only.
+    matplotlib has no depth buffer, and trimesh renders only through OpenGL and a window.
     """
 
     def __init__(self, bounds: Float[np.ndarray, "2 3"]) -> None:
@@ -176,10 +176,10 @@ class _Raster:
         shape = (int(size[1] * self._scale) + 3, PIXELS + 2)
         self._depth = np.full(shape, -np.inf)
         self._color = np.ones((*shape, 3))
-        self._plane = np.zeros((2, *shape, 4))  # of what is drawn, opaque and glassy: where it changes there is an edge
+        self._plane = np.zeros((2, *shape, 4))  # planes of opaque and transparent surfaces; edges are drawn where they change
 
     def fill(self, triangle: np.ndarray, normal: np.ndarray, color: np.ndarray, alpha: float) -> None:
-        """Draws a triangle where nothing is nearer; one with alpha < 1 lets through what lies behind it."""
+        """Draws a triangle where nothing is nearer; with alpha < 1 it is transparent."""
         for rows, columns, depth in self._pixels(triangle):
             window = (rows, columns)
             front = depth > self._depth[window] + 1e-6
@@ -189,7 +189,7 @@ class _Raster:
                 self._depth[window][front] = depth[front]
 
     def _pixels(self, triangle: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
-        """Yields the pixels around a triangle and its depth there, -inf beside it; nothing when it is seen edge-on."""
+        """Yields the pixels around a triangle and its depth there, -inf outside it; nothing if it is seen edge-on."""
         points = (triangle @ self._axes.T - self._low) * self._scale
         (x0, y0), (x1, y1) = np.floor(points[:, :2].min(0)).astype(int), np.ceil(points[:, :2].max(0)).astype(int)
         a, b, c = points
@@ -203,7 +203,7 @@ class _Raster:
         yield slice(y0, y1 + 1), slice(x0, x1 + 1), np.where(inside, a[2] + u * (b[2] - a[2]) + v * (c[2] - a[2]), -np.inf)
 
     def mark(self, point: np.ndarray, color: np.ndarray) -> None:
-        """Draws a disc with a white rim, drawn over everything."""
+        """Draws a disc with a white rim on top of everything."""
         x, y, _ = (self._axes @ point - self._low) * self._scale
         rows, columns = np.indices(self._depth.shape)
         away = np.hypot(columns - x, rows - y)
@@ -211,7 +211,7 @@ class _Raster:
         self._color[away < 15] = color
 
     def finish(self) -> Float[np.ndarray, "height width 3"]:
-        """Returns the picture with an edge drawn wherever two planes meet, at half the size."""
+        """Returns the image at half the size, with an edge wherever two planes meet."""
         edge = np.zeros(self._depth.shape, bool)
         edge[1:] |= (np.abs(np.diff(self._plane, axis=1)) > 1e-6).any((0, -1))
         edge[:, 1:] |= (np.abs(np.diff(self._plane, axis=2)) > 1e-6).any((0, -1))

@@ -1,10 +1,11 @@
-"""Sionna RT's own path solver and materials, unmodified: a truth that shares no search and no diffraction with this project's.
+"""Sionna RT's own path solver and materials, unmodified: a ground truth that shares neither the path search nor the diffraction
+with this project.
 
-What is left of this project in such a truth is the scene, the carrier phase and the order of the sum (`solve.py`). What a
-reflection or a slab does is the simulator's in both.
+Such a ground truth has in common with this project only the scene, the carrier phase and the order of summation (`solve.py`).
+Reflection and slab coefficients are the simulator's in both.
 
-The solver searches anew at every frequency, for its rays are reflected or transmitted by their power there. It must be looked
-after in one thing: a full path buffer drops candidates silently, so they are counted.
+The solver searches again at every frequency, because its rays are reflected or transmitted according to the power there. A full
+path buffer silently drops candidates, so these are counted.
 
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
@@ -24,7 +25,7 @@ from wbgs_jax.interchange.room_materials import own_law
 
 
 def public_material(name: str, part: Part, settings: SolverSettings) -> rt.RadioMaterial:
-    """Returns the simulator's material of a part: one of ITU-R P.2040, or a slab by the law of a user's own."""
+    """Returns the simulator's material of a part: one of ITU-R P.2040, or a slab with the law of a custom material."""
     slab: dict[str, Any] = {"thickness": part.thickness, "scattering_coefficient": settings.scattering[part.closed]}
     if own_law(part.material) is None:
         return rt.ITURadioMaterial(name, part.material, **slab)
@@ -32,20 +33,20 @@ def public_material(name: str, part: Part, settings: SolverSettings) -> rt.Radio
 
 
 class PublicTracer:
-    """`sionna.rt.PathSolver` in the place of a `PathTracer`."""
+    """`sionna.rt.PathSolver` with the interface of `PathTracer`."""
 
     def __init__(self, scene: rt.Scene, settings: SolverSettings) -> None:
         self._scene, self._settings = scene, settings
         self._solver = rt.PathSolver(deterministic=True)
         if not hasattr(self._solver, "_candidate_generator"):
-            raise UserError("this sionna-rt has another path solver; install a version that pyproject.toml allows")
+            raise UserError("this sionna-rt has a different path solver; install a version that pyproject.toml allows")
         self._solver._candidate_generator = _Watched(self._solver._candidate_generator, settings)
 
     def trace(self) -> None:
-        """Does nothing: the solver traces anew at every frequency."""
+        """Does nothing: the solver traces again at every frequency."""
 
     def fields(self, _: None) -> rt.Paths:
-        """Returns the paths that the solver finds at the scene's present frequency.
+        """Returns the paths that the solver finds at the scene's current frequency.
 
         Raises:
             UserError: a transmitter has more candidate paths than the buffer holds.
@@ -58,7 +59,7 @@ class PublicTracer:
 
 
 class _Watched:
-    """The solver's own candidate generator, whose candidates are counted on their way."""
+    """Wraps the solver's candidate generator and counts its candidates."""
 
     def __init__(self, generator: Any, settings: SolverSettings) -> None:
         self._generator, self._settings = generator, settings

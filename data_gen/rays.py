@@ -1,9 +1,9 @@
-"""Which way the rays start that search for paths: evenly over the sphere, and straight at what diffracts.
+"""Initial directions of the rays that search for paths: uniform over the sphere, and aimed at diffracting objects.
 
 A ray finds a diffracted path only if it hits a face beside the edge, and most edges belong to small faces: chair legs, boards,
-door frames. Evenly spread rays rarely do, all the more behind a wall. So some are aimed at points on every face of every
-solid, and some at the mirror images of these points in the walls, floor and ceiling: those arrive after one reflection. Where a
-ray starts decides only which paths are found, not what they carry.
+door frames. Uniform rays rarely do so, in particular behind a wall. Some rays are therefore aimed at points on every face of
+every solid, and some at the mirror images of these points in the walls, floor and ceiling, which they reach after one
+reflection. The initial directions determine only which paths are found, not their amplitudes.
 
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
@@ -20,13 +20,14 @@ from data_gen.scenes.base import SceneSpec
 from data_gen.settings import SolverSettings
 
 MAX_MIRRORS = 24
-"""Only the largest planes are mirrors ..."""
+"""Maximum number of mirrors, the largest planes ..."""
 MAX_AIMED = 1_000_000
-"""... and of more aimed rays than these a part is drawn: a user's mesh may have any number of faces."""
+"""... and maximum number of aimed rays, of which a random part is used beyond it: a user's mesh may have any number of
+faces."""
 
 
 class RayLauncher:
-    """The starting rays of a scene, the same number from every transmitter."""
+    """The initial rays of a scene, the same number from every transmitter."""
 
     def __init__(self, spec: SceneSpec, settings: SolverSettings) -> None:
         rng = np.random.default_rng(settings.seed)
@@ -45,7 +46,7 @@ class RayLauncher:
 
     @property
     def count(self) -> int:
-        """Rays from every transmitter."""
+        """Number of rays from every transmitter."""
         return self._evenly + len(self._points)
 
     def aimed(self, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 3"]:
@@ -61,7 +62,7 @@ class RayLauncher:
     def spawn(self, lattice: Callable[[int], Any], samples_per_src: int, src_positions: Any) -> Any:
         """Returns, in place of `sionna.rt.utils.spawn_ray_from_sources`, the rays of one transmitter after another."""
         if samples_per_src != self.count:
-            raise RuntimeError(f"asked for {samples_per_src} rays a transmitter instead of {self.count}")
+            raise RuntimeError(f"{samples_per_src} rays per transmitter requested instead of {self.count}")
         evenly = np.array(mi.warp.square_to_uniform_sphere(lattice(self._evenly))).T
         origins = np.array(src_positions).T
         directions = np.concatenate([part for origin in origins for part in (evenly, self.aimed(origin))])
@@ -79,7 +80,7 @@ def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.nd
         normals, size = np.asarray(part.mesh.face_normals), np.asarray(part.mesh.area_faces)
         offsets = (normals * np.asarray(part.mesh.triangles)[:, 0]).sum(-1)
         largest = np.take_along_axis(normals, np.abs(normals).argmax(1)[:, None], 1)
-        rows = np.concatenate([normals, offsets[:, None]], 1) * np.sign(largest)  # one plane, whichever way it is wound
+        rows = np.concatenate([normals, offsets[:, None]], 1) * np.sign(largest)  # the same plane for both orientations
         for row, value in zip(np.round(rows, 6) + 0.0, size, strict=True):  # + 0.0: no negative zeros
             area[tuple(row)] = area.get(tuple(row), 0.0) + float(value)
     found = sorted(area, key=lambda plane: (-area[plane], plane))[:MAX_MIRRORS]
@@ -88,7 +89,7 @@ def _planes(spec: SceneSpec) -> tuple[Float[np.ndarray, "planes 3"], Float[np.nd
 
 
 def _points_on(faces: Float[np.ndarray, "faces 3 3"], count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Returns `count` points on every triangle, evenly distributed."""
+    """Returns `count` points on every triangle, uniformly distributed."""
     u = rng.random((count, len(faces), 2))
     outside = u.sum(-1) > 1
     u[outside] = 1 - u[outside]

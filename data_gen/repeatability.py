@@ -1,6 +1,6 @@
-"""How well the tracer repeats itself: spectra of the released number of rays against those of three times as many.
+"""Repeatability of the tracer: spectra with the released number of rays compared with those of three times as many.
 
-No model's score can be told from the truth beyond it. Written beside the released scenes, where evaluations and tables find it.
+Scores of models above it are not meaningful. The result is written beside the released scenes, for evaluations and tables.
 
 python -m data_gen.repeatability --scenes 1 2
 """
@@ -32,20 +32,20 @@ TX_SEED = 1
 
 @dataclass(frozen=True)
 class Options:
-    """Trace some transmitters of scenes twice, with the usual and with more rays, and compare their spectra."""
+    """Trace some transmitters of scenes twice, with the usual number of rays and with more, and compare their spectra."""
 
     scenes: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     """Numbers of scenes."""
     tx: int = 40
-    """Number of transmitters, drawn at random by a fixed seed."""
+    """Number of transmitters, drawn at random with a fixed seed."""
     effort: float = 3.0
-    """All numbers of rays times this, the second time."""
+    """Factor on all numbers of rays in the second run."""
     out: Path = RELEASED / FILE
-    """What is written, scene by scene; other scenes in it stay."""
+    """File to update; other scenes in it are kept."""
 
 
 def repeatability(spec: "SceneSpec", tx_count: int, effort: float) -> dict[str, Any]:
-    """Returns the median and the 10th percentile of the SSIM of a scene's spectra at its frequencies (GHz)."""
+    """Returns the median and the 10th percentile of the SSIM of a scene's spectra by frequency (GHz)."""
     from data_gen.solve import Simulator
 
     tx = some_tx(spec, tx_count, TX_SEED)
@@ -71,8 +71,8 @@ def main() -> None:
     ensure_backend()
     for number in options.scenes:
         spec = get_scene(number)
-        known = read_json(options.out) if options.out.exists() else {}
-        write_json(options.out, known | {f"scene{number}": repeatability(spec, options.tx, options.effort)})
+        recorded = read_json(options.out) if options.out.exists() else {}
+        write_json(options.out, recorded | {f"scene{number}": repeatability(spec, options.tx, options.effort)})
         print(f"scene {number}: {options.out}")
 
 

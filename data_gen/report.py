@@ -35,7 +35,7 @@ class Options:
 
 
 def report(files: tuple[Path, ...]) -> str:
-    """Returns all tables: one row a file, then for every file one row a frequency."""
+    """Returns all tables: one row per file, then for every file one row per frequency."""
     scenes = {file: load_scene(file) for file in files}
     parts = [
         "### Files",

@@ -1,4 +1,4 @@
-"""Draws sample spectra of a scene file: some transmitters, near and far, at some frequencies.
+"""Draws sample spectra of a scene file: several transmitters, near and far, at several frequencies.
 
 python -m data_gen.samples wbgs_jax/data/released/scene2.npz --out docs/images/scene2_samples.png
 """
@@ -38,14 +38,14 @@ class Options:
     out: Path
     """Picture to write (.png)."""
     receiver: int = 0
-    """Which of the scene's receivers."""
+    """Index of the receiver."""
 
 
 def draw(scene: SceneFile, out: Path, receiver: int = 0) -> None:
-    """Writes the picture: one row a transmitter, one column a frequency; a cross is the transmitter's own direction.
+    """Writes a figure with one row per transmitter and one column per frequency; a cross marks the transmitter's direction.
 
     Raises:
-        UserError: there is no such receiver, or the scene holds no spectra.
+        UserError: there is no such receiver, or the scene has no spectra.
     """
     dataset = scene_dataset(scene)
     if not dataset.has_spectra:

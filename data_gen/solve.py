@@ -1,11 +1,11 @@
-"""Traces a scene with Sionna RT and turns paths into snapshots that are bit-identical between runs.
+"""Traces a scene with Sionna RT and converts paths to snapshots that are bit-identical between runs.
 
-What the simulator leaves to its user, and this module does:
-* Rays are traced once for all frequencies: where paths run does not depend on the frequency, only what they carry does.
+This module takes care of what the simulator leaves to its user:
+* Rays are traced once for all frequencies: the geometry of paths does not depend on the frequency, only their amplitudes do.
 * `scene.frequency` stays at 3.5 GHz unless set: it is set and read back.
-* `paths.a` carries no exp(-j 2 pi f tau): the carrier phase is applied here, with f * tau in float64.
-* Equal solves return equal paths in another order: paths are sorted before they are summed in complex128.
-* A full path buffer drops candidates silently: candidates are counted for every transmitter and a full buffer is an error.
+* `paths.a` does not contain exp(-j 2 pi f tau): the carrier phase is applied here, with f * tau in float64.
+* Equal solves return equal paths in different orders: paths are sorted before they are summed in complex128.
+* A full path buffer silently drops candidates: they are counted for every transmitter, and a full buffer is an error.
 
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
@@ -30,10 +30,10 @@ from data_gen.trace import BalancedMaterial, DiffuseTracer, PathTracer
 from wbgs_jax.interchange.room_materials import check_frequency
 
 FAINT = 1e-15
-"""Amplitude (-300 dB) below which a path is left out. Whether the simulator keeps a path whose power is a denormal number is
-chance, because some of its threads round those to zero: a sum with it may differ in its last bit, and so would the checksum."""
+"""Amplitude (-300 dB) below which a path is dropped. The simulator keeps a path of subnormal power at random, because some of
+its threads flush such numbers to zero: a sum with it could differ in its last bit, and so would the checksum."""
 FREQUENCY_TOLERANCE = 1e-6
-"""Sionna holds the frequency in float32; more than this relative difference is a mistake."""
+"""Largest relative difference of the frequency read back; Sionna stores it in float32."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class TxPaths:
     """The paths of one transmitter at one frequency, in a reproducible order (by delay, then magnitude)."""
 
     coefficients: Complex[np.ndarray, "paths elements"]
-    """complex128, carrier phase included, one column a receiver element."""
+    """complex128, including the carrier phase, one column per receiver element."""
     delays: Float[np.ndarray, " paths"]
     """Seconds."""
     order: Int[np.ndarray, " paths"]
@@ -67,22 +67,22 @@ class Simulator:
         self.settings = settings
         self.array = array or ArraySettings()
         self.read_back_hz: dict[float, float] = {}
-        """What the simulator reported (hertz, float32 inside) for every frequency that was asked."""
+        """Frequencies (hertz) reported by the simulator, float32 internally, by requested frequency."""
         self._scene = _load(spec, self.array, settings)
         self._tracers = _tracers(self._scene, spec, settings)
 
     @property
     def scene(self) -> rt.Scene:
-        """What the simulator holds."""
+        """The simulator's scene."""
         return self._scene
 
     def paths(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Sequence[float]) -> list[list[TxPaths]]:
         """Returns all paths from every transmitter (world frame, metres) to the receiver: by frequency, then by transmitter.
 
-        Random numbers belong to the place in the batch: the same batch gives the same bits, another grouping almost the same.
+        Random numbers depend on the position in the batch: the same batch gives the same bits, other batches almost the same.
 
         Raises:
-            UserError: a frequency at which the materials are not defined, or a full path buffer.
+            UserError: materials are not defined at a frequency, or the path buffer is full.
         """
         for name in list(self._scene.transmitters):
             self._scene.remove(name)
@@ -99,19 +99,18 @@ class Simulator:
         return result
 
     def _set_frequency(self, frequency_hz: float) -> None:
-        # Opaque to the compiler: a literal would compile every kernel anew for every frequency.
+        # Opaque to the compiler: a literal would recompile every kernel for every frequency.
         self._scene.frequency = dr.opaque(mi.Float, check_frequency(frequency_hz))
         read_back = float(np.array(self._scene.frequency).item())
         if abs(read_back / frequency_hz - 1) > FREQUENCY_TOLERANCE:
-            raise RuntimeError(f"asked Sionna RT for {frequency_hz} Hz, it reports {read_back} Hz")
-        elements = self.array.element_wavelengths(frequency_hz)  # what Sionna's "normalized" means
+            raise RuntimeError(f"requested {frequency_hz} Hz from Sionna RT, which reports {read_back} Hz")
+        elements = self.array.element_wavelengths(frequency_hz)  # Sionna's "normalized" positions
         self._scene.rx_array.normalized_positions = mi.Point3f(np.asarray(elements, np.float32).T)
         self.read_back_hz[frequency_hz] = read_back
 
 
 def _tracers(scene: rt.Scene, spec: SceneSpec, settings: SolverSettings) -> tuple[Any, ...]:
-    """Returns what finds the paths: each has `trace() -> geometry` and `fields(geometry) -> rt.Paths`, or None if there are
-    none."""
+    """Returns the path finders: each has `trace() -> geometry` and `fields(geometry) -> rt.Paths`, or None without paths."""
     if settings.solver == "simulator":
         return (PublicTracer(scene, settings),)
     tracer = PathTracer(scene, RayLauncher(spec, settings), settings)
@@ -123,7 +122,7 @@ def _load(spec: SceneSpec, array: ArraySettings, settings: SolverSettings) -> rt
     material_of = public_material if settings.solver == "simulator" else BalancedMaterial
     objects = []
     with tempfile.TemporaryDirectory() as folder:
-        for i, part in enumerate(spec.parts):  # numbered: a user's object may have a name that no file can have
+        for i, part in enumerate(spec.parts):  # numbered, because a user's object may have an invalid file name
             file = Path(folder) / f"{i}.ply"
             part.mesh.export(file)
             material = material_of(f"material-{i}", part, settings)
@@ -143,7 +142,7 @@ def _load(spec: SceneSpec, array: ArraySettings, settings: SolverSettings) -> rt
 def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
     """Returns Sionna's orientation (radians; R = Rz Ry Rx) of a unit quaternion (wxyz, local to world)."""
     w, x, y, z = quaternion
-    if np.hypot(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) < 1e-6:  # straight up or down: yaw and roll are one
+    if np.hypot(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) < 1e-6:  # gimbal lock: yaw and roll coincide
         return [float(2 * np.arctan2(z, w)), float(np.copysign(np.pi / 2, w * y - z * x)), 0.0]
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -178,8 +177,8 @@ def _no_paths(elements: int, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np
 def _sorted_paths(
     coefficients: Complex[np.ndarray, "paths elements"], delays: Float[np.ndarray, " paths"], order: Int[np.ndarray, " paths"]
 ) -> TxPaths:
-    # Two elements break the ties of mirrored paths, which arrive at the same time and equally strong.
+    # Two elements resolve the ties of mirrored paths, which have equal delays and magnitudes.
     first, last = coefficients[:, 0], coefficients[:, -1]
-    keys = (last.imag, last.real, first.imag, first.real, np.abs(first), delays)  # lexsort: the last key counts most
+    keys = (last.imag, last.real, first.imag, first.real, np.abs(first), delays)  # lexsort: the last key is the primary one
     rank = np.lexsort(keys)
     return TxPaths(coefficients[rank], delays[rank], order[rank])

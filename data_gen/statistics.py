@@ -1,4 +1,4 @@
-"""What a scene file's meta says about its content: how hard the scene is, and what its channels look like."""
+"""Statistics of a scene in the meta of its file: its difficulty, and properties of its channels."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from wbgs_jax.evaluation.baselines import baselines
 from wbgs_jax.metrics import ssim
 
 DIGITS = 4
-"""Decimals kept: far below the spread over transmitters, far above rounding noise."""
+"""Number of decimals: the last one is far below the spread over transmitters and far above rounding noise."""
 
 
 def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
-    """Returns the median SSIM by frequency: the ceilings, over the transmitters they were measured on, and the baselines
-    (`wbgs_jax.evaluation.baselines`), over all test transmitters."""
+    """Returns the median SSIM by frequency: of the ceilings, over the transmitters for which they were measured, and of the
+    baselines (`wbgs_jax.evaluation.baselines`), over all test transmitters."""
     baseline_scores = _baselines(scene)
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
@@ -26,8 +26,8 @@ def ceiling_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
 
 
 def channel_table(scene: SceneFile, found: Results) -> list[dict[str, float]]:
-    """Returns by frequency: number of paths and r.m.s. delay spread (median), share of transmitters in sight, and the path gain
-    to an element (5th, 50th and 95th percentile over transmitters, dB), all of the first receiver."""
+    """Returns, by frequency, the number of paths and the r.m.s. delay spread (medians), the fraction of transmitters with line
+    of sight, and the path gain to an element (5th, 50th and 95th percentile over transmitters, dB), for the first receiver."""
     gain_db = 10 * np.log10(np.mean(np.abs(scene.observations["snapshots"][:, 0].astype(np.complex128)) ** 2, -1))
     rows = []
     for i, frequency in enumerate(scene.frequencies_hz):
@@ -46,7 +46,7 @@ def _measured(found: Results) -> bool:
 
 
 def _baselines(scene: SceneFile) -> dict[str, list[np.ndarray]]:
-    """Returns the SSIM of every baseline on the test spectra, an array a frequency; none where there is nothing to compare."""
+    """Returns the SSIM of every baseline on the test spectra, one array per frequency; empty if there is nothing to compare."""
     if not 0 < (scene.split == TEST).sum() < len(scene.split):
         return {}
     dataset = scene_dataset(scene)

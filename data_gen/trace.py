@@ -1,9 +1,9 @@
-"""Sionna RT's path solver in two halves: rays traced once, fields at every frequency.
+"""Sionna RT's path solver in two stages: rays are traced once, fields are computed at every frequency.
 
-`sionna.rt.PathSolver` does both in one call, a call for every frequency. Where paths run does not depend on the frequency, and
-tracing is nearly all of the cost. The halves below are its own three stages (candidates, image method, fields), called in its
-own order; a test compares the result with the solver's, bit for bit. They are not public: `pyproject.toml` limits the versions.
-Only diffraction differs, where the solver is wrong (`utd.py`).
+`sionna.rt.PathSolver` does both in one call per frequency. The geometry of paths does not depend on the frequency, and tracing
+is nearly all of the cost. The stages below call the solver's own three steps (candidates, image method, fields) in the same
+order; a test compares the result with the solver's, bit for bit. These steps are not public, so `pyproject.toml` limits the
+versions. Only diffraction differs, where the solver is wrong (`utd.py`).
 
 Import this module only after `data_gen.llvm.ensure_backend()`.
 """
@@ -31,7 +31,7 @@ from wbgs_jax.interchange.room_materials import own_law
 
 
 def electrical_constants(material: str) -> Callable[[Any], tuple[Any, Any]]:
-    """Returns the law by which relative permittivity and conductivity (S/m) of a material follow the frequency (hertz)."""
+    """Returns relative permittivity and conductivity (S/m) of a material as a function of the frequency (hertz)."""
     law = own_law(material)
 
     def constants(frequency_hz: Any) -> tuple[Any, Any]:
@@ -44,16 +44,16 @@ def electrical_constants(material: str) -> Callable[[Any], tuple[Any, Any]]:
 
 
 class BalancedMaterial(rt.RadioMaterial):
-    """A slab of a material of ITU-R P.2040, or of the user's own, that reflects and transmits equally often in the search.
+    """A slab of a material of ITU-R P.2040, or of a custom one, that reflects and transmits equally often in the path search.
 
-    Sionna draws reflection or transmission by their power. At 1 GHz walls transmit nearly everything, rays leave the room and
-    most reflected paths are never found, while at 94 GHz nothing passes through concrete. With equal chances the paths that
-    are found do not depend on the frequency. What a path carries is computed from the exact coefficients, not from chances;
-    diffuse paths alone, of which each stands for many, are divided by their chance.
+    Sionna draws reflection or transmission according to power. At 1 GHz walls transmit nearly everything, rays leave the room
+    and most reflected paths are never found, while at 94 GHz nothing passes through concrete. With equal probabilities the
+    paths found do not depend on the frequency. The amplitude of a path is computed from the exact coefficients, not from the
+    probabilities; only diffuse paths, each of which represents many, are divided by their probability.
     """
 
     encloses: bool = False
-    """Part of the room's outer surface: rays are only reflected, for what leaves the room does not come back."""
+    """Part of the room's outer surface: rays are only reflected, since rays that leave the room do not return."""
 
     def __init__(self, name: str, part: Part, settings: SolverSettings) -> None:
         super().__init__(
@@ -71,7 +71,7 @@ class BalancedMaterial(rt.RadioMaterial):
         def chance(possible: Any) -> Any:
             return dr.select(possible, mi.Float(1), mi.Float(0))
 
-        # Metal lets nothing through: no ray is wasted on it.
+        # Metal transmits nothing, so no ray is wasted on transmission.
         through = dr.squared_norm(mi.Vector2f(dr.abs(t_te), dr.abs(t_tm)))
         reflect = chance(enabled_interactions & rt.InteractionType.SPECULAR > 0)
         scatter = chance((enabled_interactions & rt.InteractionType.DIFFUSE > 0) & (self.scattering_coefficient > 0))
@@ -89,7 +89,7 @@ class BalancedMaterial(rt.RadioMaterial):
 
 @contextmanager
 def _launching(rays: RayLauncher) -> Iterator[None]:
-    """Lets the candidate generator start with these rays: it has no argument for them."""
+    """Makes the candidate generator start with these rays, for which it has no argument."""
     original = sb_deterministic.spawn_ray_from_sources
     sb_deterministic.spawn_ray_from_sources = rays.spawn
     try:
@@ -99,9 +99,9 @@ def _launching(rays: RayLauncher) -> Iterator[None]:
 
 
 class PathTracer:
-    """Traces the paths between the transmitters and the receiver that a scene holds, and gives the fields they carry.
+    """Traces the paths between a scene's transmitters and its receiver, and computes their fields.
 
-    All but diffuse ones, which `DiffuseTracer` finds.
+    Diffuse paths are found by `DiffuseTracer` instead.
     """
 
     _diffuse = False
@@ -110,14 +110,14 @@ class PathTracer:
         solver = rt.PathSolver(deterministic=True)
         stages = ("_candidate_generator", "_image_method", "_field_calculator")
         if not all(hasattr(solver, stage) for stage in stages):
-            raise UserError("this sionna-rt has another path solver; install a version that pyproject.toml allows")
+            raise UserError("this sionna-rt has a different path solver; install a version that pyproject.toml allows")
         self._candidates, self._image_method, self._fields = (getattr(solver, stage) for stage in stages)
         self._candidates.DIFFRACTION_SAMPLING_PROBABILITY = settings.diffraction_probability
         self._scene, self._rays, self._settings = scene, rays, settings
 
     def trace(self) -> PathsBuffer | None:
-        """Returns the geometry of all paths, for `fields`; None where there is none, as in a closed yard, which
-        Sionna RT stumbles over. The transmitters must stay where they are between the two.
+        """Returns the geometry of all paths, for `fields`; None if there are none, as in a closed yard, for which Sionna RT
+        fails. The transmitters must not be moved before `fields`.
 
         Raises:
             UserError: a transmitter has more candidate paths than the buffer holds.
@@ -150,13 +150,13 @@ class PathTracer:
         return paths
 
     def fields(self, traced: PathsBuffer | None) -> rt.Paths | None:
-        """Returns the traced paths with the coefficients they have at the scene's present frequency."""
+        """Returns the traced paths with their coefficients at the scene's current frequency."""
         if traced is None:
             return None
         scene = self._scene
-        # Not those of `trace`: the distances between antenna elements follow the wavelength.
+        # Not the same as in `trace`: the distances between antenna elements scale with the wavelength.
         sources, targets = self._ends()
-        paths = traced.gather(dr.arange(mi.UInt, traced.buffer_size))  # a copy: the next stage writes into it
+        paths = traced.gather(dr.arange(mi.UInt, traced.buffer_size))  # a copy, because the next stage modifies it
         paths = self._fields(
             wavelength=scene.wavelength, paths=paths, samples_per_src=self._rays.count,
             diffraction=self._settings.diffraction, src_positions=sources[0], tgt_positions=targets[0],
@@ -173,10 +173,10 @@ class PathTracer:
 
 
 class DiffuseTracer(PathTracer):
-    """Traces the paths with a diffuse reflection, and no others.
+    """Traces only paths with a diffuse reflection.
 
-    A diffuse path stands for the part of a surface that its ray meets, so rays must be even over the sphere: those aimed at
-    edges would count furniture many times. Sionna allows no path with both a diffuse reflection and a diffraction.
+    A diffuse path represents the part of a surface around its ray, so rays must be uniform over the sphere: rays aimed at edges
+    would count furniture many times. Sionna supports no path with both a diffuse reflection and a diffraction.
     """
 
     _diffuse = True
@@ -187,7 +187,7 @@ class DiffuseTracer(PathTracer):
 
 
 def check_room(source_indices: Int[np.ndarray, " candidates"], settings: SolverSettings) -> None:
-    """Raises a `UserError` when a transmitter has filled its part of the buffer, for what came later was dropped."""
+    """Raises a `UserError` if a transmitter has filled its part of the buffer, since further candidates were dropped."""
     limit = settings.max_paths_per_src
     full = np.flatnonzero(np.bincount(source_indices) >= limit)
     if len(full):

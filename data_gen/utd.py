@@ -1,9 +1,9 @@
-"""Diffraction at a wedge: the uniform theory of diffraction, in place of Sionna RT's.
+"""Diffraction at a wedge by the uniform theory of diffraction, which replaces Sionna RT's implementation.
 
 Sionna RT 2.2.0 adds the terms of the reflected rays with the wrong sign (`RadioMaterial._diffraction_matrix`): the total field
 jumps at a reflection boundary by twice the reflected ray, and swapping transmitter and receiver changes the result. In a
-furnished room its snapshots are further from the right ones than those without any diffraction. Compared with the textbook, and
-checked for continuity and reciprocity, in `tests/data_gen/test_physics.py`.
+furnished room its snapshots are further from the correct ones than those without any diffraction. This version is compared with
+the textbook, and checked for continuity and reciprocity, in `tests/data_gen/test_physics.py`.
 
     D = -(D1 + D2) I + R_0 D4 + R_n D3
 
@@ -76,10 +76,10 @@ def diffraction_matrix(thickness: Any, to_world: Any, ki: Any, ko: Any, si: Any,
 
 
 def end_unused_vertices(paths: PathsBuffer, receivers: Any) -> None:
-    """Puts the vertices beyond a path's last interaction at its receiver, in place.
+    """Moves the unused vertices after a path's last interaction to its receiver, in place.
 
-    Sionna RT 2.2.0 takes the path length after the edge (`FieldCalculator._diffraction_compute_s_s_prime`) through the first
-    vertex that is not used, wherever that is; with the vertex at the receiver the length is right.
+    Sionna RT 2.2.0 computes the path length after the edge (`FieldCalculator._diffraction_compute_s_s_prime`) to the first
+    unused vertex, wherever that is; with the vertex at the receiver the length is correct.
     """
     goal = dr.gather(mi.Point3f, receivers, paths.target_indices)
     for depth in range(1, paths.max_depth + 1):

@@ -190,17 +190,17 @@ def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.npy", b"\0" * 20_000_000)
     assert (tmp_path / "bomb.npz").stat().st_size < 100_000
-    with pytest.raises(UserError, match=r"unfolds to .* GiB"):
+    with pytest.raises(UserError, match=r"expands to .* GiB"):
         load_dataset(tmp_path / "bomb.npz")
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"tx_positions": 1e39}, "tx_positions holds 1e.39; positions are in metres"),
-        ({"vertices": 1e6}, "vertices holds 1e.06"),
-        ({"frequencies_hz": 28.0}, "frequencies_hz holds 28; they are in hertz"),
-        ({"frequencies_hz": 1e15}, "frequencies_hz holds 1e.15"),
+        ({"tx_positions": 1e39}, "tx_positions contains 1e.39; positions are in metres"),
+        ({"vertices": 1e6}, "vertices contains 1e.06"),
+        ({"frequencies_hz": 28.0}, "frequencies_hz contains 28; values are in hertz"),
+        ({"frequencies_hz": 1e15}, "frequencies_hz contains 1e.15"),
         ({"face_part": -1}, "face_part must not be negative"),
         ({"rx_orientation": 1e300}, "unit quaternions"),
     ],
@@ -224,7 +224,7 @@ def test_what_is_no_part_is_refused(part, tmp_path):
 def test_answers_far_away_are_refused(tmp_path):
     run = make_coherent_run(tmp_path / "box")
     asked = ["--run", run, "--ghz", "10", "--out", tmp_path / "x.npz"]
-    assert_error_for_people(call(predict.main, *asked, "--tx", "1e9,0,0"), "--tx 1e9,0,0 is no position")
+    assert_error_for_people(call(predict.main, *asked, "--tx", "1e9,0,0"), "--tx 1e9,0,0 is not a position")
     assert_error_for_people(call(predict.main, *asked, "--tx", "1,0,1", "--rx", "1e39,0,0"), "--rx 1e39,0,0 is no receiver")
     assert not (tmp_path / "x.npz").exists()
 

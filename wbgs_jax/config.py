@@ -1,8 +1,8 @@
-"""Settings of a training that every field shares; what belongs to one field stands in its own file under `fields/`.
+"""Training settings shared by all fields; the settings of a single field are in its own file under `fields/`.
 
-A run's settings are those of its field, of the optimiser, of the host loop, and of the hooks that the field asks for. All
-can be overridden on the command line (`wbgs-jax train --help`); a run writes its own to `config.json`. The paper's own
-values are the wideband field's preset `paper`; docs/history.md says what was measured.
+The settings of a run are those of its field, of the optimiser, of the host loop, and of the hooks that the field requests. All
+of them can be overridden on the command line (`wbgs-jax train --help`), and a run writes them to `config.json`. The paper's
+values are the wideband field's preset `paper`; docs/history.md lists measurements.
 """
 
 import dataclasses
@@ -13,36 +13,36 @@ from typing import Any
 from wbgs_jax._util.errors import UserError
 
 FEWEST_STEPS, STEPS_A_SPECTRUM = 600, 8
-"""What `OptimConfig.min_steps` comes down to where spectra are few."""
+"""Lower bounds on `OptimConfig.min_steps` when spectra are few: in total, and per spectrum."""
 
 
 def setting(default: Any, before: Any) -> Any:
-    """Returns a setting of a dataclass that files from before it was one do not have: what it was then."""
+    """Returns a dataclass setting with its value in files written before the setting existed."""
     return dataclasses.field(default=default, metadata={"before": before})
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Steps, batches and schedules; after a warm-up every learning rate decays by a cosine to `final_fraction` of itself."""
+    """Steps, batches and schedules. After a warm-up every learning rate decays by a cosine to `final_fraction` of itself."""
 
     steps: int = 6000
-    """Upper bound; see `max_epochs`."""
+    """Maximum number of steps; see also `max_epochs`."""
     max_epochs: float = 16.0
-    """Small data sets are not seen more often than this (they would be learned by heart) ..."""
+    """Maximum number of passes over the training data, which limits the steps on small data sets (against overfitting) ..."""
     min_steps: int = 1000
-    """... but get at least this many steps."""
+    """... but at least this many steps are taken."""
     batch: int = 8
-    """Links a step."""
+    """Links per step."""
     warmup: float = 0.0
-    """Share of the steps over which every learning rate rises to its full value."""
+    """Fraction of the steps over which every learning rate rises to its full value."""
     final_fraction: float = 0.01
-    """What is left of every learning rate at the end."""
+    """Fraction of every learning rate that remains at the end."""
     curriculum: float = 0.0
-    """Share of the steps over which the highest frequency of the batches rises from the lowest to the highest of the data. At
-    low frequencies the phase behind a slab is no riddle."""
+    """Fraction of the steps over which the highest frequency of the batches rises from the lowest to the highest of the data.
+    At low frequencies the phase of a transmitted wave is unambiguous."""
     virtual: float = setting(0.5, before=0.0)
-    """Share of every batch that are links of transmitters nobody measured, with kriged spectra, where spectra are few and the
-    field knows no paths (training/batches.py)."""
+    """Fraction of every batch that consists of virtual links, from unmeasured transmitters with kriged spectra; used if spectra
+    are few and the field predicts no paths (training/batches.py)."""
 
 
 @dataclass(frozen=True)
@@ -50,131 +50,131 @@ class DensityConfig:
     """Adaptive density control (paper, section 4.5; thresholds of the authors' code)."""
 
     every: int = 500
-    """Steps between two controls; 0 switches it off."""
+    """Steps between two density controls; 0 disables them."""
     start: int = 500
-    """The first step at which there may be one."""
+    """First step at which density control may happen."""
     stop_fraction: float = 0.5
-    """No control after this fraction of the steps."""
+    """Fraction of the steps after which there is no density control."""
     gradient_threshold: float = 8e-4
     """Clone or split above this mean norm of the positional gradient in normalised image coordinates, -1..1 (authors: 2e-4)."""
     split_scale: float = 0.3
     """Metres: Gaussians larger than this are split, smaller ones cloned."""
     prune_attenuation: float = 0.005
-    """Gaussians whose delta_o lies below are removed."""
+    """Gaussians with delta_o below this are removed."""
     reset_every: int = 0
-    """Steps between two resets of delta_o to at most `reset_attenuation` (authors: 3000); 0: never."""
+    """Steps between two resets of delta_o to at most `reset_attenuation` (authors: 3000); 0 for none."""
     reset_attenuation: float = 0.01
-    """What delta_o is lowered to by a reset."""
+    """Upper bound of delta_o after a reset."""
     max_gaussians: int = 3000
-    """The field never grows beyond this number."""
+    """Maximum number of Gaussians."""
 
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Search for known materials and antennas before the first step (training/calibration/pipeline.py)."""
+    """Calibration of materials, antennas and geometry before the first step (training/calibration/pipeline.py)."""
 
     rounds: int = 3
-    """Times all materials are gone through, at most; 0: no search for materials."""
+    """Maximum number of passes over all materials; 0 disables the calibration of materials."""
     spectra: int = 384
-    """Training spectra that are looked at."""
+    """Training spectra used."""
     glance: int = 24
-    """The first of them, by which the materials of the list are narrowed down to a few."""
+    """The first of them, used to narrow down the list of materials."""
     thickness_spectra: int = 160
-    """Training spectra up to a frequency that are looked at for thicknesses which the scene does not say ..."""
+    """Training spectra up to a frequency, used for thicknesses that the scene does not specify ..."""
     thickness_glance: int = 48
-    """... and the first of them, by which slabs are narrowed down to a few."""
+    """... and the first of them, used to narrow down the candidate slabs."""
     sure: float = 2.0
-    """Standard errors by which what has been learned must fit better than every known material to be kept."""
+    """n_sigma: standard errors by which learned properties must fit better than every listed material to be kept."""
     antenna_rounds: int = 2
-    """Times the antennas of both ends are gone through, at most; 0: no search for antennas."""
+    """Maximum number of passes over the antennas of both ends; 0 disables the calibration of antennas."""
     antenna_spectra: int = 96
-    """Training spectra that are looked at for them."""
+    """Training spectra used for antennas."""
     antenna_sure: float = 3.0
-    """Standard errors by which another antenna must fit better than the one that is there."""
+    """n_sigma: standard errors by which another antenna must fit better to replace the current one."""
     absent_spectra: int = 768
-    """Training spectra of low frequencies that are looked at for bodies of the mesh that are not there; 0: all are there ..."""
+    """Training spectra of low frequencies used to find spurious bodies of the mesh; 0 disables this ..."""
     absent_glance: int = 96
-    """... and the first of them, by which bodies are narrowed down to a few."""
+    """... and the first of them, used to narrow down the candidate bodies."""
     ideal_spectra: int = 96
-    """Training spectra that are looked at for what ray tracers leave out."""
+    """Training spectra used for the propagation options, such as effects that ray tracers leave out."""
     tuning_spectra: int = 320
-    """Training spectra that are looked at for how far the elements of arrays are out of tune; 0: they are in tune."""
+    """Training spectra used to calibrate the array gains; 0 disables this."""
     geometry: bool = True
-    """Whether surfaces of a doubtful mesh are moved."""
+    """Whether surfaces of an inaccurate mesh are displaced."""
     geometry_snapshots: int = 1500
-    """Snapshots that every step of that looks at ..."""
+    """Snapshots used in every step of this alignment ..."""
     geometry_steps: int = 240
-    """... or, where only spectra are known, steps at every frequency."""
+    """... or, if only spectra are available, steps at every frequency."""
     geometry_doubt: float = 5e-4
-    """Metres: surfaces are moved where spectra are explained best if they may stand further off than this."""
+    """Metres: surfaces are displaced if the spectra are explained best by a larger position_std than this."""
     geometry_tx: int = 640
-    """Transmitters that are looked at for that at first; once surfaces are roughly in place, all of them."""
+    """Transmitters used at first for the alignment; all of them once surfaces are roughly in place."""
     geometry_width: float = 0.02
-    """Metres: how far surfaces may stand from where the mesh has them (standard deviation)."""
+    """Prior standard deviation of the displacement of surfaces, metres."""
     geometry_spectra: int = 64
-    """Training spectra that are looked at to name materials on the way."""
+    """Training spectra used to name materials between alignment steps."""
     placement_spectra: int = 96
-    """Training spectra that are looked at for how far they may still be off."""
+    """Training spectra used to estimate the remaining position_std."""
     clutter_spectra: int = 1024
-    """Training spectra that say whether clutter which the others show is there; 0: no clutter is looked for."""
+    """Training spectra used to decide whether an absorption grid fitted to the others is kept; 0 disables the grid."""
     clutter_steps: int = 800
-    """Steps in which it is fitted to the others."""
+    """Steps of the fit of the absorption grid."""
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """How the host drives training."""
+    """Settings of the host's training loop."""
 
     epoch_steps: int = 50
-    """Steps in one jitted epoch; an interrupt waits for two of them at most."""
+    """Steps of one jitted epoch; an interrupt takes effect after at most two of them."""
     evaluate_every: int = 1000
-    """Steps between two evaluations on `evaluate_spectra` held-out spectra, for the curves only."""
+    """Steps between two evaluations on `evaluate_spectra` held-out spectra, used only for the curves."""
     evaluate_spectra: int = 60
-    """How many spectra are looked at for the curves: of the validation part; none where there is none."""
+    """Number of validation spectra used for the curves; none if there is no validation part."""
     checkpoint_every: int = 1000
     """Steps between two checkpoints."""
     keep_checkpoints: int = 2
-    """Older checkpoints are removed."""
+    """Number of checkpoints kept; older ones are removed."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that makes a run, but the data and the seed."""
+    """All settings of a run except the data and the seed."""
 
     field: Any = None
-    """Settings of the field, of the type that it declares."""
+    """Settings of the field, of the type declared by the field."""
     optim: OptimConfig = dataclasses.field(default_factory=OptimConfig)
     loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     density: DensityConfig | None = None
-    """Of a field that asks for density control."""
+    """Settings of density control, for fields that use it."""
     search: SearchConfig | None = None
-    """Of a field that asks for a search for materials."""
+    """Settings of the calibration, for fields that use it."""
 
 
 PRESETS: Mapping[str, Settings] = {
-    # Under a minute on two cores: proves that everything works, not that it is good.
+    # Under a minute on two cores: shows that everything runs, not that the result is good.
     "smoke": Settings(
         optim=OptimConfig(steps=200, batch=4),
         loop=LoopConfig(epoch_steps=20, evaluate_every=100, evaluate_spectra=20, checkpoint_every=100),
     ),
-    # The default without a GPU.
+    # Default without a GPU.
     "cpu": Settings(),
-    # For a GPU: larger networks, and a Gaussian for every vertex.
+    # For a GPU: larger networks, and one Gaussian per vertex.
     "gpu": Settings(optim=OptimConfig(steps=20_000, batch=8), loop=LoopConfig(epoch_steps=100, checkpoint_every=2000)),
 }
-"""What the presets of all fields have in common."""
+"""Settings common to the presets of all fields."""
 
 
 def sections(settings: Settings, field_name: str) -> dict[str, Any]:
-    """Returns the parts of settings by the names that command lines and files give them: the field's part has its name. Those
-    of a field that is made of fields have the names of these."""
+    """Returns the sections of settings by their names in command lines and files. The field's section has the name of the
+    field; for a composite field, its components' sections have theirs."""
     values = {f.name: getattr(settings, f.name) for f in dataclasses.fields(settings) if f.name != "field"}
     own = _parts(settings.field) or {field_name: settings.field}
     return own | {name: value for name, value in values.items() if value is not None}
 
 
 def _parts(config: Any) -> dict[str, Any]:
-    """Returns the settings that a field's settings are made of; nothing where they are settings themselves."""
+    """Returns the component settings of a composite field's settings; empty for other fields."""
     if not dataclasses.is_dataclass(config):
         return {}
     values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
@@ -182,7 +182,7 @@ def _parts(config: Any) -> dict[str, Any]:
 
 
 def from_sections(values: Mapping[str, Any], like: Settings, field_name: str) -> Settings:
-    """Returns the settings of named parts, the inverse of `sections`; `like` has the types."""
+    """Returns settings from named sections, the inverse of `sections`; `like` provides the types."""
     parts = _parts(like.field)
     field = dataclasses.replace(like.field, **{name: values[name] for name in parts}) if parts else values[field_name]
     others = {name: value for name, value in values.items() if name not in (parts or {field_name})}
@@ -195,10 +195,10 @@ def to_dict(settings: Settings, field_name: str) -> dict[str, Any]:
 
 
 def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
-    """Returns settings from `to_dict`'s values; `default` has the types of all sections.
+    """Returns settings from the values of `to_dict`; `default` provides the types of all sections.
 
     Raises:
-        UserError: unknown or missing names, because today's default was not set then.
+        UserError: names are unknown or missing, as in settings of another version.
     """
 
     def build(cls: Any, values: Any) -> Any:
@@ -207,23 +207,23 @@ def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
             raise KeyError(f"{cls.__name__}.{min(missing)}")
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
 
-    known = {name: type(section) for name, section in sections(default, field_name).items()}
+    types = {name: type(section) for name, section in sections(default, field_name).items()}
     try:
-        built = {name: build(known[name], value) for name, value in values.items()}
-        return from_sections({name: built[name] for name in known}, default, field_name)
+        built = {name: build(types[name], value) for name, value in values.items()}
+        return from_sections({name: built[name] for name in types}, default, field_name)
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
 
 
 def changed(settings: Settings, changes: Mapping[str, Mapping[str, Any]]) -> Settings:
-    """Returns settings with other values in some sections, such as {"optim": {"steps": 100}, "field": {...}}."""
+    """Returns settings with changed values in some sections, such as {"optim": {"steps": 100}, "field": {...}}."""
     replaced = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in changes.items()}
     return dataclasses.replace(settings, **replaced)
 
 
 def limit_steps(settings: Settings, n_train: int, no_paths: bool = False) -> Settings:
-    """Returns settings whose `optim.steps` are what a data set of `n_train` spectra gets: a multiple of the epoch block. A
-    field that knows no paths learns a few spectra by heart, and gets fewer steps for them."""
+    """Returns settings with `optim.steps` limited for a data set of `n_train` spectra, a multiple of the epoch block. A field
+    that predicts no paths (`no_paths`) overfits to few spectra, and gets fewer steps for them."""
     optim, block = settings.optim, settings.loop.epoch_steps
     fewest = min(optim.min_steps, max(FEWEST_STEPS, STEPS_A_SPECTRUM * n_train)) if no_paths else optim.min_steps
     wanted = max(fewest, optim.max_epochs * n_train / optim.batch)
@@ -232,7 +232,7 @@ def limit_steps(settings: Settings, n_train: int, no_paths: bool = False) -> Set
 
 
 def check(settings: Settings) -> None:
-    """Raises a `UserError` for settings that cannot work, before any work is done. A field checks its own."""
+    """Raises a `UserError` for invalid settings before any work is done. Fields check their own settings."""
     optim, loop = settings.optim, settings.loop
     positive = {
         "optim.steps": optim.steps,
@@ -250,7 +250,7 @@ def check(settings: Settings) -> None:
 
 
 def check_positive(values: Mapping[str, int]) -> None:
-    """Raises a `UserError` that names the first option whose value is less than 1."""
+    """Raises a `UserError` with the name of the first option whose value is less than 1."""
     for name, value in values.items():
         if value < 1:
             raise UserError(f"--{name} is {value}; it must be at least 1")

@@ -1,6 +1,5 @@
-"""How good predicted spectra are, over all of them, by frequency and by sight: SSIM (scikit-image's), PSNR, MAE, beams.
-
-What a link engineer loses by trusting a predicted spectrum: the wrong direction, the wrong beam.
+"""Scores of predicted spectra, in total, by frequency and by visibility: SSIM (scikit-image's), PSNR, MAE, errors of the
+strongest direction, and the power lost by choosing beams from predicted spectra.
 """
 
 from typing import Any
@@ -13,9 +12,9 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.radio.array import codebook, pas_directions
 
 FLAT = 1e-4
-"""Of an array's size: how far the elements of a planar one may stand out."""
+"""Largest distance of the elements of a planar array from its plane, relative to the array's size."""
 FAINTEST_DB = -60.0
-"""A beam that hears less than this, relative to the best one, hears nothing."""
+"""Power relative to the best beam below which a beam counts as receiving nothing."""
 
 
 def angle_error_deg(
@@ -25,7 +24,7 @@ def angle_error_deg(
 ) -> Float[np.ndarray, " n"]:
     """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
 
-    A planar array cannot tell its front from its back: with its normal, either will do.
+    A planar array cannot distinguish its front from its back: if its normal is given, the smaller of both angles counts.
     """
     directions = pas_directions().reshape(-1, 3)
     a, b = (directions[spectra.reshape(len(spectra), -1).argmax(1)] for spectra in (predicted, truth))
@@ -35,7 +34,7 @@ def angle_error_deg(
 
 
 def plane_normal(element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "3"] | None:
-    """Returns the unit normal of the plane that the elements of an array lie in; None if they lie in none, or in several."""
+    """Returns the unit normal of the plane of an array's elements; None if they do not determine a single plane."""
     centred = element_positions - element_positions.mean(0)
     if len(centred) < 3:
         return None
@@ -47,21 +46,21 @@ def plane_normal(element_positions: Float[np.ndarray, "elements 3"]) -> Float[np
 def beam_loss_db(
     predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"], tried: int = 1
 ) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB, at least 0) that is lost against the codebook's best beam.
+    """Returns the power (dB, at least 0) lost relative to the codebook's best beam.
 
-    The `tried` beams that a predicted spectrum ranks highest are measured, and the best of them is used. A beam is a pixel of
-    the spectrum, which is an amplitude: power is its square.
+    The `tried` beams that the predicted spectrum ranks highest are compared in the true one, and the best of them is used. A
+    beam is a pixel of the spectrum, which is an amplitude; power is its square.
     """
-    expected, heard = (spectra.reshape(len(spectra), -1)[:, codebook()] for spectra in (predicted, truth))
+    expected, received = (spectra.reshape(len(spectra), -1)[:, codebook()] for spectra in (predicted, truth))
     ranked = np.argsort(-expected, axis=1, kind="stable")[:, :tried]
-    used = np.take_along_axis(heard, ranked, 1).max(1).astype(np.float64)
-    best = heard.max(1).astype(np.float64)
+    used = np.take_along_axis(received, ranked, 1).max(1).astype(np.float64)
+    best = received.max(1).astype(np.float64)
     ratio = np.where(best > 0, used / np.where(best > 0, best, 1), 1)
     return -20 * np.log10(np.maximum(ratio, 10 ** (FAINTEST_DB / 20)))
 
 
 PSNR_LIMIT_DB = 100.0
-"""PSNR of a perfect prediction, which would be infinite and fit no report."""
+"""PSNR reported for a perfect prediction, whose PSNR is infinite."""
 
 
 def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
@@ -72,7 +71,7 @@ def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 9
 
 def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
     """Returns the mean absolute error of every spectrum, float64."""
-    pairs = zip(predicted, truth, strict=True)  # one by one: float64 copies of a whole scene are gigabytes
+    pairs = zip(predicted, truth, strict=True)  # one at a time: float64 copies of a whole scene take gigabytes
     return np.array([np.mean(np.abs(p.astype(np.float64) - t)) for p, t in pairs])
 
 
@@ -94,19 +93,19 @@ def score(
 
     Args:
         predicted: spectra in 0..1.
-        truth: what was observed.
+        truth: observed spectra.
         frequencies_hz: of every spectrum.
-        sight: whether the receiver sees the transmitter, where that is known.
-        array_normal: of a planar array, which cannot tell its front from its back.
+        sight: whether there is a line of sight to the transmitter, if known.
+        array_normal: of a planar array, which cannot distinguish its front from its back.
 
     Returns:
         n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
         strongest direction (median); beam_loss_db and beam_loss_top3_db, the power lost by using the best of one or three
-        predicted beams (means). The same figures in per_frequency, a list by ascending frequency_ghz, and in
-        in_sight and out_of_sight, where `sight` is given and there are such spectra.
+        predicted beams (means). The same figures are in per_frequency, a list by ascending frequency_ghz, and, if `sight` is
+        given and there are such spectra, in in_sight and out_of_sight.
 
     Raises:
-        UserError: there is no spectrum, or a prediction contains NaN or infinity.
+        UserError: there are no spectra, or a prediction contains NaN or infinity.
     """
     return summarise(figures(predicted, truth, array_normal), frequencies_hz, sight)
 
@@ -116,9 +115,9 @@ def figures(
     truth: Float[np.ndarray, "n 90 360"],
     array_normal: Float[np.ndarray, "3"] | None = None,
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Returns what `score` reports of every spectrum by itself; raises what it raises."""
+    """Returns the figures of `score` for every spectrum; raises the same errors."""
     if len(predicted) == 0:
-        raise UserError("there is no spectrum to score; choose a split or frequencies with at least one test spectrum")
+        raise UserError("there are no spectra to score; choose a split or frequencies with at least one test spectrum")
     if broken := sum(not np.isfinite(p).all() for p in predicted):
         raise UserError(f"{broken} of {len(predicted)} predicted spectra contain NaN or infinity; the model diverged")
     return {
@@ -137,8 +136,8 @@ def summarise(
     sight: Bool[np.ndarray, " n"] | None = None,
     receiver: Int[np.ndarray, " n"] | None = None,
 ) -> dict[str, Any]:
-    """Returns the report of `score` from the figures of all spectra; of several receivers, where their numbers are given, with
-    the same figures in per_receiver."""
+    """Returns the report of `score` computed from the figures of all spectra. If the receivers of the spectra are given and
+    there are several, the same figures are also in per_receiver."""
 
     def part(chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]:
         return _summary({name: value[chosen] for name, value in values.items()})

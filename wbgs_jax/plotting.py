@@ -1,10 +1,6 @@
-"""Pictures of a run: spectra (rectangular and polar), curves, SSIM by frequency. Written as PNG files, atomically.
-
-Pictures of answers: spectra side by side, and quantities along a line, over a sweep, or query by query.
-
-Pictures of maps: a quantity over a floor, with the walls that the plane cuts and the receiver.
-
-Pictures of maps of received power over a floor plan.
+"""Plots, written as PNG files, atomically: spectra (rectangular and polar), training curves and SSIM by frequency of a run;
+predicted spectra, and quantities along a line, over a frequency sweep or per query; maps of a quantity over a floor with walls
+and receiver; maps of received power over a floor plan.
 """
 
 from pathlib import Path
@@ -32,11 +28,11 @@ from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 SHOWN = 6
-"""Spectra in a picture."""
+"""Maximum number of spectra in a plot."""
 LONGEST_ARROW = 0.1
-"""Of the scene's size."""
+"""Length of the longest arrow, relative to the scene's size."""
 SIZES = ("gaussians",)
-"""Sizes of a field that change during training."""
+"""Counts of a field that change during training."""
 
 
 def draw_all(
@@ -47,7 +43,7 @@ def draw_all(
     report: dict[str, Any],
     curves: list[dict[str, Any]],
 ) -> list[Path]:
-    """Draws predicted spectra of some links, the report and the curves of a training into a folder; returns the files."""
+    """Draws predicted spectra of some links, the report and the training curves into a folder; returns the files."""
     chosen = spread(dataset, index)
     truth, shown = np.asarray(dataset.pas(index[chosen])), predicted[chosen]
     titles = [_title(dataset, i) for i in index[chosen].tolist()]
@@ -62,7 +58,7 @@ def draw_all(
 
 
 def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
-    """Returns places in `index` of a spread of frequencies, at different transmitters where there are enough."""
+    """Returns positions in `index` that cover the range of frequencies, with different transmitters if there are enough."""
     frequencies = np.unique(dataset.frequencies_hz[index])
     rng = np.random.default_rng(0)
     chosen: list[int] = []
@@ -80,7 +76,7 @@ def _title(dataset: Dataset, index: int) -> str:
 
 
 def draw_spectra(truth: Float[np.ndarray, "k 90 360"], predicted: Float[np.ndarray, "k 90 360"], titles: list[str]) -> Figure:
-    """Returns truth, prediction and absolute error over azimuth and zenith, one row a spectrum."""
+    """Returns truth, prediction and absolute error over azimuth and zenith, one row per spectrum."""
     figure = Figure(figsize=(13, 1.75 * len(truth) + 0.6), layout="constrained")
     axes = figure.subplots(len(truth), 3, squeeze=False)
     ssim = metrics.ssim(predicted, truth)
@@ -117,7 +113,7 @@ def draw_polar(truth: Float[np.ndarray, "k 90 360"], predicted: Float[np.ndarray
 
 
 def draw_curves(entries: list[dict[str, Any]]) -> Figure:
-    """Returns loss, metrics of the batches and of held-out links, and the sizes that change, over the steps."""
+    """Returns the loss, metrics of the batches and of held-out links, and counts that change, over the steps."""
     steps = [e for e in entries if "loss" in e]
     held_out = sorted({name for e in steps for name in e if name.startswith("held_out")})
     sizes = [name for name in SIZES if any(name in e for e in steps)]
@@ -132,7 +128,7 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
         points = [(e["step"], e[name]) for e in steps if name in e]
         label = "held-out sample: median SSIM (7x7)" if name == "held_out_ssim" else name.replace("_", " ")
         axes[1].plot(*zip(*points, strict=True), "o-", color="C3", label=label)
-    axes[1].set(title="how good it is", xlabel="step")
+    axes[1].set(title="quality", xlabel="step")
     if batch or held_out:
         axes[1].legend(fontsize=8)
     for name in sizes:
@@ -144,11 +140,11 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
 
 
 def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[np.ndarray, "f 3"]) -> Path:
-    """Draws how far a training has moved the surfaces of a mesh, seen from above and from the side; returns the file."""
+    """Draws the displacement of a mesh's surfaces by the training, from above and from the side; returns the file."""
     figure = Figure(figsize=(10, 7), layout="constrained")
     axes, size = figure.subplots(2, 1), 1e3 * np.linalg.norm(shift, axis=-1)
     colours = colormaps["viridis"](size / max(size.max(), 1e-9))
-    different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # what moves alike is one thing
+    different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # equal shifts: one rigid body
     centre = np.array([corners[body.reshape(-1) == k].mean((0, 1)) for k in range(len(different))])
     longest = LONGEST_ARROW * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
     for axis, (i, j), name in zip(axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
@@ -157,16 +153,16 @@ def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[
         arrows = *centre[:, [i, j]].T, *(longest * different[:, [i, j]].T)
         axis.quiver(*arrows, color=colours[first], angles="xy", scale_units="xy", scale=1)
         axis.set(
-            title=f"{name} (arrows {longest:.0f} times too long)", xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal"
+            title=f"{name} (arrows magnified {longest:.0f} times)", xlabel="x [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal"
         )
         axis.autoscale_view()
     shown = ScalarMappable(Normalize(0, size.max()), "viridis")
-    figure.colorbar(shown, ax=axes, label="moved by [mm]", shrink=0.8)
+    figure.colorbar(shown, ax=axes, label="displacement [mm]", shrink=0.8)
     return _save(figure, folder / "surfaces_moved.png")
 
 
 def draw_frequencies(report: dict[str, Any]) -> Figure:
-    """Returns the median SSIM by frequency of the field and of every baseline."""
+    """Returns the median SSIM of the field and of every baseline by frequency."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axis = figure.subplots()
     series = {report["field"]: report} | {name.replace("_", " "): r for name, r in report["baselines"].items()}
@@ -198,7 +194,7 @@ COLORS = "viridis"
 def draw_answers(
     pas: Float[np.ndarray, "n 90 360"], tx_positions: Float[np.ndarray, "n 3"], frequencies_hz: Float[np.ndarray, " n"]
 ) -> Figure:
-    """Returns a figure of spectra over azimuth and zenith, two in a row."""
+    """Returns a figure of spectra over azimuth and zenith, two per row."""
     columns = min(2, len(pas))
     rows = -(-len(pas) // columns)
     figure = Figure(figsize=(5.5 * columns, 1.9 * rows + 0.5), layout="constrained")
@@ -245,7 +241,7 @@ def draw_sweeps(quantity: Quantity, values: Float[np.ndarray, " *shape"], querie
 
 
 SHOWN_MAPS = 6
-"""Frequencies in a picture."""
+"""Maximum number of frequencies in a plot."""
 
 
 def draw_maps(
@@ -287,23 +283,23 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
 
 
 def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
-    """Returns limits of the colours that leave out the extreme hundredths."""
+    """Returns colour limits that exclude the lowest and the highest hundredth of the values."""
     low, high = np.nanquantile(values, [0.01, 0.99])
     return {"vmin": float(low), "vmax": float(high)}
 
 
 SPACING, MARGIN = 0.1, 0.3
-"""Metres: of the pixels, and around all that is drawn."""
+"""Pixel spacing and margin around the plan, metres."""
 PIXELS = 40_000
-"""At most; spacings grow with larger plans."""
+"""Maximum number of pixels; the spacing grows for larger plans."""
 AT_ONCE = 2048
 SHOWN_RECEIVERS = 12
-"""Receivers in a picture."""
+"""Maximum number of receivers in a plot."""
 COLUMNS = 3
 
 
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
-    """Returns a figure with the map of every receiver at the median height of what was measured, walls, and the cells."""
+    """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
     height = float(np.median(cells.places[:, 2]))
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
     low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN

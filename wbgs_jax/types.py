@@ -1,6 +1,6 @@
-"""The pytrees that cross rooms: receivers, queries, links, batches, Gaussians and surfaces.
+"""Pytrees shared by the packages: receivers, queries, links, batches, Gaussians and surfaces.
 
-SI units: metres, hertz, radians. Constructors check what they are given; arrays are float32 on the device.
+SI units: metres, hertz, radians. Constructors check their arguments; arrays are float32 on the device.
 """
 
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -17,60 +17,60 @@ from wbgs_jax.radio.antenna import pattern_exponents
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 
 ElementUnit = Literal["wavelengths", "metres"]
-"""Unit of element positions: "wavelengths" is an array that scales with the frequency, "metres" one of fixed size."""
+"""Unit of element positions: "wavelengths" for an array that scales with the frequency, "metres" for one of fixed size."""
 SurfaceSampling = Literal["solid_angle", "area"]
-"""How points are spread: evenly over the receiver's directions, or over the area of the surface."""
+"""Distribution of surface points: uniform over the receiver's directions, or over the area of the surface."""
 MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 1e9, 100e9
-"""The band of the paper."""
+"""Frequency band of the paper."""
 LOWEST_OF_PATHS_HZ = 0.3e9
-"""Fields that know paths answer down to here, where rays begin to be a poor description of waves in rooms. Data below it, or
-above the paper's band, can never be asked for: they are of another unit, or nothing for this model."""
+"""Lower frequency limit of fields that predict paths; below it rays are a poor description of waves in rooms. Data below it or
+above the paper's band are rejected: they are probably in another unit, or outside the scope of the models."""
 LARGEST_COORDINATE_M = 2e3
-"""Larger numbers are millimetres by mistake, or coordinates of a map: there single precision is too coarse for waves."""
+"""Larger coordinates are probably in millimetres or on a map, where single precision is too coarse for waves."""
 
 
 @pytree
 class Gaussians:
     """Stored (unconstrained) parameters of N 3D Gaussians in the world frame.
 
-    Slots that hold no Gaussian, the room into which density control grows, have an opacity logit of minus infinity: they
-    attenuate nothing, and no gradient reaches them.
+    Empty slots, the spare capacity for density control, have an opacity logit of minus infinity: they attenuate nothing and
+    receive no gradient.
     """
 
     means: Float[Array, "n 3"]
     """Centres, metres."""
     log_scales: Float[Array, "n 3"]
-    """Natural logarithm of the standard deviations along the own axes, metres."""
+    """Natural logarithm of the standard deviations along the principal axes, metres."""
     quats: Float[Array, "n 4"]
-    """Rotation of the own axes into the world, wxyz, not necessarily of unit length."""
+    """Rotation of the principal axes into the world frame, wxyz, not necessarily of unit length."""
     opacity_logits: Float[Array, " n"]
     """delta_o of the paper (section 4.5), before the sigmoid."""
     features: Float[Array, "n k"] | None = None
-    """What networks know of a Gaussian beside its place; splatting takes no notice."""
+    """Additional inputs of networks for every Gaussian; ignored by splatting."""
 
     @property
     def alive(self) -> Bool[Array, " n"]:
-        """Which slots hold a Gaussian."""
+        """Mask of slots that hold a Gaussian."""
         return jnp.greater(self.opacity_logits, -jnp.inf)
 
 
 @pytree
 class Receiver:
-    """A fixed receiver array; with a leading axis on every array, R receivers of equal numbers of elements."""
+    """A fixed receiver array; with a leading axis on every array, R receivers with the same number of elements."""
 
     position: Float[Array, "*r 3"]
     """World frame, metres."""
     orientation: Float[Array, "*r 4"]
-    """Unit quaternion (wxyz) that turns the receiver's local frame into the world frame."""
+    """Unit quaternion (wxyz) that rotates the receiver's local frame into the world frame."""
     element_positions: Float[Array, "*r elements 3"]
     """Local frame, in `unit`."""
     pattern_exponents: Float[Array, "*r 2"]
-    """Of the elements' gain: how much they are the element of 3GPP TR 38.901 and how much a short dipole; zeros are isotropic
-    (`radio/antenna.py`)."""
+    """Exponents of the elements' gain patterns: the element of 3GPP TR 38.901 and the short dipole; zeros for isotropic
+    elements (`radio/antenna.py`)."""
     unit: ElementUnit = static(default="wavelengths")
 
     def element_wavelengths(self, frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b_elements 3"]:
-        """Returns the element positions in wavelengths: (elements, 3) if they are stored so, else (*b, elements, 3)."""
+        """Returns the element positions in wavelengths: (elements, 3) if stored in wavelengths, else (*b, elements, 3)."""
         if self.unit == "wavelengths":
             return self.element_positions
         return self.element_positions * (frequency_hz / SPEED_OF_LIGHT)[..., None, None]
@@ -78,7 +78,7 @@ class Receiver:
 
 @pytree
 class Query:
-    """A batch of questions to a field about one receiver: transmitter positions and frequencies."""
+    """A batch of queries to a field for one receiver: transmitter positions and frequencies."""
 
     tx_position: Float[Array, "*b 3"]
     """World frame, metres."""
@@ -92,13 +92,13 @@ class Query:
 
 @pytree
 class Links:
-    """What can be observed: (transmitter position, receiver, frequency)."""
+    """Combinations of transmitter position, receiver and frequency."""
 
     query: Query
     receiver_index: Int[Array, "*b"]
-    """Which of the dataset's receivers."""
+    """Index of the receiver in the dataset."""
     tx_index: Int[Array, "*b"]
-    """Which of the dataset's transmitters: links of one position share it."""
+    """Index of the transmitter in the dataset; links with the same position share it."""
 
     @property
     def tx_position(self) -> Float[Array, "*b 3"]:
@@ -120,7 +120,7 @@ class Batch(Observed):
     observations: Observations
     """By kind, as data have them, but spectra: wherever there are any, "pas" holds them as float32 of maximum 1."""
     key: Key[Array, ""]
-    """Randomness of this training step."""
+    """Random key of this training step."""
 
     @property
     def pas(self) -> Float[Array, "b 90 360"] | None:
@@ -135,7 +135,7 @@ class Batch(Observed):
 
 @pytree
 class Surface:
-    """Points on the scene's surfaces, where Gaussians start."""
+    """Points on the scene's surfaces at which Gaussians start."""
 
     points: Float[Array, "n 3"]
     """World frame, metres."""
@@ -145,22 +145,22 @@ class Surface:
 
 @pytree
 class Mesh:
-    """A scene's surfaces, for fields that know where they are."""
+    """A scene's surfaces, for fields that use their geometry."""
 
     vertices: Float[Array, "v 3"]
     """World frame, metres."""
     faces: Int[Array, "t 3"]
     part: Int[Array, " t"]
-    """Object of the scene that a triangle belongs to."""
+    """Index of the scene object that a triangle belongs to."""
     material: Int[Array, " t"]
-    """Material of every triangle: what shares a material shares its properties."""
+    """Index of the material of every triangle; triangles with the same index share their properties."""
     thickness: Float[Array, " m"]
-    """Thickness of every material, metres; 0 where it is not known."""
+    """Thickness of every material, metres; 0 if unknown."""
 
 
 @runtime_checkable
 class Scene(Protocol):
-    """What a field may ask about a place when it is made (`data.scene.DatasetScene`)."""
+    """Information about a scene that fields may use when they are built (`data.scene.DatasetScene`)."""
 
     @property
     def receivers(self) -> Receiver:
@@ -174,15 +174,15 @@ class Scene(Protocol):
 
     @property
     def spectra(self) -> int:
-        """Number of links that are trained."""
+        """Number of training links."""
         ...
 
     def surface(self, count: int, seed: int, sampling: SurfaceSampling) -> Surface:
-        """Points on the surfaces; 0: as many as the mesh has vertices, within bounds."""
+        """Points on the surfaces; a count of 0 means as many as the mesh has vertices, within bounds."""
         ...
 
     def mesh(self) -> Mesh:
-        """The surfaces themselves; a `UserError` where only points are known."""
+        """The surfaces themselves; raises a `UserError` if there are only points."""
         ...
 
 
@@ -197,10 +197,10 @@ def make_receiver(
 
     Args:
         position: (3,), world frame, metres.
-        orientation: quaternion (wxyz) of any non-zero length that turns local vectors into world ones.
-        element_positions: (elements, 3) in the local frame; default: the 4x4 half-wavelength array in the local y-z plane.
+        orientation: quaternion (wxyz) of any non-zero length that rotates local vectors into world ones.
+        element_positions: (elements, 3) in the local frame; by default the 4x4 half-wavelength array in the local y-z plane.
         unit: of the element positions.
-        pattern: of the elements, a name that `radio.antenna.PATTERN_EXPONENTS` knows; empty stands for isotropic ones.
+        pattern: of the elements, a name in `radio.antenna.PATTERN_EXPONENTS`; empty for isotropic ones.
     """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
@@ -210,7 +210,7 @@ def make_receiver(
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
-    """Returns receivers of equal numbers of elements and one unit as one, with a leading axis on every array."""
+    """Returns receivers with the same number of elements and the same unit as one, with a leading axis on every array."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
@@ -222,27 +222,28 @@ def make_query(tx_position: Any, frequency_hz: Any) -> Query:
 
 
 def check_query(query: Query) -> None:
-    """Raises unless positions are (b, 3) in metres and frequencies (b,) in hertz."""
+    """Raises an error unless positions are (b, 3) in metres and frequencies (b,) in hertz."""
     check_array("tx_position", query.tx_position, ("b", 3))
     check_array("frequency_hz", query.frequency_hz, (query.tx_position.shape[0],))
     frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)
     if frequency is not None and frequency.size and not frequency.min() >= LOWEST_OF_PATHS_HZ:
-        raise ValueError(f"frequency_hz holds {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")
+        raise ValueError(f"frequency_hz is {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")
     if position is not None and position.size and not np.abs(position).max() <= LARGEST_COORDINATE_M:
-        raise ValueError(f"tx_position holds {np.abs(position).max():g}; positions are in metres and finite")
+        raise ValueError(f"tx_position is {np.abs(position).max():g}; positions are in metres and finite")
 
 
 def check_receiver(receiver: Receiver) -> None:
-    """Raises unless it is one receiver: position (3,), quaternion (4,) of non-zero length, element positions (elements, 3)."""
+    """Raises an error unless it is a single receiver: position (3,), quaternion (4,) of non-zero length, element positions
+    (elements, 3)."""
     check_array("receiver.position", receiver.position, (3,))
     check_array("receiver.orientation", receiver.orientation, (4,))
     check_array("receiver.element_positions", receiver.element_positions, ("elements", 3))
     orientation = concrete(receiver.orientation)
     if orientation is not None and not np.linalg.norm(orientation) > 1e-6:
-        raise ValueError("receiver.orientation has zero length; give a quaternion (w, x, y, z), (1, 0, 0, 0) for no rotation")
+        raise ValueError("receiver.orientation has zero length; pass a quaternion (w, x, y, z), (1, 0, 0, 0) for no rotation")
 
 
 def check_surface(surface: Surface) -> None:
-    """Raises unless points are (n, 3) and their spacing (n,)."""
+    """Raises an error unless points are (n, 3) and their spacing is (n,)."""
     check_array("surface.points", surface.points, ("n", 3))
     check_array("surface.spacing", surface.spacing, (surface.points.shape[0],))

@@ -1,1 +1,1 @@
-"""A worked example of a scene of one's own (docs/own_scene.md)."""
+"""A worked example of a user's own scene (docs/own_scene.md)."""

@@ -28,7 +28,7 @@ def panel(axis: int, at: float, low: tuple[float, float], high: tuple[float, flo
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> list[Corners]:
-    """Returns the six faces of a box; those on the low side are turned, so that all normals point outward."""
+    """Returns the six faces of a box; those on the low side are reversed, so that all normals point outward."""
     faces = []
     for axis, (i, j) in enumerate(((1, 2), (0, 2), (0, 1))):
         for at, outward in ((low[axis], axis == 1), (high[axis], axis != 1)):

@@ -1,1 +1,2 @@
-"""A truth that is no ray tracing: Maxwell's equations on a grid (FDTD, openEMS) in a small furnished cabin at 1 to 1.5 GHz."""
+"""A ground truth without ray tracing: Maxwell's equations on a grid (FDTD, openEMS) in a small furnished cabin at 1 to 1.5
+GHz."""

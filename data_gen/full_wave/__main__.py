@@ -1,10 +1,10 @@
-"""Computes the full-wave cabin with openEMS, or goes on with it.
+"""Computes the full-wave cabin with openEMS, or continues an interrupted run.
 
     python -m data_gen.full_wave
     python -m data_gen.full_wave --cell 0.03 --out runs/rough.npz
     python -m data_gen.full_wave --check-cell 0.01
 
-A killed run loses the element in progress: the same command goes on where it stopped.
+A killed run loses only the element in progress: the same command continues where it stopped.
 """
 
 from dataclasses import dataclass
@@ -31,18 +31,19 @@ class Options:
     """Computes a small furnished cabin at 1 to 1.5 GHz with openEMS (FDTD) and writes it as a scene file."""
 
     cell: float = CELL
-    """Edge of the grid's cells in metres; 0.01, 0.015 and 0.03 fit the cabin."""
+    """Edge length of the grid's cells in metres; 0.01, 0.015 and 0.03 fit the cabin."""
     duration: float = DURATION
-    """Seconds that the field is followed."""
+    """Simulated time in seconds."""
     check_cell: float | None = None
-    """Compute one element again with cells of this edge (metres) and say in the scene file how well the two agree."""
+    """Compute one element again with cells of this edge length (metres) and record the agreement in the scene file."""
     out: Path | None = None
-    """Scene file to write; that of the package, cabin.npz, unless told or unless the cell or the duration is another."""
+    """Scene file to write; by default cabin.npz of the package, or of the current folder if the cell or the duration
+    differs."""
     work: Path = Path(__file__).parent.parent / "work"
-    """Folder of unfinished work."""
+    """Folder for unfinished work."""
 
     def target(self) -> Path:
-        """Returns where the scene file goes. What is computed otherwise must not replace the released file."""
+        """Returns the path of the scene file. Results with other settings must not replace the released file."""
         own = (self.cell, self.duration) != (CELL, DURATION)
         return self.out or (Path("cabin.npz") if own else RELEASED / "cabin.npz")
 

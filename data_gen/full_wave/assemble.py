@@ -1,4 +1,4 @@
-"""Puts the elements' results together: snapshots, mesh and all that is known about them, as a scene file."""
+"""Assembles a scene file from the elements' results: snapshots, mesh and metadata."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,11 +20,11 @@ def assemble(model: Model, results: Sequence[ElementResult], scale: Scale, solve
     """Returns the scene file's content.
 
     Args:
-        model: the cabin as it was computed.
+        model: the cabin as computed.
         results: of all elements, in the array's order.
         scale: of the source.
         solver: version of openEMS.
-        checks: more for `meta["checks"]`, such as the convergence; empty where nothing is known.
+        checks: further entries of `meta["checks"]`, such as the convergence; may be empty.
     """
     spec = cabin_spec()
     mesh = spec.mesh_arrays()
@@ -36,7 +36,9 @@ def assemble(model: Model, results: Sequence[ElementResult], scale: Scale, solve
         vertices=mesh["vertices"], faces=mesh["faces"], face_part=mesh["face_part"],
         meta=_provenance(model, solver) | {"checks": _checks(model, results, scale) | checks},
     )  # fmt: skip
-    unknown = {"ceilings": np.full((len(scene.tx_positions), len(model.frequencies_hz), len(NAMES)), np.nan)}  # has no paths
+    unknown = {
+        "ceilings": np.full((len(scene.tx_positions), len(model.frequencies_hz), len(NAMES)), np.nan)
+    }  # not available without paths
     scene.meta.update(ceilings=ceiling_table(scene, unknown), channel=_channel(scene, spec.line_of_sight(model.points)))
     return scene
 
@@ -64,7 +66,8 @@ def _provenance(model: Model, solver: str) -> dict[str, Any]:
 
 
 def _channel(scene: SceneFile, in_sight: Bool[np.ndarray, " tx"]) -> list[dict[str, float]]:
-    """Returns by frequency the share of transmitters in sight and the gain to an element (5th, 50th, 95th percentile, dB)."""
+    """Returns, by frequency, the fraction of transmitters with line of sight and the gain to an element (5th, 50th, 95th
+    percentile, dB)."""
     gain_db = 10 * np.log10(np.mean(np.abs(scene.observations["snapshots"][:, 0].astype(np.complex128)) ** 2, -1))
     names = ("line_of_sight_share", "gain_db_p05", "gain_db_p50", "gain_db_p95")
     columns = [np.full(len(scene.frequencies_hz), in_sight.mean()), *np.percentile(gain_db, (5, 50, 95), axis=0)]

@@ -1,8 +1,8 @@
-"""The cabin: what the solver is told (solid blocks) and what a person would model (a mesh), of one description.
+"""The cabin: the solver's geometry (solid blocks) and a mesh as a user would model it, from one description.
 
 World frame: z up, metres, the origin on the floor in the middle of the room. All sizes are multiples of `UNIT`, so that cells
-of 10, 15 and 30 mm have nodes on every surface, at every transmitter and at every element. Plan (x to the right, y up), R the
-array:
+of 10, 15 and 30 mm have nodes on every surface, at every transmitter and at every element. Plan (x to the right, y up); R is
+the array:
 
     +----------------------------------+   y = 0.75
     | shelf   cabinet       cupboard   |
@@ -15,9 +15,10 @@ array:
     +----------------------------------+   y = -0.75
    x = -0.90                         0.90
 
-Mesh and blocks differ where the conventions of meshes ask for it (docs/own_scene.md, section 1): outer walls are their inner
-faces, hollow furniture its outer faces, and what touches in the cabin is `GAP` or `JOINT` apart in the mesh. The half wall is a
-closed body: its faces are where waves are reflected, and its edges are wedges; a sheet through its middle would have neither.
+Mesh and blocks differ where the conventions for meshes require it (docs/own_scene.md, section 1): outer walls are represented
+by their inner faces, hollow furniture by its outer faces, and objects that touch in the cabin are `GAP` or `JOINT` apart in the
+mesh. The half wall is a closed body: its faces reflect waves, and its edges are wedges; a sheet through its middle would have
+neither.
 """
 
 import itertools
@@ -46,12 +47,12 @@ RX_POSITION: Vec3 = (-0.66, 0.0, 0.6)
 FREQUENCIES_HZ = (1.0e9, 1.1e9, 1.2e9, 1.3e9, 1.4e9, 1.5e9)
 TX_LOW, TX_HIGH, TX_COUNTS = (-0.72, -0.63, 0.15), (0.72, 0.63, 1.23), (9, 8, 7)
 TX_CLEARANCE, ARRAY_CLEARANCE = 0.10, 0.30
-"""Least distance in metres of a transmitter to a surface, and to an element."""
+"""Minimum distance in metres of a transmitter from a surface, and from an element."""
 AIR, METAL = "air", "metal"
 
 
 class Block(NamedTuple):
-    """A solid axis-aligned box of one material, for the solver; a later block replaces an earlier one where both are."""
+    """A solid axis-aligned box of one material, for the solver; later blocks replace earlier ones where they overlap."""
 
     low: Vec3
     high: Vec3
@@ -66,18 +67,20 @@ class Body:
     material: str
     boxes: tuple[tuple[Vec3, Vec3], ...]
     thickness: float
-    """Of the slab that a face of the mesh stands for, metres: a panel's, or half of a solid board, whose faces are two."""
+    """Thickness of the slab represented by a face of the mesh, metres: that of a panel, or half that of a solid board with two
+    faces."""
     hollow: bool = False
 
     def blocks(self) -> list[Block]:
-        """Returns what fills the body: its boxes, and the air inside of hollow ones."""
+        """Returns the blocks of the body: its boxes, and the air inside hollow ones."""
         found = [Block(low, high, self.material) for low, high in self.boxes]
         if self.hollow:
             found += [Block(_moved(low, PANEL), _moved(high, -PANEL), AIR) for low, high in self.boxes]
         return found
 
     def part(self) -> Part:
-        """Returns the body as a mesh: closed, `GAP` off floor, walls and ceiling where it touches them, boxes `JOINT` apart."""
+        """Returns the body as a closed mesh, `GAP` away from floor, walls and ceiling where it touches them, its boxes `JOINT`
+        apart."""
         (low, high), *others = self.boxes
         below = [(a, (b[0], b[1], b[2] - JOINT)) for a, b in others]  # a table's legs
         boxes = [box(*_off_the_shell(*corners)) for corners in [(low, high), *below]]
@@ -99,7 +102,7 @@ BODIES = (
 
 
 def shell_blocks() -> list[Block]:
-    """Returns the outer walls, the floor and the ceiling; walls stand beside floor and ceiling, corners are filled."""
+    """Returns the outer walls, the floor and the ceiling; walls stand beside floor and ceiling, and corners are filled."""
     x, y, top = SIZE[0] / 2, SIZE[1] / 2, SIZE[2]
     a, b = x + GABLE, y + WALL
     low, high = -FLOOR, top + CEILING
@@ -122,12 +125,12 @@ def cabin_bounds() -> tuple[Vec3, Vec3]:
 
 
 def element_positions() -> Float[np.ndarray, "16 3"]:
-    """Returns the array in its local frame, metres, in the project's order."""
+    """Returns the array in its local frame, metres, in the project's element order."""
     return planar_array(spacing=SPACING)
 
 
 def cabin_spec() -> SceneSpec:
-    """Returns the cabin as the project's scenes are: the mesh, the receiver and the transmitters."""
+    """Returns the cabin in the form of the project's scenes: the mesh, the receiver and the transmitters."""
     parts = (*_shell_parts(), *(body.part() for body in BODIES))
     empty = SceneSpec("cabin", parts, RX_POSITION, np.zeros((0, 3)), FREQUENCIES_HZ)
     return SceneSpec(
@@ -137,14 +140,14 @@ def cabin_spec() -> SceneSpec:
 
 
 def candidates() -> Float[np.ndarray, "n 3"]:
-    """Returns the uniform grid that transmitters are taken from, on multiples of `UNIT`, x slowest."""
+    """Returns the uniform grid of transmitter candidates, on multiples of `UNIT`, x slowest."""
     axes = [np.linspace(a, b, n) for a, b, n in zip(TX_LOW, TX_HIGH, TX_COUNTS, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return np.round(np.round(grid / UNIT) * UNIT, 6)
 
 
 def _transmitters(spec: SceneSpec) -> Float[np.ndarray, "tx 3"]:
-    """Returns the candidates in free air: outside of bodies, clear of every surface and of every element."""
+    """Returns the candidates in free air: outside all bodies, and clear of every surface and element."""
     grid = candidates()
     elements = element_positions() + np.asarray(RX_POSITION)
     from_array = np.linalg.norm(grid[:, None] - elements, axis=-1).min(1)
@@ -172,7 +175,7 @@ def _moved(corner: Vec3, by: float) -> Vec3:
 
 
 def _off_the_shell(low: Vec3, high: Vec3) -> tuple[Vec3, Vec3]:
-    """Returns a box whose faces that would lie in the floor, a wall or the ceiling are `GAP` away from it."""
+    """Returns a box with those faces that would lie in the floor, a wall or the ceiling moved `GAP` away from it."""
     room_low, room_high = (-SIZE[0] / 2 + GAP, -SIZE[1] / 2 + GAP, GAP), (SIZE[0] / 2 - GAP, SIZE[1] / 2 - GAP, SIZE[2] - GAP)
     x0, y0, z0 = np.maximum(low, room_low).tolist()
     x1, y1, z1 = np.minimum(high, room_high).tolist()

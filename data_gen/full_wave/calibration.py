@@ -1,7 +1,8 @@
-"""From the solver's fields to snapshots: the numerical wavelength, the short dipole in closed form, the scale of a source.
+"""Conversion of the solver's fields to snapshots: the numerical wavelength, the short dipole in closed form, the scale of a
+source.
 
-A snapshot's element is the voltage between two short vertical dipoles, scaled as everywhere in this project: in free space and
-far away it is lambda / (4 pi d) exp(-j k d) times the amplitude gain sqrt(1.5) sin(zenith) of each. The time factor is
+An element of a snapshot is the voltage between two short vertical dipoles, scaled as everywhere in this project: in free space
+and far away it is lambda / (4 pi d) exp(-j k d) times the amplitude gain sqrt(1.5) sin(zenith) of each. The time factor is
 exp(+j omega t).
 """
 
@@ -16,22 +17,22 @@ from data_gen.scenes.geometry import Vec3
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 DIRECTIONS = (24, 24)
-"""Zeniths and azimuths in one octant, over which the numerical wavelength is averaged."""
+"""Numbers of zenith and azimuth angles in one octant, over which the numerical wavelength is averaged."""
 CALIBRATION_REACH = 0.45
-"""Half the side in metres of the free space that a source is calibrated in."""
+"""Half the side of the free-space region in which a source is calibrated, metres."""
 CALIBRATION_DURATION = 10e-9
-"""Seconds: the pulse and its way out."""
+"""Seconds: long enough for the pulse to leave the region."""
 
 Solver = Callable[[Model, Vec3], Solution]
-"""Computes the field of a vertical source at some place at the points of a model, at the model's frequencies."""
+"""Computes the field of a vertical source at the points of a model, at the model's frequencies."""
 
 
 def sampled_frequencies(model: Model) -> Float[np.ndarray, " freq"]:
-    """Returns the frequencies (hertz) at which waves on the grid are as long as true ones are at the model's frequencies.
+    """Returns the frequencies (hertz) at which waves on the grid have the true wavelengths of the model's frequencies.
 
-    Waves on a grid are a little too slow, and so too short, most along its axes and not at all along its diagonals. What counts
-    for interference is their length in metres: in the mean over directions (weighted as a vertical dipole radiates) it is right
-    at a frequency a few thousandths lower.
+    Waves on a grid are slightly too slow, and hence too short, most along its axes and not at all along its diagonals.
+    Interference depends on the wavelength in metres: averaged over directions (weighted like the radiation of a vertical
+    dipole), it is correct at a frequency lower by a few thousandths.
     """
     return np.array([_matched(f, model.cell, model.time_step) for f in model.frequencies_hz])
 
@@ -45,7 +46,7 @@ def _matched(frequency_hz: float, cell: float, time_step: float) -> float:
 def _grid_frequencies(
     wave_number: float, cell: float, time_step: float
 ) -> tuple[Float[np.ndarray, " directions"], Float[np.ndarray, " directions"]]:
-    """Returns the frequencies of plane waves of one length on the grid in many directions, and the weights of these."""
+    """Returns the frequencies of plane waves of one wavelength on the grid in many directions, and their weights."""
     zenith, azimuth = np.meshgrid(*((np.arange(n) + 0.5) * np.pi / (2 * n) for n in DIRECTIONS), indexing="ij")
     k = wave_number * np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     sine = SPEED_OF_LIGHT * time_step / cell * np.sqrt((np.sin(k * cell / 2) ** 2).sum(0))
@@ -85,15 +86,15 @@ def calibration_model(cell: float, frequencies_hz: tuple[float, ...]) -> Model:
 
 
 class Scale(NamedTuple):
-    """What turns the solver's fields into snapshots."""
+    """Conversion factor from the solver's fields to snapshots."""
 
     factor: Complex[np.ndarray, " freq"]
     error: Float[np.ndarray, " freq"]
-    """Of the scaled field in free space against the closed form: root mean square, relative."""
+    """Relative r.m.s. error of the scaled free-space field with respect to the closed form."""
 
 
 def calibrate(solve: Solver, cell: float, frequencies_hz: tuple[float, ...]) -> Scale:
-    """Runs the source in free space and returns the scale that fits its field best to the closed form."""
+    """Computes the source in free space and returns the scale that best fits its field to the closed form."""
     model = calibration_model(cell, frequencies_hz)
     field = solve(model, (0.0, 0.0, 0.0)).field
     truth = dipole_field(model.points, np.asarray(frequencies_hz))

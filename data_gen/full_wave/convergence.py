@@ -1,4 +1,4 @@
-"""How much of the field is the grid's: one element again with smaller cells."""
+"""Discretisation error of the field: one element is computed again with smaller cells."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,13 @@ ELEMENT = 0
 
 
 def convergence(solve: Solver, fine: Model, coarse_result: ElementResult, folder: Path) -> dict[str, Any]:
-    """Returns how well the first element's result agrees with that on a finer grid, by frequency (`agreement`).
+    """Returns the agreement of the first element's result with that on a finer grid, by frequency (`agreement`).
 
     Args:
         solve: the solver.
         fine: the same cabin with smaller cells.
-        coarse_result: of the first element, to be judged.
-        folder: where the finer result is kept.
+        coarse_result: of the first element.
+        folder: for the finer result.
     """
     scale = get_scale(solve, fine, folder)
     result = get_element(solve, fine, scale, sources()[ELEMENT], element_file(folder, ELEMENT))
@@ -30,8 +30,8 @@ def convergence(solve: Solver, fine: Model, coarse_result: ElementResult, folder
 
 
 def agreement(first: Complex[np.ndarray, "tx freq"], second: Complex[np.ndarray, "tx freq"]) -> list[dict[str, float]]:
-    """Returns for every frequency how well the fields at the transmitters agree: the correlation |y^H y'| / (|y| |y'|), the
-    norm of the difference over that of the second, and the medians of the level difference and of its magnitude in dB."""
+    """Returns the agreement of the fields at the transmitters for every frequency: the correlation |y^H y'| / (|y| |y'|), the
+    norm of the difference relative to that of the second, and the medians of the level difference and its magnitude in dB."""
     rows = []
     for a, b in zip(first.T, second.T, strict=True):
         level = 20 * np.log10(np.abs(a) / np.abs(b))

@@ -1,8 +1,9 @@
-"""The long part: one run an element of the array, each kept as soon as it is done.
+"""The long-running part: one run per element of the array, each stored as soon as it is done.
 
-By reciprocity the voltage at an element of a current at a transmitter is that at the transmitter of the same current at the
-element: 16 runs serve all transmitters. An element's result is a file, written whole or not at all, in a folder whose name
-contains a checksum of everything that decides it; a run finds what an earlier one with the same settings left.
+By reciprocity, the voltage at an element due to a current at a transmitter equals that at the transmitter due to the same
+current at the element: 16 runs serve all transmitters. An element's result is a file, written atomically, in a folder whose
+name contains a checksum of everything that determines it, so that a run finds the results of earlier ones with the same
+settings.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ from wbgs_jax._util.files import atomic_write
 
 
 class ElementResult(NamedTuple):
-    """What one element sees of all transmitters."""
+    """Result of one element for all transmitters."""
 
     values: Complex[np.ndarray, "tx freq"]
     decay_db: float
@@ -31,7 +32,7 @@ class ElementResult(NamedTuple):
 
 
 def cabin_model(cell: float, duration: float) -> Model:
-    """Returns the cabin for the solver, a point at every transmitter."""
+    """Returns the solver's model of the cabin, with a point at every transmitter."""
     low, high = cabin_bounds()
     return Model(
         blocks=tuple(cabin_blocks()), low=_out(low, -MARGIN), high=_out(high, MARGIN), cell=cell,
@@ -40,13 +41,13 @@ def cabin_model(cell: float, duration: float) -> Model:
 
 
 def sources(rx_position: Vec3 = RX_POSITION) -> list[Vec3]:
-    """Returns the places of the elements in the world frame, metres; the array is not turned."""
+    """Returns the positions of the elements in the world frame, metres; the array is not rotated."""
     places = np.round(element_positions() + np.asarray(rx_position), 6)
     return [(x, y, z) for x, y, z in places.tolist()]
 
 
 def digest(model: Model, solver: str) -> str:
-    """Returns a checksum of the model, of how it is discretised and of the solver's version."""
+    """Returns a checksum of the model, its discretisation and the solver's version."""
     decides = {
         "blocks": model.blocks, "low": model.low, "high": model.high, "cell": model.cell, "points": model.points.tolist(),
         "frequencies": model.frequencies_hz, "duration": model.duration, "media": MEDIA, "reference": REFERENCE_HZ,
@@ -67,7 +68,7 @@ def get_scale(solve: Solver, model: Model, folder: Path) -> Scale:
 
 
 def get_element(solve: Solver, model: Model, scale: Scale, source: Vec3, file: Path) -> ElementResult:
-    """Returns what an element at `source` (metres) sees, from its file or from a run."""
+    """Returns the result of an element at `source` (metres), from its file or from a run."""
     if not file.exists():
         solution = solve(model, source)
         say(f"{file.stem}: decayed to {solution.decay_db:.1f} dB, {solution.seconds:.0f} s")
@@ -78,12 +79,12 @@ def get_element(solve: Solver, model: Model, scale: Scale, source: Vec3, file: P
 
 
 def element_file(folder: Path, element: int) -> Path:
-    """Returns where the result of an element lies."""
+    """Returns the path of the result of an element."""
     return folder / f"element{element:02d}.npz"
 
 
 def snapshots_of(results: Sequence[ElementResult]) -> Complex[np.ndarray, "tx 1 freq elements"]:
-    """Returns the array's snapshots of all transmitters (complex64) of the results of its elements, in their order."""
+    """Returns the array's snapshots of all transmitters (complex64) from the results of its elements, in order."""
     return np.stack([result.values for result in results], -1)[:, None].astype(np.complex64)
 
 

@@ -1,4 +1,5 @@
-"""What the solver computes: blocks on a grid of cubic cells, a short vertical source, the field at points, some frequencies."""
+"""Input and output of the solver: blocks on a grid of cubic cells, a short vertical source, the field at points and
+frequencies."""
 
 import math
 from collections.abc import Sequence
@@ -13,15 +14,15 @@ from data_gen.scenes.geometry import Vec3
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
 PML_CELLS = 8
-"""Depth of the absorbing layer outside of the region, in cells."""
+"""Thickness of the absorbing layer around the region, in cells."""
 MARGIN = 0.03
 """Metres of air between the cabin and the absorbing layer."""
 REFERENCE_HZ = 1.25e9
-"""Where a conductivity is that of ITU-R P.2040; on the grid it is the same at all frequencies."""
+"""Frequency at which a conductivity is that of ITU-R P.2040; on the grid it is constant over frequency."""
 
 
 class Medium(NamedTuple):
-    """What fills a block: relative permittivity, and conductivity c f^d in S/m with f in GHz (ITU-R P.2040-3, table 3)."""
+    """Medium of a block: relative permittivity, and conductivity c f^d in S/m with f in GHz (ITU-R P.2040-3, table 3)."""
 
     permittivity: float
     c: float
@@ -38,28 +39,28 @@ MEDIA = {
     "wood": Medium(1.99, 0.0047, 1.0718),
     "chipboard": Medium(2.58, 0.0217, 0.7800),
 }
-"""By name; `METAL` is a perfect conductor and has no entry."""
+"""Media by name; `METAL` is a perfect conductor and has no entry."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """One room for the solver. Blocks, points and source have their corners on nodes: multiples of the cell."""
+    """One room for the solver. Blocks, points and source have their corners on nodes, which are multiples of the cell."""
 
     blocks: tuple[Block, ...]
     low: Vec3
     high: Vec3
-    """Corners (metres) of the region that the absorbing layer surrounds."""
+    """Corners (metres) of the region inside the absorbing layer."""
     cell: float
     """Metres."""
     points: Float[np.ndarray, "n 3"]
-    """Where the vertical field is recorded, world frame, metres."""
+    """Points at which the vertical field is recorded, world frame, metres."""
     frequencies_hz: tuple[float, ...]
     duration: float
     """Seconds."""
 
     @property
     def time_step(self) -> float:
-        """Seconds: the longest that is stable on cubic cells."""
+        """Time step in seconds, the longest one that is stable on cubic cells."""
         return self.cell / (SPEED_OF_LIGHT * math.sqrt(3))
 
     @property
@@ -68,7 +69,7 @@ class Model:
         return math.ceil(self.duration / self.time_step)
 
     def lines(self) -> tuple[list[float], list[float], list[float]]:
-        """Returns the grid's nodes along x, y and z in metres, those of the absorbing layer among them."""
+        """Returns the grid's nodes along x, y and z in metres, including those of the absorbing layer."""
         x, y, z = (self._axis(a, b) for a, b in zip(self.low, self.high, strict=True))
         return x, y, z
 
@@ -83,26 +84,26 @@ class Model:
         return math.prod(len(axis) - 1 for axis in self.lines())
 
     def off_nodes(self, corners: Sequence[Vec3]) -> float:
-        """Returns how far (in cells) the worst of some coordinates is from a node."""
+        """Returns the largest distance (in cells) of coordinates from the nearest node."""
         scaled = np.asarray(corners, np.float64).reshape(-1) / self.cell
         return float(np.abs(scaled - np.round(scaled)).max(initial=0.0))
 
 
 class Solution(NamedTuple):
-    """What one run gives."""
+    """Result of one run."""
 
     field: Complex[np.ndarray, "n freq"]
     """Vertical electric field at the points, in the solver's own units and phase: time factor exp(+j omega t)."""
     decay_db: float
-    """How much weaker the recorded pulses are at the end than where they are loudest."""
+    """Level of the recorded pulses at the end relative to their maximum, dB."""
     time_step: float
-    """Seconds, as the solver chose it."""
+    """Time step in seconds, as chosen by the solver."""
     seconds: float
-    """What the stepping took."""
+    """Computing time of the time steps, seconds."""
 
 
 def fills(blocks: Sequence[Block], points: Float[np.ndarray, "n 3"]) -> list[str]:
-    """Returns the material at every point (metres), air where no block is."""
+    """Returns the material at every point (metres), air outside all blocks."""
     found = [AIR] * len(points)
     for block in blocks:
         inside = np.all((points > np.asarray(block.low)) & (points < np.asarray(block.high)), axis=1)
@@ -112,7 +113,7 @@ def fills(blocks: Sequence[Block], points: Float[np.ndarray, "n 3"]) -> list[str
 
 
 def coarsest(model: Model) -> float:
-    """Returns the number of cells in the shortest wavelength of the densest material that is in the model."""
+    """Returns the number of cells per shortest wavelength in the densest material of the model."""
     names = {block.material for block in model.blocks} - {METAL}
     densest = max((MEDIA[name].permittivity for name in names), default=1.0)
     return SPEED_OF_LIGHT / max(model.frequencies_hz) / math.sqrt(densest) / model.cell

@@ -1,4 +1,4 @@
-"""Runs the openEMS binary and reads what it recorded. Everything of a run lies in a temporary folder that vanishes."""
+"""Runs the openEMS binary and reads its records. All files of a run are in a temporary folder."""
 
 import re
 import shutil
@@ -17,7 +17,7 @@ from wbgs_jax._util.errors import UserError
 
 BINARY = "openEMS"
 ENGINE = "sse-compressed"
-"""One thread; of the engines the fastest on one core."""
+"""Single-threaded; the fastest engine on one core."""
 TENTHS = 10
 
 
@@ -29,12 +29,12 @@ def find_openems() -> str:
     """
     found = shutil.which(BINARY)
     if found is None:
-        raise UserError(f"{BINARY} is not installed; apt-get install openems brings it on Debian and Ubuntu")
+        raise UserError(f"{BINARY} is not installed; on Debian and Ubuntu: apt-get install openems")
     return found
 
 
 def version() -> str:
-    """Returns the version that the binary tells of itself."""
+    """Returns the version printed by the binary."""
     banner = subprocess.run([find_openems()], capture_output=True, text=True, check=False).stdout
     found = re.search(r"version (\S+)", banner)
     return found[1] if found else "unknown"
@@ -45,7 +45,7 @@ def run_openems(model: Model, source: Vec3) -> Solution:
 
     Args:
         model: the room.
-        source: where the source's middle is, metres.
+        source: position of the source's centre, metres.
 
     Raises:
         UserError: the binary is missing or fails.
@@ -58,20 +58,21 @@ def run_openems(model: Model, source: Vec3) -> Solution:
         log = done.stdout + done.stderr
         if done.returncode or not (folder / f"{PROBE}0").exists():
             code = done.returncode
-            raise UserError(f"{BINARY} failed with exit code {code}: {_last_line(log)}; it may want more memory or disk space")
+            raise UserError(f"{BINARY} failed with exit code {code}: {_last_line(log)}; it may need more memory or disk space")
         times, voltages = _records(model, folder)
-    told = _told(log)
-    if not np.isclose(told["time_step"], model.time_step, rtol=1e-3):
-        steps = f"{told['time_step']:.4g} s, not {model.time_step:.4g} s"
-        raise UserError(f"{BINARY} took steps of {steps}; is it another version than 0.0.35?")
+    reported = _reported(log)
+    if not np.isclose(reported["time_step"], model.time_step, rtol=1e-3):
+        steps = f"{reported['time_step']:.4g} s instead of {model.time_step:.4g} s"
+        raise UserError(f"{BINARY} used a time step of {steps}; is its version not 0.0.35?")
     transform = np.exp(-2j * np.pi * np.outer(times, sampled_frequencies(model))) * (times[1] - times[0])
-    return Solution(voltages @ transform / (2 * model.cell), decay(voltages), told["time_step"], told["seconds"])
+    return Solution(voltages @ transform / (2 * model.cell), decay(voltages), reported["time_step"], reported["seconds"])
 
 
 def decay(voltages: Float[np.ndarray, "n times"]) -> float:
-    """Returns how much weaker (dB, negative) recorded pulses are in the last tenth of their time than in the loudest one.
+    """Returns the level (dB, negative) of recorded pulses in the last tenth of the time relative to that in the strongest
+    tenth.
 
-    Differences of neighbouring samples are compared: the absorbing layer leaves a slow drift, far below the band.
+    Differences of neighbouring samples are used, because the absorbing layer leaves a slow drift far below the band.
     """
     energy = [float((part**2).mean()) for part in np.array_split(np.diff(voltages), TENTHS, axis=1)]
     return 10 * float(np.log10(max(energy[-1], np.finfo(float).tiny) / max(energy)))
@@ -83,8 +84,8 @@ def _records(model: Model, folder: Path) -> tuple[Float[np.ndarray, " times"], F
     return records[0][:, 0], np.stack([record[:, 1] for record in records])
 
 
-def _told(log: str) -> dict[str, float]:
-    """Returns what the solver's log says of its time step and of the seconds it needed."""
+def _reported(log: str) -> dict[str, float]:
+    """Returns the time step and the computing time (seconds) reported in the solver's log."""
     step = re.search(r"timestep is: (\S+) s", log)
     spent = re.search(r"iterations with .* cells : (\S+) sec", log)
     if step is None or spent is None:
@@ -94,4 +95,4 @@ def _told(log: str) -> dict[str, float]:
 
 def _last_line(log: str) -> str:
     lines = [line.strip() for line in log.splitlines() if line.strip()]
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "no output"

@@ -1,4 +1,4 @@
-"""The input file of openEMS: a grid, materials as boxes, one source, a probe at every point."""
+"""The input file of openEMS: a grid, materials as boxes, one source, and a probe at every point."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -10,18 +10,18 @@ from data_gen.scenes.geometry import Vec3
 from wbgs_jax._util.errors import UserError
 
 CENTRE_HZ, HALF_BAND_HZ = 1.25e9, 0.5e9
-"""Of the pulse, a Gaussian one: its spectrum is 20 dB down half a band from the centre."""
+"""Centre and half bandwidth of the Gaussian pulse, whose spectrum is 20 dB down half a band from the centre."""
 OVERSAMPLING = 4
-"""Samples that are kept, for every one that the highest frequency of the pulse needs."""
+"""Number of samples stored relative to the minimum for the highest frequency of the pulse."""
 PROBE = "point"
-"""Files of the recorded voltages are called so, with the point's number behind it."""
+"""Prefix of the files of recorded voltages, followed by the point's number."""
 
 
 def solver_input(model: Model, source: Vec3) -> str:
     """Returns the XML text of one run.
 
-    The source is a vertical current of two cells' length, its middle at `source`; at every point of the model the voltage over
-    two cells is recorded. Middles are nodes, so that grids of several cell sizes have them in the same places.
+    The source is a vertical current two cells long, centred at `source`; at every point of the model the voltage over two cells
+    is recorded. Centres are nodes, so that grids of several cell sizes have them at the same positions.
 
     Raises:
         UserError: a surface, the source or a point is not on a node.
@@ -52,7 +52,7 @@ def solver_input(model: Model, source: Vec3) -> str:
 
 
 def _add_blocks(properties: Element, model: Model) -> None:
-    """Writes every block as a box; a later one has the higher priority."""
+    """Writes every block as a box; later ones have higher priority."""
     for priority, block in enumerate(model.blocks, 1):
         name = f"{block.material}_{priority}"
         if block.material == METAL:
@@ -84,5 +84,5 @@ def _stick(middle: Sequence[float], cell: float) -> tuple[Vec3, Vec3]:
 
 
 def _text(value: float) -> str:
-    """Returns a number as the same text everywhere: the solver compares surfaces and nodes exactly."""
+    """Returns a number as text with fixed precision: the solver compares surfaces and nodes exactly."""
     return f"{value:.10g}"

@@ -17,7 +17,11 @@ __all__ = ["FREQUENCIES_21_HZ", "FREQUENCIES_HZ", "SCENES", "Part", "SceneSpec",
 
 
 def get_scene(number: int) -> SceneSpec:
-    """Builds a scene by number; an unknown one is a `UserError` that lists those there are."""
+    """Returns the scene of a number.
+
+    Raises:
+        UserError: there is no such scene; the message lists those that exist.
+    """
     if number not in SCENES:
-        raise UserError(f"there is no scene {number}; choose among {', '.join(map(str, sorted(SCENES)))}")
+        raise UserError(f"there is no scene {number}; choose one of {', '.join(map(str, sorted(SCENES)))}")
     return SCENES[number]()

@@ -1,8 +1,8 @@
-"""What a scene is made of: parts with a material, a receiver, candidate transmitters; and furniture to fill a room with.
+"""Components of a scene: parts with a material, a receiver and candidate transmitters.
 
 World frame: z up, metres. Walls, floor and ceiling are SINGLE surfaces whose material has a thickness (Sionna RT's slab model);
-furniture is made of closed meshes. No two surfaces may coincide: the ray tracer would see both, or one at random. Furniture
-therefore stands `GAP` above the floor and is built of boxes that are `JOINT` apart.
+furniture is made of closed meshes. No two surfaces may coincide: the ray tracer would hit both, or one of them at random.
+Furniture therefore stands `GAP` above the floor, and its boxes are `JOINT` apart.
 """
 
 import hashlib
@@ -18,20 +18,20 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.interchange.room_materials import THICKNESS, check_material
 
 GAP = 0.01
-"""Metres between furniture and the floor or wall it stands at; hides nothing and keeps surfaces apart."""
+"""Metres between furniture and the floor or wall beside it, which keeps surfaces apart and hides nothing."""
 JOINT = 0.002
 """Metres between the boxes of one piece of furniture."""
 TX_CLEARANCE = 0.10
-"""A transmitter is at least this far (metres) from every surface."""
+"""Minimum distance (metres) of a transmitter from every surface."""
 RX_CLEARANCE = 0.50
-"""A transmitter is at least this far (metres) from the receiver, and the receiver from every surface."""
+"""Minimum distance (metres) of a transmitter from the receiver, and of the receiver from every surface."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 FREQUENCIES_HZ = tuple(ghz * 1e9 for ghz in (1.0, 2.4, 5.0, 10.0, 24.25, 37.0, 47.0, 60.0, 77.0, 94.0))
-"""The ten frequencies of the paper's Table 4, those of every scene."""
+"""The ten frequencies of the paper's Table 4, used by all scenes."""
 FREQUENCIES_21_HZ = tuple(ghz * 1e9 for ghz in (1.0, *np.arange(5.0, 101.0, 5.0).tolist()))
 """1, 5, 10, ..., 100 GHz: a finer sampling of the same band."""
 KINDS = ("shell", "partition", "solid")
-"""What a part is: a piece of the room's outer surface, a single sheet inside the room, or a closed body."""
+"""Kinds of parts: a piece of the room's outer surface, a single sheet inside the room, or a closed body."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Part:
 
     @property
     def closed(self) -> bool:
-        """A body with an inside, rather than a single sheet."""
+        """Whether the part is a body with an inside rather than a single sheet."""
         return self.kind == "solid"
 
 
 def part(name: str, mesh: trimesh.Trimesh, material: str, thickness: float | None = None, kind: str = "solid") -> Part:
-    """Returns a part with a checked material and, unless given, that material's default thickness (metres)."""
+    """Returns a part with a checked material and, by default, that material's usual thickness (metres)."""
     check_material(material)
     if kind not in KINDS:
         raise ValueError(f"a part is one of {KINDS}, not {kind!r}")
@@ -68,7 +68,7 @@ class SceneSpec:
     parts: tuple[Part, ...]
     rx_position: Vec3
     tx_grid: Float[np.ndarray, "candidates 3"]
-    """Candidate transmitter positions; `accessible_tx` picks those that can be reached."""
+    """Candidate transmitter positions; `accessible_tx` selects those in free space."""
     frequencies_hz: tuple[float, ...] = FREQUENCIES_HZ
     rx_orientation: tuple[float, float, float, float] = IDENTITY
     description: str = field(default="")
@@ -79,7 +79,7 @@ class SceneSpec:
         return tuple(p for p in self.parts if p.closed)
 
     def triangles(self, *kinds: str) -> Float[np.ndarray, "m 3 3"]:
-        """Returns the corners of all triangles of the parts of some kinds, of all kinds unless given."""
+        """Returns the corners of all triangles of parts of the given kinds, by default of all kinds."""
         found = [np.asarray(p.mesh.triangles) for p in self.parts if p.kind in (kinds or KINDS)]
         return np.concatenate([np.zeros((0, 3, 3)), *found])
 
@@ -93,20 +93,20 @@ class SceneSpec:
         return np.stack([corners.min(0), corners.max(0)])
 
     def in_room(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Returns which points the outer surface encloses: a way out of the room crosses it an odd number of times."""
+        """Returns which points the outer surface encloses: a line out of the room crosses it an odd number of times."""
         low, high = self.bounds()
-        outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # askew, to meet no edge of a wall
+        outside = high + np.array([1.0, np.sqrt(2), np.sqrt(3)]) * (high - low)  # oblique, to hit no edge of a wall
         return crossings(self.mesh("shell"), points, outside) % 2 == 1
 
     def line_of_sight(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Returns from which points nothing, not even glass, hides the receiver."""
+        """Returns which points have an unobstructed line of sight to the receiver; even glass obstructs it."""
         return crossings(self.mesh(), points, np.asarray(self.rx_position)) == 0
 
     def inside_objects(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Returns which points are inside a solid."""
         inside = np.zeros(len(points), bool)
         for p in self.solids:
-            near = trimesh.bounds.contains(p.mesh.bounds, points)  # the others need no look at the triangles
+            near = trimesh.bounds.contains(p.mesh.bounds, points)  # for the other points, triangles need not be tested
             inside[near] |= np.abs(winding_number(p.mesh, points[near])) > 0.5
         return inside
 
@@ -115,7 +115,8 @@ class SceneSpec:
         return distance(self.mesh(), points)
 
     def accessible_tx(self) -> Float[np.ndarray, "tx 3"]:
-        """Returns the candidates that are in the room, in no object, and clear of surfaces and of the receiver, in grid order.
+        """Returns the candidates inside the room, outside all objects, and clear of surfaces and of the receiver, in grid
+        order.
 
         Raises:
             UserError: the receiver is inside or too near to something, or no candidate is left.
@@ -129,7 +130,7 @@ class SceneSpec:
         return grid[keep]
 
     def check_receiver(self) -> None:
-        """Raises a `UserError` when the receiver is outside the room, inside an object or too near to a surface."""
+        """Raises a `UserError` if the receiver is outside the room, inside an object or too near to a surface."""
         point = np.asarray([self.rx_position], np.float64)
         if not self.in_room(point)[0] or self.inside_objects(point)[0] or self.distance(point)[0] < RX_CLEARANCE:
             raise UserError(f"the receiver of scene {self.name} at {self.rx_position} is not {RX_CLEARANCE} m clear; move it")
@@ -155,6 +156,6 @@ class SceneSpec:
 
 
 def grid_3d(low: Vec3, high: Vec3, counts: tuple[int, int, int]) -> Float[np.ndarray, "n 3"]:
-    """Returns a uniform grid with both ends included, x slowest, z fastest."""
+    """Returns a uniform grid including both ends, x slowest, z fastest."""
     axes = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -1,6 +1,6 @@
 """Furniture as meshes. Everything stands on the floor (z = GAP) centred on (x, y); metres, z up.
 
-`facing` turns a piece about the vertical by quarter turns: 0 looks towards +y, 1 towards -x, 2 towards -y, 3 towards +x.
+`facing` rotates a piece about the vertical by quarter turns: 0 faces +y, 1 towards -x, 2 towards -y, 3 towards +x.
 """
 
 import numpy as np
@@ -13,9 +13,9 @@ LAMP_SIDES = 8  # a round shade would be hundreds of triangles and as many diffr
 
 
 def place(mesh: trimesh.Trimesh, x: float, y: float, facing: int = 0) -> trimesh.Trimesh:
-    """Turns a mesh about the vertical by quarter turns, then moves it to (x, y) and onto the floor."""
+    """Rotates a mesh about the vertical by quarter turns, then moves it to (x, y) and onto the floor."""
     cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[facing % 4]
-    # Whole numbers, so that turned boxes stay exactly axis-aligned.
+    # Whole numbers, so that rotated boxes stay exactly axis-aligned.
     turn = np.array([[cosine, -sine, 0, x], [sine, cosine, 0, y], [0, 0, 1, GAP], [0, 0, 0, 1]], np.float64)
     return mesh.copy().apply_transform(turn)
 
@@ -34,7 +34,7 @@ def table(width: float, depth: float, height: float, board: float = 0.04) -> tri
 
 
 def chair(width: float = 0.45, seat: float = 0.46, height: float = 0.88) -> trimesh.Trimesh:
-    """Returns a chair whose sitter looks towards +y."""
+    """Returns a chair whose sitter faces +y."""
     half, board = width / 2, 0.04
     cushion = box((-half, -half, seat - board), (half, half, seat))
     back = box((-half, -half, seat + JOINT), (half, -half + board, height))
@@ -42,7 +42,7 @@ def chair(width: float = 0.45, seat: float = 0.46, height: float = 0.88) -> trim
 
 
 def sofa(width: float, depth: float = 0.9, height: float = 0.8) -> trimesh.Trimesh:
-    """Returns a sofa whose sitter looks towards +y: seat, back and two arms."""
+    """Returns a sofa whose sitter faces +y: seat, back and two arms."""
     half, front, arm, seat = width / 2, depth / 2, 0.18, 0.42
     inner = half - arm - JOINT
     back = box((-inner, -front, 0), (inner, -front + 0.22, height))
@@ -52,7 +52,7 @@ def sofa(width: float, depth: float = 0.9, height: float = 0.8) -> trimesh.Trime
 
 
 def shelf(width: float, depth: float, height: float, boards: int = 5, thickness: float = 0.03) -> trimesh.Trimesh:
-    """Returns an open book shelf that looks towards +y: two sides, a back and horizontal boards."""
+    """Returns an open book shelf that faces +y: two sides, a back and horizontal boards."""
     half, front = width / 2, depth / 2
     sides = [box((a, -front, 0), (a + thickness, front, height)) for a in (-half, half - thickness)]
     inner = half - thickness - JOINT
@@ -68,7 +68,7 @@ def cabinet(width: float, depth: float, height: float) -> trimesh.Trimesh:
 
 
 def screen(width: float, height: float, bottom: float, thickness: float = 0.05) -> trimesh.Trimesh:
-    """Returns a flat display that looks towards +y, its lower edge `bottom` above the floor."""
+    """Returns a flat display that faces +y, its lower edge `bottom` above the floor."""
     return box((-width / 2, -thickness / 2, bottom), (width / 2, thickness / 2, bottom + height))
 
 
@@ -115,7 +115,7 @@ def desk(width: float, depth: float = 0.7, height: float = 0.74) -> trimesh.Trim
 
 
 def office_chair(seat: float = 0.46, height: float = 0.84) -> trimesh.Trimesh:
-    """Returns a chair on one column whose sitter looks towards +y."""
+    """Returns a chair on one column whose sitter faces +y."""
     base = box((-0.26, -0.26, 0.02), (0.26, 0.26, 0.06))
     column = box((-0.03, -0.03, 0.06 + JOINT), (0.03, 0.03, seat - 0.06 - JOINT))
     cushion = box((-0.24, -0.24, seat - 0.06), (0.24, 0.24, seat))
@@ -132,14 +132,14 @@ def bench(width: float, depth: float = 0.35, height: float = 0.45) -> trimesh.Tr
 
 
 def monitor(bottom: float, width: float = 0.6) -> trimesh.Trimesh:
-    """Returns a computer display on a foot that looks towards +y and stands on something `bottom` high."""
+    """Returns a computer display on a foot that faces +y and stands on something `bottom` high."""
     low = bottom + JOINT
     foot = box((-0.13, -0.09, low), (0.13, 0.09, low + 0.02))
     return merge([foot, box((-width / 2, -0.02, low + 0.02 + JOINT), (width / 2, 0.02, low + 0.38))])
 
 
 def counter(width: float, depth: float = 0.6, height: float = 0.85) -> trimesh.Trimesh:
-    """Returns kitchen base units with a worktop, looking towards +y."""
+    """Returns kitchen base units with a worktop, facing +y."""
     half, front = width / 2, depth / 2
     units = box((-half, -front, 0), (half, front - 0.04, height - 0.04 - JOINT))
     return merge([units, box((-half, -front, height - 0.04), (half, front, height))])

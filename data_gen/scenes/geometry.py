@@ -1,8 +1,8 @@
-"""Meshes and questions about them: boxes, inside or outside, crossings, distances. Metres, z up.
+"""Geometric operations on meshes: boxes, tests for inside or outside, crossings, distances. Metres, z up.
 
-Rays and distances are trimesh's, which searches the triangles with rtree: on the released scenes several times as fast as all
-pairs of points and triangles, with equal answers. Inside or outside a body is told by the winding number, because trimesh's
-`contains` counts crossings of a ray and errs where it grazes an edge: at 5 of the 5,400 candidate transmitters.
+Rays and distances are computed by trimesh, which searches triangles with rtree: several times as fast on the released scenes as
+testing all pairs of points and triangles, with equal results. Inside or outside is decided by the winding number, because
+trimesh's `contains` counts crossings of a ray and errs if it grazes an edge: at 5 of the 5,400 candidate transmitters.
 """
 
 import importlib.util
@@ -35,12 +35,12 @@ def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns how often a closed mesh goes around every point: 0 outside, 1 or -1 inside."""
+    """Returns the winding number of a closed mesh around every point: 0 outside, 1 or -1 inside."""
     return solids.winding_number(np.asarray(mesh.triangles), points)
 
 
 def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, " n"]:
-    """Returns how many triangles of a mesh the straight segment from every start to the one end goes through."""
+    """Returns the number of triangles of a mesh crossed by the straight segment from every start to the end."""
     if not len(start) or not len(mesh.faces):
         return np.zeros(len(start), int)
     _demand_rtree()
@@ -52,7 +52,7 @@ def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float
 
 
 def distance(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns the distance of every point to the nearest place on a mesh."""
+    """Returns the distance of every point to the nearest point of a mesh."""
     _demand_rtree()
     return trimesh.proximity.closest_point(mesh, points)[1] if len(points) else np.zeros(0)
 

@@ -1,6 +1,6 @@
 """Scene 1: a sparsely furnished living room, 10 x 7.5 x 3 m. The origin lies on the floor in the middle of the room.
 
-Plan (x to the right, y up); the receiver R looks along +x:
+Plan (x to the right, y up); the receiver R faces +x:
 
     +y   window      screen      window
       +----====------######------====----+
@@ -20,8 +20,8 @@ WIDTH, DEPTH, HEIGHT = 10.0, 7.5, 3.0
 """Size of the room along x, y and z in metres."""
 
 RX_POSITION = (-4.2, 0.35, 1.0)
-"""0.8 m from the -x wall and off the room's symmetry plane; low, so that most transmitters are above it: the PAS shows the
-upper half of the directions only."""
+"""0.8 m from the -x wall and off the room's symmetry plane; low, so that most transmitters are above it: the PAS shows only the
+upper half of the directions."""
 
 TX_COUNTS = (15, 10, 6)
 TX_LOW, TX_HIGH = (-4.6, -3.35, 0.5), (4.6, 3.35, 2.6)

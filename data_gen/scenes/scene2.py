@@ -1,6 +1,6 @@
 """Scene 2: a densely furnished two-bedroom flat, 11 x 8.5 x 2.7 m. The origin lies on the floor in the middle of the outline.
 
-Plan (x to the right, y up); the receiver R looks along +x; gaps are open doors:
+Plan (x to the right, y up); the receiver R faces +x; gaps are open doors:
 
     +---window---+--door----+--window------+
     | study      |  hall    |  child's     |
@@ -37,14 +37,14 @@ WIDTH, DEPTH, HEIGHT = 11.0, 8.5, 2.7
 """Outline and height along x, y and z in metres."""
 
 RX_POSITION = (-4.7, -1.6, 1.0)
-"""In the living room, looking at the dining table and the wall of the bedroom behind it."""
+"""In the living room, facing the dining table and the wall of the bedroom behind it."""
 
 TX_COUNTS = (15, 10, 6)
 TX_LOW, TX_HIGH = (-4.92, -3.53, 0.6), (4.97, 3.67, 2.35)
 """Corners of the grid of 900 candidates; its planes keep clear of the inner walls and of table tops."""
 
 BEARING_Y = 0.85
-"""Where the load-bearing wall stands."""
+"""Position of the load-bearing wall."""
 
 
 def scene2() -> SceneSpec:

@@ -1,7 +1,7 @@
 """Scene 3: a densely furnished L-shaped flat, 12 x 10 m outline, 2.6 m high. The origin lies on the floor in the middle of the
 outline's bounding rectangle.
 
-Plan (x to the right, y up); the receiver R looks along +x; gaps are open doors:
+Plan (x to the right, y up); the receiver R faces +x; gaps are open doors:
 
            +--window----+-window--+
            | kitchen    | study   |
@@ -42,7 +42,7 @@ NOTCH = (1.2, 0.83)
 """The re-entrant corner of the L: nothing beyond it in both +x and +y."""
 
 RX_POSITION = (-5.2, -1.9, 1.0)
-"""In the living room, looking through the hall into the bedrooms."""
+"""In the living room, facing the bedrooms through the hall."""
 
 TX_COUNTS = (15, 12, 6)
 TX_LOW, TX_HIGH = (-5.41, -4.37, 0.6), (5.64, 4.31, 2.45)

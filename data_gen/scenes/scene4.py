@@ -1,6 +1,6 @@
 """Scene 4: a densely furnished office floor along a corridor, 18 x 6 x 2.8 m. The origin lies on the floor in the middle.
 
-Plan (x to the right, y up); the receiver R looks along +x down the corridor; gaps are open doors:
+Plan (x to the right, y up); the receiver R faces +x down the corridor; gaps are open doors:
 
     +-sofa-+-lockers-+-desk--window--+---window-------+--window--+-counter-+
     |      |         H office        |     meeting    | office   | kitchen |
@@ -40,7 +40,7 @@ TX_LOW, TX_HIGH = (-8.69, -2.25, 0.6), (8.63, 2.18, 2.65)
 """Corners of the grid of 900 candidates; its planes keep clear of the inner walls and of table tops."""
 
 CORRIDOR_Y = -1.15
-"""Where the wall between the corridor and the rooms stands."""
+"""Position of the wall between the corridor and the rooms."""
 
 
 def scene4() -> SceneSpec:
@@ -73,7 +73,7 @@ def _inner_walls() -> list[Part]:
     x, y = WIDTH / 2, DEPTH / 2
     doors = [Door(1.78, leaf=(-1, 1)), Door(5.2, leaf=(1, 1)), Door(9.0, leaf=(1, 1)), Door(12.2, width=1.2)]
     return [
-        # The post at the corridor's corner takes up the edges of both walls that meet there.
+        # The post at the corridor's corner contains the edges of both walls that meet there.
         *inner_wall("corridor", (-4.68, CORRIDOR_Y), (x, CORRIDOR_Y), HEIGHT, doors=doors, free=(True, False)),
         *inner_wall("bearing", (-4.62, CORRIDOR_Y + 0.05), (-4.62, y), HEIGHT, "concrete", 0.15),
         *inner_wall("partition_meeting", (-1.08, CORRIDOR_Y), (-1.08, y), HEIGHT),
@@ -116,7 +116,7 @@ def _offices() -> list[Part]:
 
 
 def _work_place(number: int, x: float, y: float, facing: int) -> list[Part]:
-    """Returns a desk with a display and, in front of it, a chair that looks at it."""
+    """Returns a desk with a display and, in front of it, a chair facing it."""
     ahead = {1: (-1, 0), 2: (0, -1)}[facing]
     chair_at = (x + 0.68 * ahead[0], y + 0.68 * ahead[1])
     display_at = (x - 0.15 * ahead[0], y - 0.15 * ahead[1])

@@ -1,7 +1,7 @@
 """Scene 5: a densely furnished loft flat under a sloped roof, 10.5 x 8 m, 2.2 to 3.6 m high. The origin lies on the floor
 in the middle.
 
-Plan (x to the right, y up; the roof rises along +y); the receiver R looks along +x; gaps are open doors:
+Plan (x to the right, y up; the roof rises along +y); the receiver R faces +x; gaps are open doors:
 
     +--------------+--door--+-wardrobe-shelf-+
     | study  desk             guest room desk|
@@ -43,7 +43,7 @@ LOW, HIGH = 2.2, 3.6
 RISE = (HIGH - LOW) / DEPTH
 
 RX_POSITION = (-4.45, -0.7, 1.0)
-"""In the living room, looking past the pillar at the wall of the bedrooms."""
+"""In the living room, facing the wall of the bedrooms past the pillar."""
 
 TX_COUNTS = (15, 10, 8)
 TX_LOW, TX_HIGH = (-4.81, -3.68, 0.6), (4.84, 3.33, 3.25)
@@ -96,7 +96,7 @@ def _inner_walls() -> list[Part]:
     return [
         *inner_wall("bearing", (0.35, -y), (0.35, y), LOW, "concrete", 0.15, doors, rise=RISE),
         *inner_wall("partition_guest", (0.35, 0.0), (x, 0.0), roof(0.0)),
-        # The post at the study's corner takes up the edges of both walls that meet there.
+        # The post at the study's corner contains the edges of both walls that meet there.
         *inner_wall("partition_living", (-x, 1.6), (-1.69, 1.6), roof(1.6), free=(False, True)),
         *inner_wall("partition_study", (-1.75, 1.65), (-1.75, y), roof(1.65), doors=[Door(1.4, leaf=(1, 1))], rise=RISE),
     ]

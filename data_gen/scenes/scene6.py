@@ -1,6 +1,6 @@
 """Scene 6: a sparsely furnished bedroom with a chimney breast, 7 x 5.5 x 2.6 m. The origin lies on the floor in the middle.
 
-Plan (x to the right, y up); the receiver R looks along +x:
+Plan (x to the right, y up); the receiver R faces +x:
 
     +y     [ bed ]      window   wardrobe
       +----------------===========-------+

@@ -1,6 +1,6 @@
-"""Room surfaces: walls, floors and ceilings with doors and windows flush in them, and inner walls with open doorways.
+"""Room surfaces: walls, floors and ceilings with flush doors and windows, and inner walls with open doorways.
 
-A surface is a single sheet whose material has a thickness. The ray tracer diffracts at the edges of solids only, not at the
+A surface is a single sheet whose material has a thickness. The ray tracer diffracts only at the edges of solids, not at the
 free edge of a sheet; therefore every free edge ends `REBATE` deep inside a solid: a door frame or an end post.
 """
 
@@ -19,19 +19,19 @@ Rectangle = tuple[float, float, float, float]
 """(u low, v low, u high, v high) in the coordinates of a wall, metres."""
 
 FRAME = 0.06
-"""Metres of a door frame along the wall."""
+"""Width of a door frame along the wall, metres."""
 FRAME_DEPTH = 0.15
-"""Metres of a door frame across the wall, centred on the sheet."""
+"""Depth of a door frame across the wall, centred on the sheet, metres."""
 POST = 0.12
-"""Metres of an end post along the wall; across it is as deep as a door frame."""
+"""Width of an end post along the wall, metres; across it, it is as deep as a door frame."""
 POST_GAP = 0.02
-"""Metres between an end post and the ceiling: enough for a roof that falls across the wall."""
+"""Metres between an end post and the ceiling: enough for a roof that slopes across the wall."""
 REBATE = 0.025
-"""How far (metres) a sheet reaches into the frame or post that hides its edge."""
+"""Depth (metres) by which a sheet extends into the frame or post that hides its edge."""
 LEAF = 0.04
 """Thickness of a door leaf in metres."""
 STUD_WALL = 0.025
-"""Plasterboard in metres that a wave meets in an inner wall: two boards of 12.5 mm with air between them."""
+"""Total thickness of plasterboard in an inner wall, metres: two boards of 12.5 mm with air between them."""
 
 
 def wall(
@@ -39,7 +39,7 @@ def wall(
     openings: Mapping[str, tuple[Rectangle, str | None]] | None = None,
     thickness: float | None = None, rise: float = 0.0, kind: str = "shell",
 ) -> list[Part]:  # fmt: skip
-    """Returns a rectangular surface with doors or windows flush in it.
+    """Returns a rectangular surface with flush doors or windows.
 
     The rectangle is cut along the lines of all openings; a cell belongs to the opening that covers it, otherwise to the wall.
     The parts meet at shared vertices, without a hole and without overlap.
@@ -48,8 +48,8 @@ def wall(
         corner, along, up: the point (0, 0) of the surface and its two unit directions.
         size: lengths (metres) along the two directions.
         openings: by name a rectangle in the surface's coordinates and a material; None leaves a hole.
-        thickness: of the wall's own material in metres; the material's default unless given.
-        rise: how much higher the upper edge gets with every metre along, for a wall below a sloped ceiling.
+        thickness: of the wall's own material in metres; by default the usual one.
+        rise: increase of the upper edge's height per metre along, for a wall below a sloped ceiling.
     """
     openings = openings or {}
     rectangles = [rectangle for rectangle, _ in openings.values()]
@@ -118,17 +118,17 @@ class Door:
     """An open doorway in an inner wall; sizes are those of the clear opening in metres."""
 
     at: float
-    """Distance of its middle from the start of the wall."""
+    """Distance of its centre from the start of the wall."""
     leaf: tuple[int, int] | None = None
-    """Which jamb the open leaf hangs at (-1 the one nearer to the wall's start, +1 the other) and on which side it stands
-    (+1 left of the wall seen from its start, -1 right); None for a doorway without a leaf."""
+    """Jamb of the open leaf (-1 for the one nearer to the wall's start, +1 for the other) and side on which it stands (+1 left
+    of the wall seen from its start, -1 right); None for a doorway without a leaf."""
     width: float = 0.9
     height: float = 2.05
 
 
 @dataclass(frozen=True)
 class _Line:
-    """The foot of an inner wall along +x or +y; u runs along it, v to the left of it."""
+    """The base line of an inner wall along +x or +y; u runs along it, v to its left."""
 
     start: Vec2
     end: Vec2
@@ -137,7 +137,7 @@ class _Line:
     def along(self) -> Vec2:
         step = np.subtract(self.end, self.start)
         if step.min() != 0 or step.max() <= 0:
-            raise ValueError(f"an inner wall runs along +x or +y, not from {self.start} to {self.end}")
+            raise ValueError(f"an inner wall must run along +x or +y, not from {self.start} to {self.end}")
         return (1.0, 0.0) if step[0] > 0 else (0.0, 1.0)
 
     @property
@@ -156,12 +156,12 @@ def inner_wall(
     name: str, start: Vec2, end: Vec2, height: float, material: str = "plasterboard", thickness: float | None = None,
     doors: Sequence[Door] = (), free: tuple[bool, bool] = (False, False), rise: float = 0.0,
 ) -> list[Part]:  # fmt: skip
-    """Returns a wall between rooms: the sheet, and in wood the door frames, the open leaves and the posts at free ends.
+    """Returns a wall between rooms: the sheet and, in wood, the door frames, the open leaves and the posts at free ends.
 
     Args:
-        start, end: its foot, along +x or +y, in metres; it touches what it ends at unless that end is free.
-        height: at the start, in metres; with a `rise`, it grows along the wall like the ceiling above.
-        free: whether the wall stops in the middle of a room, at its start and at its end.
+        start, end: its base line, along +x or +y, in metres; it touches the objects at its ends unless they are free.
+        height: at the start, in metres; with a `rise`, it increases along the wall like the ceiling above.
+        free: whether the wall ends in the middle of a room, at its start and at its end.
     """
     line = _Line(start, end)
     if material == "plasterboard" and thickness is None:
@@ -191,7 +191,7 @@ def _upright(line: _Line, u0: float, u1: float, top: float) -> trimesh.Trimesh:
 
 
 def _frame(line: _Line, door: Door) -> list[trimesh.Trimesh]:
-    """Returns two jambs and a head on them."""
+    """Returns two jambs with a head on top."""
     half, depth = door.width / 2, FRAME_DEPTH / 2
     head = (door.height + JOINT, door.height + JOINT + FRAME)
     return [
@@ -202,7 +202,7 @@ def _frame(line: _Line, door: Door) -> list[trimesh.Trimesh]:
 
 
 def _leaf(line: _Line, door: Door, jamb: int, side: int) -> trimesh.Trimesh:
-    """Returns a leaf opened by a quarter turn: it stands across the wall in front of its jamb."""
+    """Returns a leaf opened by 90 degrees: it stands perpendicular to the wall in front of its jamb."""
     hinge = door.at + jamb * (door.width / 2 + FRAME / 2)
     near = FRAME_DEPTH / 2 + GAP
     return line.box(

@@ -145,9 +145,9 @@ def test_a_wall_of_metal_gives_the_coherent_field_slopes_too(rng):
 def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_refused(by_spectra):
     with pytest.raises(ValueError, match="expected"):
         by_spectra(jnp.zeros((3, 90, 360)))
-    with pytest.raises(UserError, match="says nothing"):
+    with pytest.raises(UserError, match="is not enough"):
         locator(trained(), HZ[:1], "power", RECEIVERS[:1], BOX, known_power=False)
-    with pytest.raises(UserError, match="knows no snapshots"):
+    with pytest.raises(UserError, match="predicts no snapshots"):
         locator(Trained(Silent(), None), HZ, "snapshots")
 
 

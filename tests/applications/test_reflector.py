@@ -105,5 +105,5 @@ def test_what_cannot_reflect_or_tell_is_refused():
     with pytest.raises(UserError, match="two sides above 0"):
         reflector(TX, USER, (0.0, 1.0), HZ)
     field = Blind()
-    with pytest.raises(UserError, match="knows no paths"):
+    with pytest.raises(UserError, match="predicts no paths"):
         reflector(TX, USER, (1.0, 1.0), HZ, field, field.init(jax.random.key(0)))

@@ -75,5 +75,5 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
 
 def test_a_field_without_paths_turns_nothing():
     field = Blind()
-    with pytest.raises(UserError, match="knows no paths"):
+    with pytest.raises(UserError, match="predicts no paths"):
         arrivals_anywhere(field, field.init(jax.random.key(0)), RX, [[1.0, 0, 0]], HZ)

@@ -68,7 +68,7 @@ def test_a_model_becomes_a_room_beside_spectra(tmp_path):
     )
     options = "--materials", tmp_path / "m.toml", "--scale", 0.001, "--out", tmp_path / "room.npz"
     listing = convert(tmp_path / "hall.glb", *options)
-    assert "wall_a  brick     0.2 m   sheet, of a closed box 0.2 m deep  2 triangles" in listing
+    assert "wall_a  brick     0.2 m   sheet from a closed box 0.2 m deep  2 triangles" in listing
     assert "desk    wood      0.03 m  closed" in listing, "a name takes precedence over a pattern"
     assert "4 objects from (0, 0, 0) to (8, 5, 2.7) m" in listing
     room = load_room(tmp_path / "room.npz")
@@ -76,7 +76,7 @@ def test_a_model_becomes_a_room_beside_spectra(tmp_path):
         ("wood", 0.03), ("concrete", 0.2), ("brick", 0.2), ("glass", 0.01)
     ]  # fmt: skip
     unknown = convert(tmp_path / "hall.glb", "--scale", 0.001, "--out", tmp_path / "other.npz")
-    assert "desk    desk    of unknown thickness" in unknown
+    assert "desk    desk    unknown thickness" in unknown
     np.testing.assert_array_equal(load_room(tmp_path / "other.npz").vertices, room.vertices)
 
 
@@ -92,7 +92,7 @@ def test_a_model_without_an_answer(tmp_path):
         (["--out", "a.ply"], ["--run", "--paths", "room.glb"]),
         (["room.glb", "--run", "RUN", "--out", "a.npz"], ["one of --run"]),
         (["room.glb", "--out", "a.ply"], ["a.ply does not end in .npz"]),
-        (["room.glb", "--out", "a.npz"], ["there is no scene file room.glb"]),
+        (["room.glb", "--out", "a.npz"], ["scene file room.glb does not exist"]),
         (["--run", "RUN", "--out", "a.ply"], ["--tx", "--ghz 28"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.obj"], ["a.obj", "gaussians.ply"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["knows no paths"]),

@@ -52,14 +52,14 @@ def test_cells_grow_until_a_map_can_hold_them(tmp_path, rng):
     ("options", "says"),
     [
         ([], "give --data FOLDER"),
-        (["--data", "nowhere"], "there is no folder nowhere"),
+        (["--data", "nowhere"], "folder nowhere does not exist"),
         (["--data", "DATA", "--out", "scores.txt"], "does not end in .json"),
         (["--data", "DATA", "--answers", "a.csv"], "--answers needs --tx"),
         (["--data", "DATA", "--cell", "0"], "--cell is 0"),
-        (["--data", "DATA", "--tx", "1,2"], "--tx 1,2 is no position"),
+        (["--data", "DATA", "--tx", "1,2"], "--tx 1,2 is not a position"),
         (["--data", "DATA", "--floor-plan", "nowhere.csv"], "there is no floor plan nowhere.csv"),
         (["--floor-plan", "walls.csv", "--mesh", "w.ply", "--tx", "1,1,1"], "powers follow from readings"),
-        (["--data", "DATA", "--tx", "1e30,0,0"], "--tx 1e30,0,0 is no position"),
+        (["--data", "DATA", "--tx", "1e30,0,0"], "--tx 1e30,0,0 is not a position"),
         (["--data", "DATA", "--out", "/dev/null/s.json"], "cannot write /dev/null/s.json"),
     ],
 )

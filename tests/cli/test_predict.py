@@ -389,7 +389,7 @@ def test_the_whole_channel(coherent, tmp_path):
         (["--what", "frequency-response"], ["knows no paths"]),
         (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is no array"]),
         (["--what", "mimo", "--tx-array", "0x3"], ["--tx-array 0x3"]),
-        (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is no velocity"]),
+        (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is not a velocity"]),
         (["--what", "frequency-response", "--points", "1"], ["is no band"]),
         (["--what", "frequency-response", "--band-mhz", "-5"], ["is no band"]),
         (["--what", "frequency-response", "--band-mhz", "100000"], ["reaches -22 GHz"]),

@@ -121,7 +121,7 @@ def test_the_paper_s_field_trains_on_a_folder_of_spectra(tmp_path, layout):
 def test_eval_of_other_data_for_people_with_results(run, layout, tmp_path):
     result = call(eval_command.main, "--run", run, "--data", layout, "--no-pictures", "--results", tmp_path / "results")
     assert result.code == 0, result.err
-    assert "held-out SSIM" in result.out and "inverse distance" in result.out and "ms a PAS" in result.out
+    assert "held-out SSIM" in result.out and "inverse distance" in result.out and "ms per PAS" in result.out
     assert not (run / "pictures").exists()
     assert len([*run.glob("eval-*.json")]) == 1, "scores on other data do not replace the run's own"
     (path,) = (tmp_path / "results").iterdir()

@@ -66,7 +66,7 @@ def test_rows_of_elevations_are_moved_to_their_directions(rng):
 def test_the_zenith_reveals_the_convention(rng, convention):
     images, receiver, tx, _ = room(rng, 3, convention)
     found = find_convention(images, receiver, tx, np.arange(3))
-    assert found.convention == convention and "at a single direction" in found.reason
+    assert found.convention == convention and "shows a single direction" in found.reason
 
 
 @pytest.mark.parametrize("convention", ["zenith", "elevation"])
@@ -109,7 +109,7 @@ def test_a_folder_is_read_as_it_reveals_or_as_it_is_named(tmp_path, rng):
         np.testing.assert_array_equal(load_layout(folder, convention="zenith").observations["pas"], images)
         (folder / "gateway_info.yml").write_text("convention: elevation\n" + (folder / "gateway_info.yml").read_text())
         assert load_layout(folder).convention == load_layout(folder, convention="elevation").convention == "elevation"
-    with pytest.raises(UserError, match="names the convention elevation; leave out zenith"):
+    with pytest.raises(UserError, match="specifies the convention elevation; leave out zenith"):
         load_layout(folder, convention="zenith")
     (folder / "gateway_info.yml").write_text((folder / "gateway_info.yml").read_text().replace(": elevation", ": north"))
     with pytest.raises(UserError, match="convention is 'north'; it must be zenith or elevation"):
@@ -143,7 +143,7 @@ def test_the_command_takes_it_and_the_run_keeps_it(tmp_path, rng, monkeypatch):
     folder = folder_of(rng.permutation(images.ravel()).reshape(images.shape), receiver, tx, tmp_path / "den")
     short = ["--field", "wideband", "--preset", "smoke", "--out", tmp_path / "run"]
     refused = call(train_command.main, "--data", folder, *short)
-    assert_error_for_people(refused, "does not name the order of its pixels", "--convention zenith or elevation")
+    assert_error_for_people(refused, "does not record the order of its pixels", "--convention zenith or elevation")
     assert not (tmp_path / "run").exists()
     nowhere = call(train_command.main, "--scene", "1", "--convention", "elevation", *short)
     assert_error_for_people(nowhere, "--convention is for folders of spectra")

@@ -131,7 +131,7 @@ def test_no_links_no_spectra(data, kind, unit):
 
 
 def test_power_has_no_angular_spectrum(data):
-    with pytest.raises(UserError, match="box holds received powers, which have no angular spectrum; ") as error:
+    with pytest.raises(UserError, match="box contains received powers, which have no angular spectrum; ") as error:
         data["power", "wavelengths"].pas(np.arange(2))
     assert "\n" not in str(error.value)
 

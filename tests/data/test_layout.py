@@ -92,7 +92,7 @@ def test_a_room_lies_in_the_frame_of_the_transmitters(folder, rng):
         rng.normal(size=(4, 3)).astype(np.float32), np.array([[0, 1, 2], [1, 2, 3]], np.int32), np.array([0, 1], np.int32)
     )
     save_room(folder / "room.npz", dataclasses.replace(room, parts=[{"name": n, "material": n, "thickness": 0} for n in "ab"]))
-    with pytest.raises(UserError, match=r"both point_cloud.ply and room.npz; keep the one"):
+    with pytest.raises(UserError, match=r"both point_cloud.ply and room.npz; keep only one"):
         load_layout(folder)
     (folder / "point_cloud.ply").unlink()
     dataset = load_layout(folder)
@@ -146,14 +146,14 @@ def test_one_frequency_from_the_gateway_or_the_caller(folder, where):
     (folder / "gateway_info.yml").write_text(GATEWAY + where)
     assert set(load_layout(folder).frequencies_hz) == {915e6}
     assert set(load_layout(folder, frequency_hz=868e6).frequencies_hz) == {868e6}
-    with pytest.raises(UserError, match=r"the model knows 0\.3 to 100 GHz"):
+    with pytest.raises(UserError, match=r"the valid range is 0\.3 to 100 GHz"):
         load_layout(folder, frequency_hz=0.0)
 
 
 def test_a_folder_with_walls_but_no_frequency_is_doubted(folder):
     (folder / "freq.txt").unlink()
     trimesh.creation.box().export(folder / "point_cloud.ply")
-    with pytest.warns(UserWarning, match="names no frequency: its spectra are taken to be of 1 GHz"):
+    with pytest.warns(UserWarning, match="does not record a frequency, and 1 GHz is assumed"):
         load_layout(folder)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -168,7 +168,7 @@ def test_a_frequency_at_odds_with_the_file_is_refused(folder):
 def test_the_first_gateway_is_the_receiver(folder):
     second = "gateway2:\n  position: [9, 9, 9]\n  orientation: [0, 0, 0, 1]\n"
     (folder / "gateway_info.yml").write_text(GATEWAY + second)
-    with pytest.warns(UserWarning, match=r"gateway_info\.yml names 2 gateways; the first, 'gateway1'"):
+    with pytest.warns(UserWarning, match=r"gateway_info\.yml has 2 gateways; the first one, 'gateway1'"):
         np.testing.assert_array_equal(load_layout(folder).receivers.position, np.float32([[2, 1, 0.5]]))
 
 
@@ -236,10 +236,10 @@ def no_images(folder):
     ("spoil", "file", "trouble"),
     [
         (shutil.rmtree, "den", "is not a folder"),
-        (empty, "spectrum", "holds no .png"),
-        (no_images, "spectrum", "holds no .png"),
-        (remove("spectrum"), "spectrum", "holds no .png"),
-        (remove("spectrum/00003.png"), "spectrum", "stands where image 00003 is due"),
+        (empty, "spectrum", "has no .png"),
+        (no_images, "spectrum", "has no .png"),
+        (remove("spectrum"), "spectrum", "has no .png"),
+        (remove("spectrum/00003.png"), "spectrum", "is in the place of image 00003"),
         (truncate("spectrum/00003.png"), "00003.png", "truncated"),
         (truncate("spectrum/00003.png", 0.02), "00003.png", "truncated"),
         (write("spectrum/00003.png", b""), "00003.png", "truncated or not a PNG"),
@@ -248,7 +248,7 @@ def no_images(folder):
         (image("spectrum/00003.png", (360, 90), "RGB"), "00003.png", "mode RGB"),
         (image("spectrum/00003.png", (360, 90), "I;16"), "00003.png", "mode I;16"),
         (image("spectrum/mean.png", (360, 90)), "spectrum", "'mean' is not an image number"),
-        (image("spectrum/3.png", (360, 90)), "spectrum", "stands where image 00004 is due"),
+        (image("spectrum/3.png", (360, 90)), "spectrum", "is in the place of image 00004"),
         (image("spectrum/00000.png", (360, 90)), "00000.png", "number images from 1"),
         (image("spectrum/00007.png", (360, 90)), "tx_pos.csv", "6 rows for 7 images"),
         (remove("tx_pos.csv"), "tx_pos.csv", "No such file"),
@@ -270,7 +270,7 @@ def no_images(folder):
         (write("freq.txt", "1 2.4 1 2.4 1 GHz"), "freq.txt", "'GHz'"),
         (write("freq.txt", "1 2.4 1 2.4 1 0"), "freq.txt", "'0'"),
         (write("freq.txt", "1 2.4 1 2.4 1 -2"), "freq.txt", "'-2'"),
-        (remove("gateway_info.yml"), "gateway_info.yml", "is missing, which says where the receiver stands"),
+        (remove("gateway_info.yml"), "gateway_info.yml", "with the position of the receiver, is missing"),
         (write("gateway_info.yml", ""), "gateway_info.yml", "names no gateway"),
         (write("gateway_info.yml", "[1, 2"), "gateway_info.yml", "not valid YAML"),
         (write("gateway_info.yml", "a: 2000-99-99"), "gateway_info.yml", "not valid YAML"),
@@ -341,9 +341,9 @@ def test_the_validation_of_an_export(tmp_path, kind):
     assert (tmp_path / "with" / "validation_index.txt").read_text().split()[:4] == ["00004", "00005", "00006", "00013"]
 
 
-@pytest.mark.parametrize(("changes", "what"), [({"n_rx": 3}, "3 receivers"), ({"kind": "power"}, "received powers alone")])
+@pytest.mark.parametrize(("changes", "what"), [({"n_rx": 3}, "3 receivers"), ({"kind": "power"}, "only received powers")])
 def test_what_the_layout_has_no_form_for(tmp_path, changes, what):
-    with pytest.raises(UserError, match=f"scene box has {what}, which the layout has no form for; keep the scene file"):
+    with pytest.raises(UserError, match=f"scene box has {what}, which the layout cannot represent; keep the scene file"):
         export_layout(tiny_scene(**changes), tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 

@@ -24,11 +24,11 @@ def test_a_file_is_refused_by_its_kind(tmp_path, suffix):
 
 def test_folders_of_others_are_refused_by_what_they_lack(tmp_path):
     (tmp_path / "rf" / "sparse" / "0").mkdir(parents=True)
-    with pytest.raises(UserError, match=r"RF-3DGS.* without the places of transmitters"):
+    with pytest.raises(UserError, match=r"RF-3DGS.* without positions of transmitters"):
         load_dataset(tmp_path / "rf")
     (tmp_path / "arrays").mkdir()
     (tmp_path / "arrays" / "spectra.npy").write_bytes(b"")
-    with pytest.raises(UserError, match=r"arrays of NumPy; make a folder of images"):
+    with pytest.raises(UserError, match=r"NumPy arrays; create a folder of images"):
         load_dataset(tmp_path / "arrays")
 
 

@@ -47,11 +47,11 @@ def test_beside_snapshots_objects_keep_their_materials(tmp_path, room, rng):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"faces": np.full((5, 3), 7)}, "faces point at vertices that do not exist"),
+        ({"faces": np.full((5, 3), 7)}, "faces refer to vertices that do not exist"),
         ({"face_part": np.full(5, -1)}, "face_part must not be negative"),
         ({"vertices": np.full((7, 3), 1e5)}, "positions are in metres"),
         ({"vertices": np.full((7, 3), np.nan)}, "contains NaN"),
-        ({"faces": np.zeros((0, 3), int), "face_part": np.zeros(0, int)}, "holds no triangles"),
+        ({"faces": np.zeros((0, 3), int), "face_part": np.zeros(0, int)}, "has no triangles"),
         ({"faces": None}, "lacks faces"),
         ({"meta": None}, "lacks meta"),
         ({"meta": np.array("no JSON")}, "meta of room file"),

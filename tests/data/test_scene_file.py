@@ -134,7 +134,7 @@ def test_of_very_many_materials_the_smaller_ones_are_one(scene):
     corners = np.random.default_rng(0).uniform(-1, 1, (100, 3, 3)) * np.linspace(0.1, 3, 100)[:, None, None]
     parts = [{"name": f"part {i}", "thickness": 0.1 * (i % 2)} for i in range(100)]
     changes = {"vertices": np.float32(corners.reshape(-1, 3)), "faces": np.int32(faces), "meta": {"parts": parts}}
-    with pytest.warns(UserWarning, match="names 100 materials: all but the 64 of the largest area"):
+    with pytest.warns(UserWarning, match="has 100 materials: all except the 64 of the largest area"):
         materials = scene_dataset(dataclasses.replace(scene, face_part=np.arange(100, dtype=np.int32), **changes)).materials
     assert len(materials.names) == 66 and {"others 0", "others 0.1"} < set(materials.names)
     others = np.array([materials.names[kind].startswith("others") for kind in materials.material])
@@ -161,7 +161,7 @@ def test_a_place_on_both_sides_of_the_split_is_noted(tmp_path):
     scene = tiny_scene(4)
     scene.tx_positions[3], scene.split[:] = scene.tx_positions[0], [0, 0, 2, 1]
     save_scene(tmp_path / "s.npz", scene)
-    with pytest.warns(UserWarning, match="box: 1 TX positions are both in train and in test; scores will flatter"):
+    with pytest.warns(UserWarning, match="box: 1 TX positions are both in train and in test; scores will be too high"):
         load_dataset(tmp_path / "s.npz")
 
 
@@ -191,8 +191,8 @@ def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains NaN alone"),
-        ("snapshots", np.full((5, 1, 3, 16), [np.nan] + [1.0] * 15), "or NaN in some elements of a link alone"),
+        ("snapshots", np.full((5, 1, 3, 16), np.nan, np.complex64), "snapshots contains only NaN"),
+        ("snapshots", np.full((5, 1, 3, 16), [np.nan] + [1.0] * 15), "or NaN in only some elements of a link"),
         ("snapshots", np.full((5, 1, 3, 16), 1e300), "snapshots contains infinity"),
         ("snapshots", np.zeros((5, 3, 16), np.complex64), "snapshots must be a 4-D complex64"),
         ("snapshots", np.zeros((5, 1, 3, 16), "U1"), "snapshots must be a 4-D complex64"),
@@ -207,13 +207,13 @@ def test_released_scenes_are_looked_for_in_the_repository(monkeypatch):
         ("rx_position", np.zeros((2, 3)), "rx_position has shape"),
         ("element_positions", np.zeros((1, 15, 3)), "element_positions has shape"),
         ("element_unit", "cm", "element_unit must be wavelengths or metres"),
-        ("element_pattern", ("iso", "iso"), "element_pattern must be a name, or one a receiver"),
-        ("element_pattern", 3, "element_pattern must be a name, or one a receiver"),
+        ("element_pattern", ("iso", "iso"), "element_pattern must be a name, or one per receiver"),
+        ("element_pattern", 3, "element_pattern must be a name, or one per receiver"),
         ("faces", np.array([[0, 1, 6]] * 4, np.int32), "do not exist"),
         ("faces", np.array([[0, 1, -1]] * 4, np.int32), "do not exist"),
         ("face_part", np.zeros(3, np.int32), "face_part has shape"),
-        ("split", np.array([0, 1, 3, 0, 0], np.int8), "split must hold"),
-        ("split", np.array([0, 1, 256, 0, 0]), "split must hold"),
+        ("split", np.array([0, 1, 3, 0, 0], np.int8), "split must contain"),
+        ("split", np.array([0, 1, 256, 0, 0]), "split must contain"),
     ],
 )
 def test_a_scene_that_is_none_is_not_written(tmp_path, scene, key, value, message):
@@ -235,7 +235,7 @@ def test_a_scene_that_is_none_is_not_written(tmp_path, scene, key, value, messag
         ("pas", np.ones((4, 1, 3, 360, 90), np.uint8), "pas has shape"),
         ("pas", np.ones((4, 2, 3, 90, 360), np.uint8), "element_positions has shape"),
         ("power_db", np.full((4, 1, 3), -np.inf, np.float32), "power_db contains infinity"),
-        ("power_db", np.full((4, 1, 3), np.nan, np.float32), "or NaN alone"),
+        ("power_db", np.full((4, 1, 3), np.nan, np.float32), "or only NaN"),
         ("power_db", np.zeros((4, 0, 3), np.float32), "element_positions has shape"),
     ],
 )

@@ -49,5 +49,5 @@ def test_scenes_without_anything_in_common_are_told():
     moved = dataclasses.replace(scene, tx_positions=scene.tx_positions + 0.1)
     with pytest.raises(UserError, match="in common"):
         compare(scene, moved)
-    with pytest.raises(UserError, match="other arrays"):
+    with pytest.raises(UserError, match="different arrays"):
         compare(scene, dataclasses.replace(scene, element_positions=2 * scene.element_positions))

@@ -171,8 +171,8 @@ def test_no_path_at_all_is_told_before_long(simulator_backend, tmp_path, monkeyp
     [
         ({"scene": "99"}, "no scene 99"),
         ({"scene": "nowhere.glb"}, "--rx"),
-        ({"materials": Path("m.toml")}, "scene of your own"),
-        ({"frequency_set": "21"}, "two ways"),
+        ({"materials": Path("m.toml")}, "your own scene"),
+        ({"frequency_set": "21"}, "exclude each other"),
         ({"name": "../elsewhere"}, "--name"),
         ({"rx_orientation": (0.0, 0.0, 0.0, 0.0)}, "quaternion"),
         ({"array": ArraySettings(rows=0)}, "--array.rows"),

@@ -128,7 +128,7 @@ def test_a_scene_xml_that_cannot_be_used(tmp_path):
     file = write_xml(tmp_path, kind="hair")
     refused("has the unsupported type 'hair'; export it as ply or obj", file, None)
     file = write_xml(tmp_path, transform='<transform name="to_world"><lookat origin="0,0,0"/></transform>')
-    refused("is moved by <lookat>", file, None)
+    refused("has the transform <lookat>", file, None)
     file = write_xml(tmp_path, bsdf={"floor": "paint", "door": "missing"})
     refused("no material for 'door', 'floor'", file, None)
     file = write_xml(tmp_path)

@@ -166,7 +166,7 @@ def test_every_receiver_is_predicted_from_its_own(unit):
 def test_a_receiver_without_training_spectra_is_named():
     scene = scene_dataset(tiny_scene(n_rx=3))
     deaf = dataclasses.replace(scene, train=scene.train[scene.receiver_index[scene.train] != 1])
-    with pytest.raises(UserError, match="no training spectra of receiver 1"):
+    with pytest.raises(UserError, match="no training spectra for receiver 1"):
         baselines(deaf)["nearest_tx"](deaf.test)
 
 

@@ -99,7 +99,7 @@ def test_a_prediction_that_is_no_number_is_refused(pair, value):
 
 
 def test_nothing_to_score():
-    with pytest.raises(UserError, match="no spectrum"):
+    with pytest.raises(UserError, match="no spectra"):
         score(np.zeros((0, 90, 360), np.float32), np.zeros((0, 90, 360), np.float32), np.zeros(0))
 
 

@@ -32,7 +32,7 @@ def test_powers_are_scored_in_decibels():
 def test_a_power_that_is_no_number_is_refused(value):
     with pytest.raises(UserError, match="1 of 3 predicted powers"):
         score_power(np.array([1, value, 2]), np.zeros(3), np.ones(3))
-    with pytest.raises(UserError, match="no link"):
+    with pytest.raises(UserError, match="no links"):
         score_power(np.zeros(0), np.zeros(0), np.zeros(0))
 
 

@@ -124,7 +124,7 @@ def test_powers_are_scored_where_there_is_nothing_else(knowing, blind):
     assert "median_ssim" not in report and report["baselines"].keys() == {"free_space", "nearest_tx"}
     assert [row["frequency_ghz"] for row in report["per_frequency"]] == (FREQUENCIES_HZ / 1e9).tolist()
     assert watch(knowing.field, knowing.params, powers, powers.test) == {"held_out_power_error_db": report["power_error_db"]}
-    with pytest.raises(UserError, match="received powers, of which this field knows nothing"):
+    with pytest.raises(UserError, match="received powers, which this field does not predict"):
         evaluate(blind, powers)
 
 

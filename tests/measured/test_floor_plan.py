@@ -73,11 +73,11 @@ def test_walls_stand_between_floor_and_ceiling(tmp_path):
     ("content", "says"),
     [
         ("x,z\n1,2\n", "has no column 'y'"),
-        ("x1,y1,x2,y2\n1,2,3,\n", "corners must be numbers of metres"),
-        ("x,y\n1,1e300\n2,2\n", "corners must be numbers of metres"),
+        ("x1,y1,x2,y2\n1,2,3,\n", "corners must be coordinates in metres"),
+        ("x,y\n1,1e300\n2,2\n", "corners must be coordinates in metres"),
         ("x,y\n", "no rows"),
-        ("floor,x,y\n1,0,0\n1,1,0\n1,1,1\n", "has a column 'floor', of which a floor plan knows nothing"),
-        ("x1,y1,x2,y2,storey\n0,0,1,1,2\n", "has a column 'storey'"),
+        ("floor,x,y\n1,0,0\n1,1,0\n1,1,1\n", "has an unknown column 'floor'"),
+        ("x1,y1,x2,y2,storey\n0,0,1,1,2\n", "has an unknown column 'storey'"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, content, says):

@@ -151,7 +151,7 @@ def test_what_cannot_be_learned_is_said(rng):
     with pytest.raises(UserError, match="too few to learn from"):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
     tx = places(rng, MAX_PLACES + 1)
-    with pytest.raises(UserError, match="more than a map can hold"):
+    with pytest.raises(UserError, match="exceed the limit of a map"):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
 
 

@@ -100,13 +100,13 @@ def test_the_terms_of_data_are_found(tmp_path):
     [
         ("readings.csv", None, "has no readings.csv or calibration.csv"),
         ("receivers.csv", None, "has no receivers.csv or anchors.csv"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60\n", "line 2 has 4 cells, the header 5"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,loud,-60\n", "row 1: 'loud' is no number"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60\n", "line 2 has 4 cells, but the header has 5"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,loud,-60\n", "row 1: 'loud' is not a number"),
         ("readings.csv", "x,y,rssi_1,rssi_2\n1,1,-50,-60\n", "2 columns of powers"),
         ("readings.csv", "x,rssi_1,rssi_2,rssi_3\n1,-50,-60,-70\n", "has no column 'y'"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n", "no rows"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,,-50,-60,-70\n", "places must be numbers of metres"),
-        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1e9,-50,-60,-70\n", "places must be numbers of metres"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,,-50,-60,-70\n", "places must be coordinates in metres"),
+        ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1e9,-50,-60,-70\n", "places must be coordinates in metres"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,-5000,-60,-70\n", "powers must be dBm"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,inf,-60,-70\n", "powers must be dBm"),
         ("readings.csv", "x,y,rssi_1,rssi_2,rssi_3\n1,1,1e-7,0,3e-9\n", "convert milliwatts"),
@@ -130,7 +130,7 @@ def test_the_terms_of_data_are_found(tmp_path):
             "x\ty\trssi_1\trssi_2\trssi_3\n1\t1\t-50\t-60\t-60\n",
             "tabs between its cells; separate them by commas",
         ),
-        ("readings.csv", "x,y,rssi,rssi,rssi\n1,1,-50,-60,-70\n", "names two columns alike"),
+        ("readings.csv", "x,y,rssi,rssi,rssi\n1,1,-50,-60,-70\n", "has two columns of the same name"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
@@ -146,7 +146,7 @@ def test_what_is_wrong_is_said(tmp_path, rng, file, content, says):
 def test_tables_in_utf_16_are_refused(tmp_path, rng):
     folder(tmp_path, rng, n=20)
     (tmp_path / "readings.csv").write_text("x,y,rssi_1,rssi_2,rssi_3\n1,1,-50,-60,-60\n", encoding="utf-16")
-    with pytest.raises(UserError, match=r"readings\.csv is no text in UTF-8; save it as CSV in UTF-8"):
+    with pytest.raises(UserError, match=r"readings\.csv is not a text file in UTF-8; save it as CSV in UTF-8"):
         load_readings(tmp_path, HEIGHT)
 
 
@@ -166,7 +166,7 @@ def test_places_in_degrees_around_receivers_in_metres_are_refused(tmp_path, rng)
 
 
 def test_a_folder_that_is_none(tmp_path):
-    with pytest.raises(UserError, match="there is no folder"):
+    with pytest.raises(UserError, match=r"folder .* does not exist"):
         load_readings(tmp_path / "nowhere", HEIGHT)
 
 
@@ -241,7 +241,7 @@ def test_numbers_that_stand_for_nothing_are_recognised(rng, number):
     heard = np.round(rng.uniform(-80, -40, (60, 3)), 1)
     nothing = rng.random(heard.shape) < 0.2
     if np.isfinite(number):
-        with pytest.warns(UserWarning, match="stands for nothing received"):
+        with pytest.warns(UserWarning, match="is taken as not received"):
             found = not_received(Path("t.csv"), np.where(nothing, number, heard))
     else:
         found = not_received(Path("t.csv"), np.where(nothing, number, heard))

@@ -120,7 +120,7 @@ def test_one_device_is_left_alone():
 
 
 def test_too_many_devices_are_an_error_for_people(tmp_path):
-    with registered(RippleField), pytest.raises(UserError, match="--devices is 3, and this process has 1"):
+    with registered(RippleField), pytest.raises(UserError, match="--devices is 3, but this process has 1"):
         Run(device_runs.data(), "ripple", toy_settings(), 0, tmp_path, devices=3)
 
 

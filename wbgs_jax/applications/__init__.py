@@ -1,1 +1,1 @@
-"""What a trained field is for: to locate transmitters, to choose beams, to place antennas."""
+"""Applications of a trained field: localisation of transmitters, choice of beams, placement of antennas and reflectors."""

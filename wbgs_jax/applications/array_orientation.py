@@ -1,7 +1,7 @@
-"""Which way to turn a receiver's elements so that they hear their transmitters best.
+"""Orientation of a receiver's directive elements for the best reception of its transmitters.
 
-What arrives does not depend on how the receiver is turned; what its directive elements make of it does. So the waves are asked
-of a trained field once, and turning is a closed form of them, with a gradient.
+The arriving waves do not depend on the orientation of the receiver; the response of its directive elements does. The waves are
+therefore predicted once by a trained field, and the response is a closed-form, differentiable function of the orientation.
 """
 
 from collections.abc import Callable
@@ -23,37 +23,38 @@ from wbgs_jax.radio.channel import Arrivals, decibels
 from wbgs_jax.types import Query, make_receiver
 
 Turned = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
-"""Azimuth and elevation (radians, world frame) of where the elements look -> power (dB) from every transmitter."""
+"""Azimuth and elevation of the boresight (radians, world frame) -> power (dB) from every transmitter."""
 STEP = 0.3
-"""Radians between directions that are tried first."""
+"""Spacing of the directions that are tried first, radians."""
 FINEST = 0.01
-"""Of the last steps, radians."""
+"""Size of the last steps, radians."""
 STEPS = 40
 HIGHEST = 1.55
 """Largest elevation, radians."""
 
 
 def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
-    """Returns the quaternion (wxyz) of a receiver whose +x, where directive elements look, has this azimuth and elevation
-    (radians, world frame) and whose y axis stays level."""
+    """Returns the quaternion (wxyz) of a receiver whose +x, the boresight of directive elements, has this azimuth and elevation
+    (radians, world frame) and whose y axis stays horizontal."""
     (ca, ce), (sa, se) = jnp.cos(angles / 2), jnp.sin(angles / 2)
     return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
 
 
 def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
-    """Returns what reaches an isotropic element at a place from n transmitters, over every path; its frame is the world's.
+    """Returns the waves that reach an isotropic element from n transmitters over all paths; its local frame is the world frame.
 
     Args:
-        field, params: a trained field that knows paths; of it the part that holds anywhere (`Field.receiver_independent`).
+        field, params: a trained field that predicts paths, of which the receiver-independent part is used
+            (`Field.receiver_independent`).
         receiver: (3,), world frame, metres.
-        transmitters: (n, 3), the same.
+        transmitters: (n, 3), world frame, metres.
         frequency_hz: hertz.
 
     Raises:
-        UserError: the field knows no paths, or holds nowhere else than at its receivers.
+        UserError: the field predicts no paths, or only at the receivers it was trained for.
     """
     if "paths" not in outputs_of(field):
-        raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
+        raise UserError(f"the {field.name} field predicts no paths; train the default one on data with a mesh")
     field, params = field.receiver_independent(params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
@@ -61,24 +62,25 @@ def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters:
 
 
 def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
-    """Returns the mean power over all elements (dB) of waves by where the elements look; differentiable.
+    """Returns a function for the mean received power over all elements (dB) in terms of the boresight; differentiable.
 
-    The powers of all paths are added, as the mean over places around the receiver: interference is not what an array is turned
-    for.
+    The powers of all paths are added, as in a mean over positions around the receiver: interference should not determine the
+    orientation.
 
     Args:
-        arrived: at isotropic elements whose frame is the world's, with a leading axis of transmitters (`arrivals_anywhere`).
-        pattern: of the elements: "tr38901", "dipole", "hw_dipole", or "iso", which no turn changes but for polarisation.
+        arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`arrivals_anywhere`).
+        pattern: of the elements: "tr38901", "dipole", "hw_dipole", or "iso", for which the orientation affects only the
+            polarisation.
     """
-    assert arrived.polarised is not None, "arrivals of traced paths have it"
+    assert arrived.polarised is not None, "arrivals of traced paths have polarised amplitudes"
     direction, amplitude = arrived.direction, arrived.polarised
     along_theta = zenith_vector(direction)
     vector = amplitude[..., :1] * along_theta + amplitude[..., 1:] * jnp.cross(direction, along_theta)
     exponents = jnp.array(pattern_exponents(pattern), jnp.float32)
 
     def one(angles: Float[Array, "2"]) -> Float[Array, " tx"]:
-        heard = antenna_field(Antenna(boresight_quaternion(angles), exponents), direction)
-        return decibels(jnp.sum(squared_magnitude(jnp.sum(vector * heard, -1)), -1))
+        pattern_field = antenna_field(Antenna(boresight_quaternion(angles), exponents), direction)
+        return decibels(jnp.sum(squared_magnitude(jnp.sum(vector * pattern_field, -1)), -1))
 
     return jax.vmap(one)
 
@@ -86,19 +88,19 @@ def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
 def turn_array(
     powers: Turned, aim: Callable[[Float[Array, "k tx"]], Float[Array, " k"]] = soft_minimum, starts: int = 4
 ) -> Descended:
-    """Returns where elements should look: `place` (starts, 2), azimuth and elevation in radians, the best one first, and
-    `loss`, minus the aim (dB).
+    """Returns the best boresights: `place` (starts, 2), azimuth and elevation in radians, the best one first, and `loss`, minus
+    the objective (dB).
 
-    The best directions of a grid over the sphere that stand apart are followed by gradient steps.
+    The best directions of a grid over the sphere that are not close together are refined by gradient steps.
 
     Args:
-        powers: of the transmitters by direction, as `power_when_turned` makes it, or any function like it.
-        aim: of the powers, to be as large as possible, as in `place_antenna`.
-        starts: directions that gradient steps begin from.
+        powers: of the transmitters by boresight, from `power_when_turned` or any similar function.
+        aim: objective to maximise, as in `place_antenna`.
+        starts: number of starting directions of the gradient steps.
     """
     sphere = np.array([[-np.pi, -HIGHEST], [np.pi, HIGHEST]])
     tried = jnp.asarray(grid_over(sphere, STEP))
-    low_high = jnp.array([[-2 * np.pi, -HIGHEST], [2 * np.pi, HIGHEST]])  # azimuths go on beyond half a turn
+    low_high = jnp.array([[-2 * np.pi, -HIGHEST], [2 * np.pi, HIGHEST]])  # azimuths may pass +-pi
 
     def loss(angles: Float[Array, "k 2"], blur: Any) -> Float[Array, " k"]:
         return -aim(powers(angles))

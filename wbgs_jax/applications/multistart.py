@@ -1,8 +1,9 @@
-"""Multi-start descent in a box: a grid, the best places that stand apart from each other, and steps that lead on from each.
+"""Multi-start optimisation in a box: a grid, the best points that are not close together, and descent steps from each of them.
 
-A coherent field's answers have fringes: they change over a fraction of a wavelength, and slopes lead to the next fringe.
-Functions of places therefore take a blur (metres), over which answers are averaged (`Field.smoothed`): the descent begins with
-a wide one, under which there are few minima, and ends with a narrow one, under which they are sharp.
+Predictions of a coherent field have interference fringes: they vary over a fraction of a wavelength, and gradients lead only to
+the next fringe. Functions of the position therefore take a smoothing length (metres) over which predictions are averaged
+(`Field.smoothed`): the descent begins with a large one, for which there are few minima, and ends with a small one, for which
+they are sharp.
 """
 
 from collections.abc import Callable
@@ -19,49 +20,53 @@ from wbgs_jax.radio.array import EXACT
 
 AnyArray = Array | np.ndarray
 Loss = Callable[[Float[Array, "k n"], Any], Float[Array, " k"]]
-"""(places (k, n), blur in metres) -> loss of every place by itself; differentiable in reverse mode."""
+"""(points (k, n), smoothing length in metres) -> loss of every point independently; differentiable in reverse mode."""
 Residuals = Callable[[Float[Array, "k n"], Any], Float[Array, "k m"]]
-"""(places (k, n), blur in metres) -> residuals of every place by itself, whose squares add up to its loss."""
+"""(points (k, n), smoothing length in metres) -> residuals of every point independently; their squares add up to its loss."""
 STEP = 0.3
-"""Length of a gradient step along each axis, relative to the blur."""
+"""Length of a gradient step along each axis, relative to the smoothing length."""
 MOMENTS = 0.7, 0.9
-"""Of Adam: short memories, for tens of steps under a loss that sharpens on the way."""
+"""Moment decay rates of Adam: short averages, for tens of steps on a loss that sharpens meanwhile."""
 ASIDE = 0.2
-"""How far aside Gauss-Newton looks for slopes, relative to the blur ..."""
+"""Step of Gauss-Newton's finite differences, relative to the smoothing length ..."""
 FARTHEST = 2.0
 """... and the longest step that it takes."""
 DAMPING, EASED, RAISED = 1e-2, 0.2, 10.0
-"""Of Gauss-Newton: relative to the mean curvature at first, after a step that helped, and after one that did not."""
+"""Damping of Gauss-Newton: relative to the mean curvature initially, and factors after a step that helped and one that did
+not."""
 TINY = 1e-12
 MOST_PLACES = 1_000_000
 BLOCK = 16
-"""Places that are asked at a time."""
+"""Number of points evaluated together."""
 FAR = 1e6
-"""Added to losses of places that are taken, or near one that is: the next round takes those that have least of it."""
+"""Added to the losses of points that are taken or near one that is, so that the remaining ones are chosen first."""
 
 
 class Descended(NamedTuple):
-    """Where K starts have led to, the best one first."""
+    """Results of K starts, the best one first."""
 
     place: Float[Array, "k n"]
     loss: Float[Array, " k"]
 
 
 def grid_over(box: Float[np.ndarray, "2 n"], step: float) -> Float[np.ndarray, "places n"]:
-    """Returns places (float32) of a box (its lowest and highest corner), `step` apart at most along every axis and half of that
-    from its sides.
+    """Returns grid points (float32) in a box, at most `step` apart along every axis and half of that from its sides.
+
+    Args:
+        box: lowest and highest corner.
+        step: largest grid spacing, in the unit of the box.
 
     Raises:
-        UserError: the box is empty, or there would be more than a million places.
+        UserError: the box is empty, or there would be more than a million points.
     """
     low, high = np.asarray(box, float)
     if not (low < high).all() or not step > 0:
         raise UserError(
-            f"no places between {low} and {high}, {step:g} m apart; give the lowest corner first and a step above 0"
+            f"no points between {low} and {high}, {step:g} m apart; give the lowest corner first and a step above 0"
         )
     counts = np.maximum(np.ceil((high - low) / step - 1e-9), 1).astype(int)
     if np.prod(counts.astype(float)) > MOST_PLACES:
-        raise UserError(f"a step of {step:g} m makes more than {MOST_PLACES:,} places; give a larger one or a smaller box")
+        raise UserError(f"a step of {step:g} m gives more than {MOST_PLACES:,} points; give a larger one or a smaller box")
     axes = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(low)).astype(np.float32)
 
@@ -69,8 +74,8 @@ def grid_over(box: Float[np.ndarray, "2 n"], step: float) -> Float[np.ndarray, "
 def best_apart(
     places: Float[Array, "places n"], losses: Float[Array, " places"], count: int, apart: float
 ) -> Int[Array, " count"]:
-    """Returns the `count` places of least loss of which no two stand nearer than `apart`; where there are fewer, the best of
-    the rest."""
+    """Returns the indices of the `count` points of lowest loss that are at least `apart` from each other; if there are fewer,
+    the best of the others follow."""
 
     def choose(left: Float[Array, " places"], _: None) -> tuple[Float[Array, " places"], Int[Array, ""]]:
         best = jnp.argmin(left)
@@ -81,22 +86,30 @@ def best_apart(
 
 
 def in_blocks(function: Callable[[Float[Array, "k n"]], Array], places: Float[Array, "places n"]) -> Array:
-    """Returns a function of K places, (k, ...), for any number of them, a block at a time: one compilation, little memory."""
+    """Returns a function of K points, (k, ...), for any number of points, evaluated in blocks: one compilation, little
+    memory."""
     count = places.shape[0]
-    filled = np.minimum(np.arange(-(-count // BLOCK) * BLOCK), count - 1)  # the last place fills the last block up
+    filled = np.minimum(np.arange(-(-count // BLOCK) * BLOCK), count - 1)  # the last block is padded with the last point
     found = jax.lax.map(function, places[filled].reshape(-1, BLOCK, places.shape[1]))
     return found.reshape(-1, *found.shape[2:])[:count]
 
 
 def shrinking(first: float, last: float, steps: int) -> Float[np.ndarray, " steps"]:
-    """Returns blurs (metres) from a wide one to a narrow one, by equal factors."""
+    """Returns smoothing lengths (metres) that decrease by equal factors."""
     return np.geomspace(first, last, steps).astype(np.float32)
 
 
 def descend(loss: Loss, starts: Float[Array, "k n"], box: Float[Array, "2 n"], blurs: Float[AnyArray, " steps"]) -> Descended:
-    """Returns where gradient steps (Adam) lead to from K starts, each by itself, ordered by the loss of the last blur.
+    """Returns the results of gradient steps (Adam) from K starts independently, ordered by the loss at the last smoothing
+    length.
 
     Pure and jittable. No step leaves the box.
+
+    Args:
+        loss: of every point.
+        starts: K starting points.
+        box: lowest and highest corner.
+        blurs: smoothing length of every step, metres.
     """
     low, high = jnp.asarray(box, starts.dtype)
     adam = optax.scale_by_adam(*MOMENTS)
@@ -116,7 +129,7 @@ def descend(loss: Loss, starts: Float[Array, "k n"], box: Float[Array, "2 n"], b
 
 
 class _Slopes(NamedTuple):
-    """What Gauss-Newton knows of K places."""
+    """State of Gauss-Newton at K points."""
 
     place: Float[Array, "k n"]
     loss: Float[Array, " k"]
@@ -127,11 +140,19 @@ class _Slopes(NamedTuple):
 def gauss_newton(
     residuals: Residuals, starts: Float[Array, "k n"], box: Float[Array, "2 n"], blurs: Float[AnyArray, " levels"], steps: int
 ) -> Descended:
-    """Returns where damped Gauss-Newton steps (Levenberg, Marquardt) lead to from K starts, each by itself, ordered by the loss
-    under the last blur: `steps` of them under every blur.
+    """Returns the results of damped Gauss-Newton steps (Levenberg-Marquardt) from K starts independently, ordered by the loss
+    at the last smoothing length.
 
-    Pure and jittable. No step leaves the box, or makes the loss larger. Slopes are differences over a share of the blur: four
-    calls a step in space, and less than reverse mode costs a field that traces paths; forward mode not every field knows.
+    Pure and jittable. No step leaves the box or increases the loss. Derivatives are finite differences over a fraction of the
+    smoothing length: four evaluations per step in space, less than reverse mode costs for a field that traces paths; not all
+    fields support forward mode.
+
+    Args:
+        residuals: of every point.
+        starts: K starting points.
+        box: lowest and highest corner.
+        blurs: smoothing lengths, metres.
+        steps: at each smoothing length.
     """
     low, high = jnp.asarray(box, starts.dtype)
     k, n = starts.shape
@@ -148,7 +169,7 @@ def gauss_newton(
     def step(carry: tuple[_Slopes, Float[Array, "k n"], Float[Array, " k"]], blur: Float[Array, ""]) -> Any:
         best, place, damping = carry
         tried = look(place, blur)
-        helped = tried.loss < best.loss  # not where it is no number
+        helped = tried.loss < best.loss  # false for NaN
         best = jax.tree.map(lambda a, b: jnp.where(helped.reshape(-1, *[1] * (a.ndim - 1)), a, b), tried, best)
         damping = damping * jnp.where(helped, EASED, RAISED)
         scale = damping * jnp.trace(best.curvature, axis1=-2, axis2=-1) / n + TINY

@@ -1,9 +1,9 @@
-"""Where to hang a flat metal plate so that places are covered which see the transmitter badly.
+"""Placement of a flat metal plate that covers positions poorly served by the transmitter.
 
-The wave off a plate comes from the transmitter's mirror image in the plate's plane, as far as the plate reaches over the point
-where it is reflected. That point, the length of the path and the share of the wave that the plate catches are closed forms of
-the plate's pose, and so is their gradient; what stands between plate and ends is asked of a trained field. The plate is no part
-of the field's mesh: waves that meet it and another wall are not counted.
+The wave reflected by a plate comes from the transmitter's mirror image in the plate's plane, as far as the plate extends around
+the point of reflection. That point, the path length and the fraction of the wave that the plate reflects are closed-form
+functions of the plate's pose, and so is their gradient; the attenuation by walls between the plate and the ends is predicted by
+a trained field. The plate is not part of the field's mesh: waves that interact with both it and another wall are not included.
 """
 
 from collections.abc import Callable
@@ -27,42 +27,43 @@ from wbgs_jax.radio.channel import decibels, free_space_db
 from wbgs_jax.types import Query, make_receiver
 
 STEPS = 60
+"""Gradient steps."""
 STEEPEST = 1.45
-"""Largest angle of the normal above or below the horizon, radians: straight up its azimuth would mean nothing."""
+"""Largest angle of the normal above or below the horizon, radians: the azimuth of a vertical normal is undefined."""
 NEAREST_M = 1e-3
-"""Smallest distance that counts, so that gradients stay finite."""
+"""Lower bound on distances, so that gradients stay finite."""
 
 
 @dataclass(frozen=True)
 class Reflector:
-    """A flat rectangular plate of metal between one transmitter and some users. Make it with `reflector`.
+    """A flat rectangular metal plate between one transmitter and users. Create it with `reflector`.
 
     A pose is (5,): the plate's centre x, y, z (world frame, metres), and azimuth and elevation of its normal (radians). Two of
-    its sides are level.
+    its sides are horizontal.
     """
 
     transmitter: Float[Array, "3"]
     users: Float[Array, "users 3"]
     size: Float[Array, "2"]
-    """Length of the level sides and of the others, metres."""
+    """Length of the horizontal and of the other sides, metres."""
     frequencies_hz: Float[Array, " f"]
     legs: Powers | None
-    """(places of the plate (k, 3), blur) -> powers (dB) straight from there to the transmitter and to every user; None: nothing
-    is in the way."""
+    """(plate positions (k, 3), smoothing length) -> powers (dB) of the straight paths from there to the transmitter and to
+    every user; None for an unobstructed scene."""
 
     def power_db(self, poses: Float[Array, "k 5"], blur: Any = 0.0) -> Float[Array, "k users"]:
-        """Returns the power that every user gets over the plate (dB, relative to the transmitted power, mean over the
+        """Returns the power that every user receives via the plate (dB relative to the transmitted power, mean over the
         frequencies); differentiable in reverse mode.
 
         Args:
             poses: of the plate.
-            blur: metres by which the plate's edges are washed out, so that a plate that just misses a user feels it.
+            blur: metres by which the plate's edges are smoothed, so that a plate that just misses a user has a gradient.
         """
         return self._over(poses, self._in_the_way(poses[:, :3], blur), blur)
 
     def aimed(self, centres: Float[Array, "k 3"]) -> Float[Array, "k users 5"]:
-        """Returns the poses of plates at K places that send the transmitter's wave to one user each: the normal halves the
-        angle between the ways to the two."""
+        """Returns the poses of plates at K positions that reflect the transmitter's wave to one user each: the normal bisects
+        the directions to the two ends."""
         to_tx = _unit(self.transmitter - centres)[:, None]
         normal = _unit(to_tx + _unit(self.users - centres[:, None]))
         angles = [jnp.arctan2(normal[..., 1], normal[..., 0]), jnp.arcsin(jnp.clip(normal[..., 2], -1, 1))]
@@ -70,14 +71,14 @@ class Reflector:
         return jnp.concatenate([at, angles[0][..., None], jnp.clip(angles[1], -STEEPEST, STEEPEST)[..., None]], -1)
 
     def best_aimed(self, centres: Float[Array, "k 3"], loss: Callable[[Array], Array], blur: Any) -> Any:
-        """Returns of K places the pose (k, 5) of least loss among those that are aimed at one user, and that loss (k,)."""
+        """Returns, for K positions, the pose (k, 5) of lowest loss among those aimed at one user, and its loss (k,)."""
         poses, in_the_way = self.aimed(centres), self._in_the_way(centres, blur)
         tried = jax.vmap(lambda some: loss(self._over(some, in_the_way, blur)), 1, 1)(poses)
         best = jnp.argmin(tried, 1)[:, None]
         return jnp.take_along_axis(poses, best[..., None], 1)[:, 0], jnp.take_along_axis(tried, best, 1)[:, 0]
 
     def _in_the_way(self, centres: Float[Array, "k 3"], blur: Any) -> Float[Array, "k users"]:
-        """Returns what walls take away from a plate at K places (dB, 0 or less), on both legs together."""
+        """Returns the attenuation by walls (dB, at most 0) on both segments together, for a plate at K positions."""
         if self.legs is None:
             return jnp.zeros((len(centres), len(self.users)))
         ends = jnp.concatenate([self.transmitter[None], self.users])
@@ -94,12 +95,12 @@ class Reflector:
     def _share_of_one(
         self, pose: Float[Array, "5"], user: Float[Array, "3"], in_the_way: Float[Array, ""], blur: Array
     ) -> Float[Array, " f"]:
-        """Returns the power of one user from one plate at all frequencies, dB."""
+        """Returns the power of one user via one plate at all frequencies, dB."""
         normal, level, up = plate_axes(pose[3:])
         here, there = (end - pose[:3] for end in (self.transmitter, user))
         before, behind = _along(here, normal), _along(there, normal)
         image = here - 2 * before * normal
-        # Where the straight way from the mirror image to the user meets the plane; weights alone, so that nothing divides by 0.
+        # Point where the line from the mirror image to the user meets the plane; weights are used to avoid dividing by 0.
         share = jnp.abs(before) / jnp.maximum(jnp.abs(before) + jnp.abs(behind), NEAREST_M)
         point = image + share * (there - image)
         first, second, whole = _length(point - here), _length(there - point), _length(there - image)
@@ -110,9 +111,9 @@ class Reflector:
         ]
         leaving = (there - point) / second
         field = zenith_vector(arriving)
-        mirrored = 2 * _along(field, normal) * normal - field  # of the electric field off a metal
-        turned = _along(mirrored, zenith_vector(-leaving))
-        amplitude = jnp.where(before * behind > 0, caught[0] * caught[1] * turned, 0)
+        mirrored = 2 * _along(field, normal) * normal - field  # electric field reflected by a metal
+        copolarised = _along(mirrored, zenith_vector(-leaving))
+        amplitude = jnp.where(before * behind > 0, caught[0] * caught[1] * copolarised, 0)
         return decibels(amplitude**2) + _friis(whole, self.frequencies_hz) + in_the_way
 
 
@@ -130,17 +131,17 @@ def reflector(
 
     Args:
         transmitter: (3,), world frame, metres.
-        users: (users, 3), the same.
-        size: of the plate, metres: level sides, and the others.
+        users: (users, 3), world frame, metres.
+        size: of the plate, metres: horizontal sides, and the others.
         frequencies_hz: (f,) or one, hertz.
-        field, params: a trained field that knows paths, to be asked for the walls between plate and ends; without them there
-            are none. Every end is planned and compiled by itself: a dozen take a minute.
+        field, params: a trained field that predicts paths, used for the walls between the plate and the ends; by default there
+            are no walls. Every end is planned and compiled separately: a dozen take a minute.
 
     Raises:
-        UserError: a side is not longer than 0, or the field knows no paths or none elsewhere than at its receivers.
+        UserError: a side is not longer than 0, or the field predicts no paths, or only at the receivers it was trained for.
     """
     if not min(size) > 0:
-        raise UserError(f"a plate of {size[0]:g} m x {size[1]:g} m reflects nothing; give two sides above 0")
+        raise UserError(f"a plate of {size[0]:g} m x {size[1]:g} m has no area; give two sides above 0")
     ends = np.concatenate([np.reshape(transmitter, (1, 3)), np.atleast_2d(users)]).astype(np.float32)
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
     legs = None if field is None else straight_powers(field, params, ends, frequencies)
@@ -148,27 +149,27 @@ def reflector(
 
 
 def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any) -> Powers:
-    """Returns the powers (dB, mean over the frequencies) that go straight from any place to some ends, through whatever walls
-    stand between: no reflections, no diffraction.
+    """Returns a function for the powers (dB, mean over the frequencies) of straight paths from any position to given ends,
+    through all walls in between but without reflections or diffraction.
 
     Args:
-        field, params: a trained field that knows paths; of it the part that holds anywhere.
+        field, params: a trained field that predicts paths, of which the receiver-independent part is used.
         ends: (ends, 3), world frame, metres.
         frequencies_hz: (f,) or one, hertz.
 
     Raises:
-        UserError: the field knows no paths, or holds nowhere else than at its receivers.
+        UserError: the field predicts no paths, or only at the receivers it was trained for.
     """
     if "paths" not in outputs_of(field):
-        raise UserError(f"the {field.name} field knows no paths; train the default one on data with a mesh")
+        raise UserError(f"the {field.name} field predicts no paths; train the default one on data with a mesh")
     field, params = field.receiver_independent(params)
-    one = np.zeros((1, 3))  # an antenna, no array
+    one = np.zeros((1, 3))  # a single antenna
     plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
 
     def at(plan: Any, places: Float[Array, "k 3"], frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
         arrived = paths_of(field, params, plan, Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1])))
-        assert arrived.interaction is not None, "arrivals of traced paths have them"
+        assert arrived.interaction is not None, "arrivals of traced paths have interactions"
         straight = jnp.all(arrived.interaction <= TRANSMITTED, -1)
         return decibels(jnp.sum(jnp.where(straight, squared_magnitude(arrived.amplitude), 0), -1))
 
@@ -188,18 +189,19 @@ def place_reflector(
     step: float = 0.5,
     starts: int = 4,
 ) -> Descended:
-    """Returns where a plate serves its users best: poses, `place` (starts, 5), the best one first, and minus the aim, `loss`.
+    """Returns the plate poses that serve the users best: `place` (starts, 5), the best one first, and `loss`, minus the
+    objective.
 
-    At every place of a grid the plate is aimed at one user after the other; the best poses that stand apart are followed by
-    gradient steps of all five numbers, under edges that are ever less washed out.
+    At every grid point the plate is aimed at each user in turn; the best poses that are not close together are refined by
+    gradient steps in all five numbers, with the plate's edges smoothed less and less.
 
     Args:
-        plate: of `reflector`.
-        without_db: (users,), what every user gets without the plate, dB (`power_at_users` at the transmitter); powers add up.
-        box: (2, 3), lowest and highest corner of where its centre may be, metres.
-        aim: of the users' powers, to be as large as possible, as in `place_antenna`.
-        step: metres between places of the grid.
-        starts: poses that gradient steps begin from.
+        plate: from `reflector`.
+        without_db: (users,), power of every user without the plate, dB (`power_at_users` at the transmitter); powers are added.
+        box: (2, 3), lowest and highest corner of the possible centres, metres.
+        aim: objective to maximise, as in `place_antenna`.
+        step: grid spacing, metres.
+        starts: number of starting poses of the gradient steps.
     """
     before = 10 ** (jnp.asarray(without_db, jnp.float32) / 10)
     centres = grid_over(np.asarray(box, np.float32), step)
@@ -226,8 +228,8 @@ def place_reflector(
 
 
 def plate_axes(angles: Float[Array, "2"]) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """Returns unit vectors of a plate whose normal has this azimuth and elevation (radians): the normal, along the level sides,
-    and along the others."""
+    """Returns unit vectors of a plate whose normal has this azimuth and elevation (radians): the normal, along the horizontal
+    sides, and along the others."""
     (ca, ce), (sa, se) = jnp.cos(angles), jnp.sin(angles)
     zero = jnp.zeros_like(ca)
     return jnp.stack([ce * ca, ce * sa, se]), jnp.stack([-sa, ca, zero]), jnp.stack([-se * ca, -se * sa, ce])
@@ -236,19 +238,19 @@ def plate_axes(angles: Float[Array, "2"]) -> tuple[Float[Array, "3"], Float[Arra
 def _caught(
     aside: Array, half: Array, slant: Array, focal: Array, frequencies_hz: Float[Array, " f"], blur: Array
 ) -> Float[Array, " f"]:
-    """Returns the share of the wave's amplitude that a plate catches along one axis: 1 where it reaches many Fresnel zones to
-    both sides, 1/2 at its edge.
+    """Returns the fraction of the wave's amplitude that a plate reflects, along one axis: 1 if it extends over many Fresnel
+    zones on both sides, 1/2 at its edge.
 
-    The Fresnel integral without its ripples: an error function of the same limits for plates that are large and for plates that
-    are small against the first Fresnel zone, whose square is the radar equation of a flat plate.
+    This is the Fresnel integral without its ripples: an error function with the same limits for plates large and small compared
+    with the first Fresnel zone; the square of the latter is the radar equation of a flat plate.
 
     Args:
-        aside: metres along the axis from the plate's centre to the point of reflection.
-        half: of the side, metres.
+        aside: distance along the axis from the plate's centre to the point of reflection, metres.
+        half: half the side, metres.
         slant: cosine between the axis and the wave's direction.
-        focal: product of both ways over their sum, metres.
+        focal: product of both path lengths over their sum, metres.
         frequencies_hz: hertz.
-        blur: metres.
+        blur: smoothing length, metres.
     """
     zone = SPEED_OF_LIGHT / frequencies_hz * focal / jnp.maximum(1 - slant**2, NEAREST_M)
     width = jnp.sqrt(zone / jnp.pi + blur**2)

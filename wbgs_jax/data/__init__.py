@@ -1,4 +1,4 @@
-"""Data in and out: scene files, the published folder layout, splits, surfaces. `load_dataset` reads any of them."""
+"""Import and export of data: scene files, the published folder layout, splits, surfaces. `load_dataset` reads all formats."""
 
 from wbgs_jax.data.dataset import Dataset, Materials
 from wbgs_jax.data.load import load_dataset, released_scenes, scene_dataset

@@ -1,15 +1,15 @@
-"""In which order published folders hold the pixels of a spectrum, which no file of theirs records.
+"""Order of the pixels of spectra in published folders, which is not recorded in their files.
 
-Two orders are in use, in folders of the same names and images of the same size:
+Two orders are in use, in folders with the same file names and images of the same size:
 
     zenith         rows are zenith angles, 0..90 degrees; azimuths -180..180 degrees; the array in the local y-z plane (the
                    paper's authors)
     elevation      rows are elevations, 0..89 degrees; azimuths 0..359 degrees; the array in the local x-y plane (NeRF2's
-                   generator of spectra; WRF-GS and WRF-GS+ took it over)
+                   generator of spectra, also used by WRF-GS and WRF-GS+)
 
-In both the zenith is local +z and azimuths grow from local +x to +y; the receiver's quaternion turns local vectors into the
-world frame. The first is that of `radio.array.pas_directions`. Pixels of the second are moved, never interpolated: nothing is
-lost, and directions are off by a degree at most (rows near the zenith, columns near +180 degrees).
+In both, the zenith is local +z and azimuths increase from local +x to +y; the receiver's quaternion rotates local vectors into
+the world frame. The first order is that of `radio.array.pas_directions`. Pixels of the second are moved, never interpolated:
+nothing is lost, and directions are off by at most one degree (rows near the zenith, columns near +180 degrees).
 """
 
 from dataclasses import dataclass
@@ -26,29 +26,29 @@ from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Receiver
 
 ConventionName = Literal["zenith", "elevation"]
-"""In which order a folder holds its pixels."""
+"""Name of a pixel order."""
 CONVENTIONS: tuple[ConventionName, ...] = get_args(ConventionName)
 
 INWARD = 3
-"""Rows further in with which the outer rows are compared: next to the zenith, a single direction, what pixels vary by grows
-from nothing; at the horizon it is about as large."""
+"""Distance in rows between an outer row and the inner row it is compared with: near the zenith, which is a single direction,
+the variation of pixels increases from zero; at the horizon it is nearly constant."""
 POLE, APART = 0.5, 2.0
-"""Variation of the row at the zenith, as a share of that further in, at most; and how many times as large that share is at the
-other end."""
+"""Maximum variation of the row at the zenith relative to that of the inner row; and minimum factor by which this ratio is
+larger at the other end."""
 VISIBLE = 0.3
-"""Grey levels (of 255) that pixels further in have to vary by: an image without content decides nothing."""
+"""Minimum variation of inner pixels in grey levels (of 255): an image without content is not conclusive."""
 CHANCE, FEWEST = 1e-3, 5
-"""With which lines of sight may prefer a convention by accident, and transmitters that they take."""
+"""Probability that lines of sight favour a convention by chance, and minimum number of transmitters for the test."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What spectra reveal of their convention."""
+    """Convention inferred from spectra."""
 
     convention: ConventionName | None
-    """None: undecided."""
+    """None if undecided."""
     reason: str
-    """In words."""
+    """Explanation for messages."""
 
 
 def to_pas(images: UInt8[np.ndarray, "n 90 360"], convention: ConventionName) -> UInt8[np.ndarray, "n 90 360"]:
@@ -57,7 +57,7 @@ def to_pas(images: UInt8[np.ndarray, "n 90 360"], convention: ConventionName) ->
 
 
 def array_of(convention: ConventionName) -> Float[np.ndarray, "elements 3"]:
-    """Returns the element positions (wavelengths, local frame) of the array that a convention goes with, 4x4 at half a
+    """Returns the element positions (wavelengths, local frame) of the array that belongs to a convention, 4x4 at half a
     wavelength."""
     elements = planar_array()
     return elements if convention == "zenith" else elements[:, [1, 2, 0]]
@@ -69,16 +69,16 @@ def find_convention(
     tx_positions: Float[np.ndarray, "n 3"],
     tx_index: Int[np.ndarray, " n"],
 ) -> Evidence:
-    """Returns the convention of some spectra, as their geometry shows it.
+    """Returns the convention of spectra, inferred from their geometry.
 
-    The row of the zenith is (nearly) a single direction, so that its pixels are alike. Where neither outer row is such, lines
-    of sight decide: the pixel towards the transmitter is the brighter one.
+    The row at the zenith is (nearly) a single direction, so that its pixels are almost equal. If neither outer row is like
+    this, lines of sight decide: the pixel towards the transmitter is bright in the right convention.
 
     Args:
-        images: as the folder holds them.
-        receiver: that saw them.
+        images: as stored in the folder.
+        receiver: of the spectra.
         tx_positions: world frame, metres.
-        tx_index: which transmitter.
+        tx_index: index of the transmitter.
     """
     if found := _by_the_zenith(images):
         return found
@@ -92,9 +92,9 @@ def find_convention(
     gain = second - first
     error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
     compared = (
-        f"towards the transmitter spectra are brighter than {100 * second.mean():.0f} % of their pixels read as elevations"
+        f"towards the transmitter, spectra are brighter than {100 * second.mean():.0f} % of their pixels read as elevations"
     )
-    compared += f", than {100 * first.mean():.0f} % read as zenith angles"
+    compared += f" and than {100 * first.mean():.0f} % read as zenith angles"
     if len(gain) < FEWEST or not abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - CHANCE / 2) * error:
         return Evidence(None, compared)
     return Evidence("elevation" if gain.mean() > 0 else "zenith", compared)
@@ -105,13 +105,13 @@ def _by_the_zenith(images: UInt8[np.ndarray, "n 90 360"]) -> Evidence | None:
     share = outer / np.maximum(inner, 1e-9)
     for pole, convention, row in ((0, CONVENTIONS[0], "first"), (1, CONVENTIONS[1], "last")):
         if inner.min() >= VISIBLE and share[pole] <= POLE and share[1 - pole] >= APART * share[pole]:
-            spread = f"grey levels spread by {outer[pole]:.1f}, {INWARD} rows on by {inner[pole]:.1f}"
-            return Evidence(convention, f"the {row} row is at a single direction ({spread}), as the zenith is")
+            spread = f"grey levels vary by {outer[pole]:.1f}, {INWARD} rows further by {inner[pole]:.1f}"
+            return Evidence(convention, f"the {row} row shows a single direction ({spread}), like the zenith")
     return None
 
 
 def _pixel(local: Float[np.ndarray, "n 3"], convention: ConventionName) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Returns rows and columns of a folder's images in which directions lie."""
+    """Returns the rows and columns of directions in a folder's images."""
     zenith = np.degrees(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]))
     azimuth = np.degrees(np.arctan2(local[:, 1], local[:, 0]))
     if convention == "zenith":
@@ -124,6 +124,6 @@ def _pixel(local: Float[np.ndarray, "n 3"], convention: ConventionName) -> tuple
 def _brighter(
     images: UInt8[np.ndarray, "n 90 360"], row: Int[np.ndarray, " n"], column: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the share of its image that a pixel is brighter than, pixels as bright as it by half."""
+    """Returns the fraction of its image that a pixel is brighter than; equally bright pixels count half."""
     pixel = images[np.arange(len(images)), row, column][:, None, None]
     return (images < pixel).mean((1, 2)) + 0.5 * (images == pixel).mean((1, 2))

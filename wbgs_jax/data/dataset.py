@@ -1,6 +1,7 @@
-"""What a trainer, an evaluation or an experiment sees of any data: links, observations, receivers, surface, split.
+"""The dataset, the common form of all data for training, evaluation and experiments: links, observations, receivers, surfaces,
+split.
 
-A checksum of a data set: a run keeps that of its data, so that nobody goes on with others under the same name.
+A run stores a checksum of its dataset, so that it cannot be continued with other data of the same name.
 """
 
 import dataclasses
@@ -19,19 +20,19 @@ from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver
 
 AT_ONCE = 1024
-"""Spectra that are made of snapshots."""
+"""Number of spectra computed from snapshots at a time."""
 
 
 @dataclass(frozen=True)
 class Materials:
-    """Which triangles share a material. Not its electrical properties: those are for a field to find out."""
+    """Assignment of triangles to materials. Their electrical properties are not included: a field has to learn them."""
 
     material: Int[np.ndarray, " faces"]
-    """int32: the material of every triangle."""
+    """int32: index of the material of every triangle."""
     names: tuple[str, ...]
-    """A label of every material."""
+    """Label of every material."""
     thickness: Float[np.ndarray, " materials"]
-    """Metres; 0 where it is not known."""
+    """Metres; 0 if unknown."""
 
 
 @dataclass(frozen=True)
@@ -45,26 +46,27 @@ class Dataset(Observed):
     """World frame, metres, float64."""
     frequencies_hz: Float[np.ndarray, " n"]
     receiver_index: Int[np.ndarray, " n"]
-    """Which of the receivers."""
+    """Index of the receiver."""
     tx_index: Int[np.ndarray, " n"]
-    """Which transmitter: links of one TX position share it; 0, 1, ... without gaps. Splits never cut through it."""
+    """Index of the transmitter, shared by links with the same TX position; 0, 1, ... without gaps. Splits never divide these
+    links."""
     train: Int[np.ndarray, " n_train"]
     """Indices of the training links."""
     validation: Int[np.ndarray, " n_validation"]
-    """Indices of the links that decide between settings; may be empty."""
+    """Indices of the links used to choose between settings; may be empty."""
     test: Int[np.ndarray, " n_test"]
     observations: HostObservations
     """What was observed, of exactly one kind: `{"snapshots": ...}`, `{"pas": ...}` or `{"power_db": ...}`, say."""
     vertices: Float[np.ndarray, "vertices 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
-    """The scene's surfaces in the world frame, metres, float32; empty where no mesh is known."""
+    """The scene's surfaces in the world frame, metres, float32; empty without a mesh."""
     faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
-    """int32 triangles; empty where only points are known."""
+    """int32 triangles; empty if only points are available."""
     face_part: Int[np.ndarray, " faces"] | None = None
-    """int32: the part, an object of the scene, that every triangle belongs to; None where parts are not known."""
+    """int32: the part (scene object) of every triangle; None if unknown."""
     materials: Materials | None = None
-    """What the triangles are made of; None where it is not known. Parts of one material share it."""
+    """Materials of the triangles; None if unknown. Parts of one material share it."""
     convention: ConventionName | None = None
-    """By which the images of a folder were read; None for scene files, which have one alone."""
+    """Convention by which the images of a folder were read; None for scene files, which have only one."""
 
     def __post_init__(self) -> None:
         only_kind(self.observations, self.name)
@@ -98,16 +100,16 @@ class Dataset(Observed):
         return jax.tree.map(lambda leaf: leaf[i], self.receivers)
 
     def query(self, index: Int[np.ndarray, " b"]) -> Query:
-        """Returns the float32 queries of some links."""
+        """Returns the float32 queries of links."""
         return Query(jnp.asarray(self.tx_positions[index], jnp.float32), jnp.asarray(self.frequencies_hz[index], jnp.float32))
 
     def links(self, index: Int[np.ndarray, " b"]) -> Links:
-        """Returns some links as float32 and int32 arrays on the device."""
+        """Returns links as float32 and int32 arrays on the device."""
         receiver, tx = (jnp.asarray(which[index], jnp.int32) for which in (self.receiver_index, self.tx_index))
         return Links(self.query(index), receiver, tx)
 
     def pas(self, index: Int[np.ndarray, " b"]) -> Float[Array, "b 90 360"]:
-        """Returns the observed power angular spectra (float32, maximum 1) of some links.
+        """Returns the observed power angular spectra (float32, maximum 1) of links.
 
         Raises:
             UserError: what was observed has no spectrum, as received powers have none.
@@ -136,7 +138,7 @@ class Dataset(Observed):
         return np.concatenate(made) if made else np.zeros((0, *PAS_SHAPE), np.uint8)
 
     def rx_positions(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 3"]:
-        """Returns where the receivers of some links stand (float64, world frame, metres)."""
+        """Returns the positions of the receivers of links (float64, world frame, metres)."""
         return np.asarray(self.receivers.position, np.float64)[self.receiver_index[index]]
 
     def received_db(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, " b"] | None:
@@ -146,7 +148,7 @@ class Dataset(Observed):
         return None if kind.to_power is None else np.asarray(kind.to_power(self.observations[kind.name][index]))
 
     def _arrays(self, index: Int[np.ndarray, " b"]) -> tuple[Float[Array, "arrays elements 3"], Int[np.ndarray, " b"]]:
-        """Returns the different arrays of some links, element positions in wavelengths, and which one belongs to every link."""
+        """Returns the distinct arrays of links (element positions in wavelengths) and the index of each link's array."""
         own = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[self.receiver_index[index]]), self.receivers)
         positions = own.element_wavelengths(jnp.asarray(self.frequencies_hz[index], jnp.float32))
         _, first, which = np.unique(np.asarray(positions), axis=0, return_index=True, return_inverse=True)
@@ -159,7 +161,7 @@ RENAMED = {"pas": "images"}
 
 
 def checksum(dataset: Dataset) -> str:
-    """Returns a checksum (SHA-256) of all numbers of a data set, its split included; names do not count."""
+    """Returns a checksum (SHA-256) of all numbers of a dataset, including its split but not names."""
     found = hashlib.sha256()
     parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
     parts |= {RENAMED.get(name, name): values for name, values in parts.pop("observations").items()}
@@ -172,7 +174,11 @@ def checksum(dataset: Dataset) -> str:
 
 
 def check_data(dataset: Dataset, expected: str, where: str) -> Dataset:
-    """Returns a data set whose checksum is the expected one (empty: not known); any other is a `UserError`."""
+    """Returns the dataset if its checksum is the expected one (or if that is empty).
+
+    Raises:
+        UserError: the checksum differs.
+    """
     if expected and checksum(dataset) != expected:
-        raise UserError(f"the data of {where} are not those that it was trained on; put them back, or train again")
+        raise UserError(f"the data of {where} are not those that it was trained on; restore them, or train again")
     return dataset

@@ -1,7 +1,7 @@
-"""Walls of a floor plan: how many of them stand between two points, and what mesh they make.
+"""Walls of a floor plan: the number of walls between two points, and a mesh of the walls.
 
-walls.csv (or layout.csv) holds segments x1,y1,x2,y2, each a wall, or the corners x,y of an outline around free space, in which
-a wall between rooms has two faces; of several outlines if a column room tells them apart. Metres.
+walls.csv (or layout.csv) has segments x1,y1,x2,y2, one per wall, or the corners x,y of an outline of free space, in which a
+wall between rooms has two faces; a column `room` separates several outlines. Metres.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from wbgs_jax.data.tables import check_positions, numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
 OUTLINES = "room"
-"""Column that tells outlines apart."""
+"""Column that separates outlines."""
 IGNORED = ("id", "name", "material", "thickness", "comment", "note")
-"""Columns that change nothing: the law takes all walls to be alike."""
+"""Names of columns that are ignored: the path loss law treats all walls equally."""
 PARALLEL = 1e-9
-"""Square metres: what is smaller crosses nothing."""
+"""Square metres: smaller cross products count as parallel."""
 ON_WALL = 1e-2
-"""Metres: what is as near to a wall is on it, and the wall not in its way."""
+"""Metres: a point this near to a wall counts as lying on it, and the wall as no obstacle."""
 
 
 @pytree
@@ -33,9 +33,9 @@ class Walls:
     """W vertical walls."""
 
     ends: Float[Array | np.ndarray, "w 2 2"]
-    """Of every wall on the floor, metres."""
+    """End points of every wall on the floor, metres."""
     share: Float[Array | np.ndarray, " w"]
-    """1, or 1/2 of each face of a wall that is drawn with two."""
+    """Weight: 1, or 1/2 for each face of a wall drawn with two faces."""
 
 
 NO_WALLS = Walls(np.zeros((0, 2, 2)), np.zeros(0))
@@ -51,15 +51,19 @@ SEGMENTS, OUTLINE = _Format(("x1", "y1", "x2", "y2"), 1.0), _Format(("x", "y"), 
 
 
 def load_walls(path: Path) -> Walls:
-    """Reads the walls of a CSV file; anything else than the two forms is a `UserError`."""
+    """Reads the walls of a CSV file.
+
+    Raises:
+        UserError: the file is in neither of the two forms.
+    """
     header, rows = read_table(path)
     form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
     values = numbers(path, header, rows, list(form.columns))
     check_positions(f"{path}: corners", values)
-    known = (*form.columns, *IGNORED, *([] if form is SEGMENTS else [OUTLINES]))
-    if other := [name for name in header if name not in known]:
+    allowed = (*form.columns, *IGNORED, *([] if form is SEGMENTS else [OUTLINES]))
+    if other := [name for name in header if name not in allowed]:
         raise UserError(
-            f"{path} has a column {other[0]!r}, of which a floor plan knows nothing; its columns are {', '.join(form.columns)}"
+            f"{path} has an unknown column {other[0]!r}; the columns of a floor plan are {', '.join(form.columns)}"
             + (f" and, for several outlines, {OUTLINES}" if form is OUTLINE else "")
         )
     if form is SEGMENTS:
@@ -71,22 +75,22 @@ def load_walls(path: Path) -> Walls:
 
 
 def namespace(array: Any) -> Any:
-    """Returns the library that an array is of: geometry is found in NumPy, in double precision, and used in JAX."""
+    """Returns the module of an array: geometry is computed in NumPy in double precision, and used in JAX."""
     return np if isinstance(array, np.ndarray) else jnp
 
 
 def crossings(
     walls: Walls, start: Float[Array | np.ndarray, "*#n 2"], goal: Float[Array | np.ndarray, "*#n 2"]
 ) -> Float[Array | np.ndarray, "*#n"]:
-    """Returns how many walls stand between points of the plan; one that a point lies on does not count."""
+    """Returns the number of walls between points of the plan; walls that contain one of the points do not count."""
     xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
     ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
     ground = _cross(ray, along)
     safe = xp.where(xp.abs(ground) < PARALLEL, 1.0, ground)
     on_ray, on_wall = _cross(corner, along) / safe, _cross(corner, ray) / safe
     long = xp.sqrt(xp.sum(along**2, -1))
-    apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # of the ends, across the wall
-    near = xp.minimum(on_ray, 1 - on_ray) * apart  # of the nearer one from it
+    apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # distance between the two points, perpendicular to the wall
+    near = xp.minimum(on_ray, 1 - on_ray) * apart  # distance of the nearer point from the wall
     hit = (xp.abs(ground) >= PARALLEL) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
     return xp.sum(xp.where(hit, walls.share, 0.0), -1)
 
@@ -96,8 +100,13 @@ def _cross(a: Any, b: Any) -> Any:
 
 
 def extruded(walls: Walls, height: float) -> trimesh.Trimesh:
-    """Returns the walls as upright rectangles without thickness, between a floor at z = 0 and a ceiling that span all of them:
-    a mesh for the fields that want one."""
+    """Returns a mesh of the walls for fields that need one: vertical rectangles without thickness between a floor at z = 0 and
+    a ceiling, which extend over all of them.
+
+    Args:
+        walls: of the plan.
+        height: of the ceiling, metres.
+    """
     low, high = np.asarray(walls.ends).min((0, 1)), np.asarray(walls.ends).max((0, 1))
     sheets = [[[*a, 0], [*b, 0], [*b, height], [*a, height]] for a, b in np.asarray(walls.ends) if not np.allclose(a, b)]
     for z in (0.0, height):

@@ -1,21 +1,19 @@
-"""The folder layout in which spectra are published (NeRF2, WRF-GS, Wideband3DGS): in, and out of any scene file.
+"""The folder layout in which spectra are published (NeRF2, WRF-GS, Wideband3DGS): import, and export of any scene file.
 
-    spectrum/00001.png ...       8-bit grey PAS, 90 x 360, its pixels in one of two orders (`wbgs_jax.data.conventions`)
+    spectrum/00001.png ...       8-bit grey PAS, 90 x 360, with pixels in one of two orders (`wbgs_jax.data.conventions`)
     tx_pos.csv                   header x,y,z; row k belongs to image k, both counted from 1; metres
     gateway_info.yml             the receiver: position [x, y, z] in metres, orientation quaternion [x, y, z, w]; optional:
                                  frequency (GHz), convention (of the spectra)
-    freq.txt                     optional: one frequency (GHz) a spectrum
-    train_, test_index.txt       optional: image names without .png, zero-padded or not; beside them validation_index.txt
+    freq.txt                     optional: one frequency (GHz) per spectrum
+    train_, test_index.txt       optional: image names without .png, zero-padded or not; also validation_index.txt
     point_cloud.ply              optional: the surface, or ...
     room.npz                     ... optional: a room with its objects and materials (`wbgs-jax convert room.glb`)
 
-Frames: transmitters and receiver share the world frame, and room.npz is in it. The mesh is z-up while that frame is y-up: a
-mesh point (x, y, z) lies at (x, z, -y) in the world. The layout knows no array; the 4x4 half-wavelength one is assumed, of
-unknown element pattern.
+Frames: transmitters, receiver and room.npz share the world frame. The mesh is z-up while that frame is y-up: a mesh point (x,
+y, z) lies at (x, z, -y) in the world. The layout does not specify the array; the 4x4 half-wavelength one with an unknown
+element pattern is assumed.
 
     wbgs-jax layout SCENE.npz FOLDER      writes a scene file as such a folder
-
-The receiver of a folder of the published layout: gateway_info.yml.
 """
 
 import contextlib
@@ -53,11 +51,11 @@ from wbgs_jax.types import (
 )
 
 SHORTEST, LONGEST = 1e-6, 1e6
-"""Of quaternions that have a direction."""
+"""Range of quaternion norms that are accepted."""
 
 
 class Gateway(NamedTuple):
-    """What gateway_info.yml holds; None where it does not."""
+    """Content of gateway_info.yml; None for missing entries."""
 
     name: str | None
     position: list[float]
@@ -68,10 +66,14 @@ class Gateway(NamedTuple):
 
 
 def read_gateway(path: Path) -> Gateway:
-    """Returns what is known of the data set and of its first gateway."""
+    """Returns the information about the dataset and its first gateway.
+
+    Raises:
+        UserError: the file is missing or invalid.
+    """
     wanted = "write 'gateway1:' with position [x, y, z] and orientation [x, y, z, w]"
     if not path.exists():
-        raise UserError(f"{path} is missing, which says where the receiver stands; {wanted}")
+        raise UserError(f"{path}, with the position of the receiver, is missing; {wanted}")
     content = read_yaml(path)
     entries = content if isinstance(content, dict) else {}
     gateways = {str(k): v for k, v in entries.items() if isinstance(v, dict) and "position" in v}
@@ -79,13 +81,11 @@ def read_gateway(path: Path) -> Gateway:
         raise UserError(f"{path} names no gateway; {wanted}")
     first, gateway = next(iter(gateways.items()))
     if len(gateways) > 1:
-        warnings.warn(f"{path} names {len(gateways)} gateways; the first, {first!r}, is taken for the receiver", stacklevel=3)
+        warnings.warn(f"{path} has {len(gateways)} gateways; the first one, {first!r}, is used as the receiver", stacklevel=3)
     position = vector(gateway.get("position"), 3, f"{path}: position")
     x, y, z, w = vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
     if not SHORTEST < np.linalg.norm(np.array([x, y, z, w]) / LONGEST) * LONGEST < LONGEST:
-        raise UserError(
-            f"{path}: orientation is all zeros, or beyond all measure; write the quaternion [0, 0, 0, 1] for no rotation"
-        )
+        raise UserError(f"{path}: orientation is all zeros or out of range; write the quaternion [0, 0, 0, 1] for no rotation")
     frequency = entries.get("frequency", gateway.get("frequency"))
     name, convention = entries.get("dataset_name"), entries.get("convention", gateway.get("convention"))
     if convention not in (None, *CONVENTIONS):
@@ -100,32 +100,41 @@ def read_gateway(path: Path) -> Gateway:
 
 
 def vector(value: Any, length: int, what: str) -> list[float]:
-    """Returns so many numbers, or raises a `UserError` that names what they are."""
+    """Returns `length` numbers.
+
+    Args:
+        value: a list.
+        length: number of entries.
+        what: description for the message.
+
+    Raises:
+        UserError: `value` is not such a list, or has entries that are too large.
+    """
     try:
-        vector = [float(v) for v in value] if isinstance(value, list) else []  # YAML gives 1e-3 as text
+        vector = [float(v) for v in value] if isinstance(value, list) else []  # YAML reads 1e-3 as text
     except (TypeError, ValueError, OverflowError):
         vector = []
     if len(vector) != length or not (np.abs(vector) <= LARGEST_COORDINATE_M).all():
-        unit = " metres from a place on the site" if length == 3 else ""
+        unit = " metres, relative to a point on the site" if length == 3 else ""
         raise UserError(f"{what} is {repr(value)[:80]}; it must be {length} numbers of at most {LARGEST_COORDINATE_M:g}{unit}")
     return vector
 
 
 def ghz_to_hz(word: str, where: Path) -> float:
-    """Returns hertz, through decimals, not by a factor of 1e9: rounding must not part a frequency from itself elsewhere."""
+    """Returns hertz, computed with decimals instead of a factor 1e9, so that equal frequencies stay equal despite rounding."""
     try:
         hertz = float(Decimal(word).scaleb(9))
     except (ArithmeticError, ValueError):
         hertz = np.nan
     if not LOWEST_OF_PATHS_HZ <= hertz <= MAX_FREQUENCY_HZ:
-        raise UserError(f"{where}: the frequency {word[:40]!r} is no number of GHz from 0.3 to 100; write 0.92 for 920 MHz")
+        raise UserError(f"{where}: the frequency {word[:40]!r} is not a number of GHz from 0.3 to 100; write 0.92 for 920 MHz")
     return hertz
 
 
 DIGITS = 9
-"""Of the number of an image, at most."""
+"""Maximum number of digits of an image number."""
 NOMINAL_FREQUENCY_HZ = 1e9
-"""Stands for the frequency of a folder that names none: without a mesh, a model of one frequency only needs some constant."""
+"""Frequency used for a folder without one: without a mesh, a model of a single frequency only needs some constant."""
 
 SPECTRA, POSITIONS, GATEWAY, FREQUENCIES = "spectrum", "tx_pos.csv", "gateway_info.yml", "freq.txt"
 MESH, ROOM = "point_cloud.ply", "room.npz"
@@ -142,16 +151,16 @@ def load_layout(
     """Loads a folder of the published layout; spectrum i is image i + 1.
 
     Without freq.txt all spectra have one frequency: `frequency_hz`, else `frequency` (GHz) in gateway_info.yml, else
-    `NOMINAL_FREQUENCY_HZ`. Without index files `test_fraction` of the transmitters, drawn by `seed`, are the test.
-    The pixels are in the order of `convention`, else of `convention` in gateway_info.yml, else of that which the training
-    spectra reveal; a note names what was found.
+    `NOMINAL_FREQUENCY_HZ`. Without index files, `test_fraction` of the transmitters (drawn with `seed`) are the test. The
+    pixels are in the order of `convention`, else of `convention` in gateway_info.yml, else of the one inferred from the
+    training spectra, which a warning names.
 
     Raises:
-        UserError: a file is missing, damaged, or at odds with the others, or the convention cannot be found.
+        UserError: a file is missing, damaged, or inconsistent with the others, or the convention cannot be inferred.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder; give one that holds {SPECTRA}/, {POSITIONS} and {GATEWAY}")
+        raise UserError(f"{folder} is not a folder; give one that contains {SPECTRA}/, {POSITIONS} and {GATEWAY}")
     images = _read_images(folder / SPECTRA)
     positions = _read_positions(folder / POSITIONS, len(images))
     gateway = read_gateway(folder / GATEWAY)
@@ -162,7 +171,7 @@ def load_layout(
     else:
         train, test = tx_disjoint_split(tx_index, test_fraction, seed)
         split = {"train": train, "validation": train[:0], "test": test}
-    named = _agreed(convention, gateway.convention, folder) or _revealed(folder, images, gateway, positions, tx_index, split)
+    named = _agreed(convention, gateway.convention, folder) or _inferred(folder, images, gateway, positions, tx_index, split)
     receiver = make_receiver(gateway.position, gateway.orientation, array_of(named))
     return Dataset(
         name=gateway.name or safe_name(folder.resolve().name),
@@ -186,23 +195,25 @@ def load_layout(
 
 
 def export_layout(scene: SceneFile, folder: Path | str) -> None:
-    """Writes a scene as a folder of the published layout; the folder appears whole or not at all.
+    """Writes a scene as a folder of the published layout, atomically.
 
     Loading it gives the scene's queries, split and mesh, and its PAS rounded to 8 bits; snapshots and array are not kept.
 
     Raises:
-        UserError: `folder` exists and is not empty, or cannot be written; or the scene has several receivers, powers alone, or
-            no training or no test spectra, for which the layout has no form.
+        UserError: `folder` exists and is not empty, or cannot be written; or the scene has several receivers, only powers, or
+            no training or no test spectra, which the layout cannot represent.
     """
     dataset = scene_dataset(scene)
     if dataset.n_receivers > 1 or not dataset.has_spectra:
         what = f"{dataset.n_receivers} receivers" if dataset.has_spectra else f"{dataset.observed.words} alone"
         raise UserError(f"scene {scene.name} has {what}, which the layout has no form for; keep the scene file")
     if len(dataset.train) == 0 or len(dataset.test) == 0:
-        raise UserError(f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; give its split both")
+        raise UserError(
+            f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; its split needs both"
+        )
     with _new_folder(Path(folder)) as target:
         (target / SPECTRA).mkdir()
-        for start in range(0, len(dataset), 256):  # in blocks: a scene in float32 is a gigabyte
+        for start in range(0, len(dataset), 256):  # in blocks: all spectra of a scene in float32 take a gigabyte
             index = np.arange(start, min(start + 256, len(dataset)))
             for number, pas in zip(index + 1, np.asarray(dataset.pas(index)), strict=True):
                 Image.fromarray(np.round(pas * 255).astype(np.uint8)).save(target / SPECTRA / f"{number:05d}.png")
@@ -221,7 +232,7 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
 
 
 def mesh_to_world(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns points of the layout's z-up mesh in the y-up world of its transmitters: (x, y, z) -> (x, z, -y)."""
+    """Returns points of the layout's z-up mesh in the y-up world frame of its transmitters: (x, y, z) -> (x, z, -y)."""
     x, y, z = points.T
     return np.stack([x, z, -y], -1)
 
@@ -233,11 +244,12 @@ def world_to_mesh(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def _read_room(folder: Path) -> Room:
-    """Returns the surfaces of a folder, in the frame of its transmitters; without a triangle where it has points or nothing."""
+    """Returns the surfaces of a folder in the frame of its transmitters; without triangles if there are only points or
+    nothing."""
     mesh, room = folder / MESH, folder / ROOM
     if room.exists():
         if mesh.exists():
-            raise UserError(f"{folder} has both {MESH} and {ROOM}; keep the one that shows the room as it was")
+            raise UserError(f"{folder} has both {MESH} and {ROOM}; keep only one of them")
         return load_room(room)
     vertices, faces = read_ply(mesh) if mesh.exists() else (np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     return Room(mesh_to_world(vertices), faces, np.zeros(len(faces), np.int32))
@@ -246,10 +258,10 @@ def _read_room(folder: Path) -> Room:
 def _read_images(folder: Path) -> UInt8[np.ndarray, "n 90 360"]:
     numbered = sorted((_image_number(path.stem, folder), path) for path in folder.glob("*.png"))
     if not numbered:
-        raise UserError(f"{folder} holds no .png spectra; put 00001.png, 00002.png, ... there")
+        raise UserError(f"{folder} has no .png spectra; add 00001.png, 00002.png, ...")
     for expected, (number, path) in enumerate(numbered, 1):
         if number != expected:
-            raise UserError(f"{path} stands where image {expected:05d} is due; number images from 1, without gaps or doubles")
+            raise UserError(f"{path} is in the place of image {expected:05d}; number images from 1, without gaps or duplicates")
     return np.stack([_read_image(path) for _, path in numbered])
 
 
@@ -258,10 +270,10 @@ def _read_image(path: Path) -> UInt8[np.ndarray, "90 360"]:
         with Image.open(path, formats=["PNG"]) as image:
             if image.size != (PAS_WIDTH, PAS_HEIGHT) or image.mode != "L":
                 found = f"{image.height} x {image.width} pixels of mode {image.mode}"
-                raise UserError(f"{path} has {found}; a spectrum is {PAS_HEIGHT} x {PAS_WIDTH}, 8-bit grey (mode L)")
+                raise UserError(f"{path} has {found}; spectra have {PAS_HEIGHT} x {PAS_WIDTH} pixels, 8-bit grey (mode L)")
             return np.asarray(image)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # all of these, says Pillow
-        raise UserError(f"{path} is truncated or not a PNG image ({error}); copy or make it again") from error
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # documented by Pillow
+        raise UserError(f"{path} is truncated or not a PNG image ({error}); copy or create it again") from error
 
 
 def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
@@ -269,7 +281,7 @@ def _read_positions(path: Path, n: int) -> Float[np.ndarray, "n 3"]:
     if header.lower().replace(" ", "") != "x,y,z":
         raise UserError(f"{path} starts with {header[:40]!r}; its first line must be x,y,z")
     if len(rows) != n:
-        raise UserError(f"{path} has {len(rows)} rows for {n} images in {SPECTRA}/; give one for each, row k for image k")
+        raise UserError(f"{path} has {len(rows)} rows for {n} images in {SPECTRA}/; row k must belong to image k")
     return np.array([vector(row.split(","), 3, f"{path}: row {number}") for number, row in enumerate(rows, 1)])
 
 
@@ -280,16 +292,16 @@ def _read_frequencies(
         single = wanted_hz if wanted_hz is not None else gateway_hz
         if single is None and walls:
             warnings.warn(
-                f"{path.parent} names no frequency: its spectra are taken to be of {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz; if they "
-                f"are not, give --frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
+                f"{path.parent} does not record a frequency, and {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz is assumed; otherwise give "
+                f"--frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
                 stacklevel=3,
             )
         single = NOMINAL_FREQUENCY_HZ if single is None else single
         if not LOWEST_OF_PATHS_HZ <= single <= MAX_FREQUENCY_HZ:
-            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; the model knows 0.3 to 100 GHz")
+            raise UserError(f"the frequency of {path.parent} is {single / 1e9:g} GHz; the valid range is 0.3 to 100 GHz")
         return np.full(n, single, np.float64)
     if wanted_hz is not None:
-        raise UserError(f"{path} gives the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
+        raise UserError(f"{path} has the frequencies; leave out the {wanted_hz:g} Hz, or delete that file")
     words = read_text(path).split()
     if len(words) != n:
         raise UserError(f"{path} has {len(words)} frequencies for {n} images in {SPECTRA}/; give one (GHz) for each")
@@ -297,13 +309,13 @@ def _read_frequencies(
 
 
 def _agreed(wanted: ConventionName | None, named: ConventionName | None, folder: Path) -> ConventionName | None:
-    """Returns the convention that somebody has named, if anybody has."""
+    """Returns the convention that the caller or the folder specifies, if any."""
     if wanted is not None and named is not None and wanted != named:
-        raise UserError(f"{folder / GATEWAY} names the convention {named}; leave out {wanted}, or correct that file")
+        raise UserError(f"{folder / GATEWAY} specifies the convention {named}; leave out {wanted}, or correct that file")
     return named if wanted is None else wanted
 
 
-def _revealed(
+def _inferred(
     folder: Path,
     images: UInt8[np.ndarray, "n 90 360"],
     gateway: Gateway,
@@ -311,26 +323,26 @@ def _revealed(
     tx_index: np.ndarray,
     split: dict[str, np.ndarray],
 ) -> ConventionName:
-    """Returns the convention that the spectra reveal that are not for the test."""
-    known = np.sort(np.concatenate([split["train"], split["validation"]]))
+    """Returns the convention inferred from the spectra outside the test."""
+    trained = np.sort(np.concatenate([split["train"], split["validation"]]))
     receiver = make_receiver(gateway.position, gateway.orientation)
-    found = find_convention(images[known], receiver, positions[known], tx_index[known])
+    found = find_convention(images[trained], receiver, positions[trained], tx_index[trained])
     choices = " or ".join(CONVENTIONS)
     if found.convention is None:
         raise UserError(
-            f"{folder} does not name the order of its pixels, and its spectra do not show it ({found.reason}): give "
+            f"{folder} does not record the order of its pixels, and its spectra do not reveal it ({found.reason}): give "
             f"--convention {choices}, or write `convention: ...` in {GATEWAY} (docs/formats.md)"
         )
     warnings.warn(
-        f"{folder} does not name the order of its pixels: {found.convention} is used, because {found.reason}; "
-        f"`convention: {choices}` in {GATEWAY} settles it",
+        f"{folder} does not record the order of its pixels: {found.convention} is used, because {found.reason}; "
+        f"`convention: {choices}` in {GATEWAY} sets it",
         stacklevel=3,
     )
     return found.convention
 
 
 def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the indices of every part of the split; one of them alone, the validation, may be missing."""
+    """Returns the indices of every part of the split; only the validation may be missing."""
     optional = [] if (folder / INDEX["validation"]).exists() else ["validation"]
     split = {p: np.zeros(0, int) if p in optional else _read_index(folder / INDEX[p], len(tx_index)) for p in INDEX}
     for first, second in itertools.combinations(INDEX, 2):
@@ -342,13 +354,13 @@ def _read_split(folder: Path, tx_index: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _read_index(path: Path, n: int) -> np.ndarray:
-    """Returns the indices of the spectra that an index file names; at least one, none twice."""
+    """Returns the indices of the spectra named in an index file: at least one, and none twice."""
     numbers = [_image_number(word.removesuffix(".png"), path) for word in read_text(path).split()]
     absent = [number for number in numbers if not 1 <= number <= n]
     if absent:
-        raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ holds images 1 to {n}; mend the index")
+        raise UserError(f"{path} names image {absent[0]:05d}, but {SPECTRA}/ has images 1 to {n}; correct the index")
     if not numbers or len(set(numbers)) < len(numbers):
-        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; mend it, or delete all index files")
+        raise UserError(f"{path} names {'an image twice' if numbers else 'no image'}; correct it, or delete all index files")
     return np.array(numbers) - 1
 
 
@@ -364,7 +376,7 @@ def _hz_to_ghz(hertz: float) -> str:
 
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """Gives a temporary folder beside `folder` that becomes it when the block ends well and vanishes when it does not."""
+    """Yields a temporary folder beside `folder`, which replaces it if the block succeeds and is removed otherwise."""
     temporary = None
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -373,10 +385,10 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
         yield temporary
         os.umask(umask := os.umask(0))
-        temporary.chmod(0o777 & ~umask)  # mkdtemp makes folders that only their owner can enter
+        temporary.chmod(0o777 & ~umask)  # mkdtemp makes folders accessible only to their owner
         temporary.rename(folder)
     except OSError as error:
-        raise UserError(f"cannot write {folder}: {error.strerror}; choose another folder or mend its permissions") from error
+        raise UserError(f"cannot write {folder}: {error.strerror}; choose another folder or fix its permissions") from error
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)

@@ -1,8 +1,6 @@
-"""Data sets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them.
-
-Several data sets of one scene, each seen from receivers of its own, as one.
-
-What files and folders of other programs are, and the way from there.
+"""Loads datasets by name: a released scene by its number, a scene file, a folder of the published layout, or several of them
+with different receivers in one scene as a single dataset. For files and folders of other programs, the error explains how to
+convert them.
 """
 
 import os
@@ -29,18 +27,18 @@ SURFACES = ("vertices", "faces", "face_part")
 
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
-    """Returns the links of all data sets in their order.
+    """Returns the links of all datasets in order.
 
-    Receivers are numbered on, and a place where several data sets have a transmitter is one transmitter. It is of the test if
-    one of them tests it, and else of the validation if one of them validates it: its other receivers would give it away. Links
-    that are in no part of their data set are in none here.
+    Receivers are renumbered consecutively, and transmitters of several datasets at the same position become one transmitter. It
+    is in the test if any dataset tests it, otherwise in the validation if any validates it, since links to other receivers
+    would reveal it. Links that are in no part of their dataset are in none here.
 
     Raises:
-        UserError: they are not of one scene, or of different kinds or arrays.
+        UserError: the datasets are from different scenes, or have different kinds of observations or arrays.
     """
     first, *others = datasets
     for other in others:
-        _check_alike(first, other)
+        _check_compatible(first, other)
     tx_positions = np.concatenate([one.tx_positions for one in datasets])
     tx_index = group_transmitters(tx_positions)
     before = np.cumsum([0, *(len(one) for one in datasets)])
@@ -69,15 +67,15 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     )
 
 
-def _check_alike(first: Dataset, other: Dataset) -> None:
+def _check_compatible(first: Dataset, other: Dataset) -> None:
     where = f"{first.name} and {other.name} cannot be joined"
     if first.observed != other.observed:
         raise UserError(f"{where}: one holds {first.observed.words} and the other {other.observed.words}")
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
-        raise UserError(f"{where}: their arrays differ in the number or the unit of their elements")
+        raise UserError(f"{where}: their arrays differ in the number or unit of their elements")
     if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in SURFACES):
-        raise UserError(f"{where}: their surfaces differ; give data sets of one scene")
+        raise UserError(f"{where}: their surfaces differ; give datasets of one scene")
 
 
 def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"]) -> Int[np.ndarray, " n"]:
@@ -86,23 +84,23 @@ def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"
 
 SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
 PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
-ROOM = "`wbgs-jax convert` makes a room of it beside measured data, data_gen makes spectra for it (docs/own_scene.md)"
+ROOM = "`wbgs-jax convert` makes a room of it for measured data, data_gen computes spectra for it (docs/own_scene.md)"
 MODELS = (".usd", ".usda", ".usdc", ".usdz", ".stl", ".dae", ".fbx", ".blend", ".3ds", ".off", ".3mf", ".abc", ".vtk", ".vtp")
 KINDS = {
-    ".h5": ("of HDF5", SNAPSHOTS),
-    ".hdf5": ("of HDF5", SNAPSHOTS),
-    ".parquet": ("of Parquet", PATHS),
+    ".h5": ("an HDF5 file", SNAPSHOTS),
+    ".hdf5": ("an HDF5 file", SNAPSHOTS),
+    ".parquet": ("a Parquet file", PATHS),
     ".mat": (
-        "of MATLAB",
-        "give DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.scene_of_snapshots` (docs/formats.md)",
+        "a MATLAB file",
+        "pass DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.scene_of_snapshots` (docs/formats.md)",
     ),
     ".npy": (
-        "a single array of NumPy",
-        "make a folder of images, or a scene file of snapshots, with places and receiver (docs/formats.md)",
+        "a single NumPy array",
+        "create a folder of images, or a scene file of snapshots, with positions and receiver (docs/formats.md)",
     ),
     ".pkl": ("a pickle, which can run any program", "save its arrays as .npz"),
-    ".pt": ("a pickle of PyTorch, which can run any program", "save its arrays as .npz"),
-    ".p2m": ("of Wireless InSite", PATHS),
+    ".pt": ("a PyTorch pickle, which can run any program", "save its arrays as .npz"),
+    ".p2m": ("a Wireless InSite file", PATHS),
     ".uan": ("an antenna pattern of Wireless InSite", "patterns are named: tr38901, iso, dipole, hw_dipole (docs/formats.md)"),
     ".ffd": ("an antenna pattern of HFSS", "patterns are named: tr38901, iso, dipole, hw_dipole (docs/formats.md)"),
     ".csv": ("a table", "readings of powers go to `wbgs-jax measure --data FOLDER` (docs/measured.md)"),
@@ -114,13 +112,13 @@ KINDS = {
     **dict.fromkeys((".glb", ".gltf", ".obj", ".ply", ".xml"), ("a model of a room", ROOM)),
     **dict.fromkeys(MODELS, ("a model", "export it as glTF or OBJ; then " + ROOM)),
 }
-"""Of files by their suffix: what they are, and what to do with them."""
+"""Descriptions of other kinds of files by suffix, and how to use their content."""
 COLMAP = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
-"""Of a folder of RF-3DGS: the cameras of its images."""
+"""Files in a folder of RF-3DGS with the cameras of its images."""
 
 
 def check_kind(path: Path) -> None:
-    """Raises a `UserError` for a file of another program, or a folder of another layout, that says what is missing."""
+    """Raises a `UserError` with advice for a file of another program or a folder of another layout."""
     kind = KINDS.get(path.suffix.lower())
     if path.is_file() and kind is not None:
         raise UserError(f"{path} is {kind[0]}, not a scene file; {kind[1]}")
@@ -128,25 +126,25 @@ def check_kind(path: Path) -> None:
         return
     if any((path / name).exists() for name in COLMAP):
         raise UserError(
-            f"{path} is a folder of RF-3DGS: pictures by cameras of COLMAP, without the places of transmitters; give "
+            f"{path} is a folder of RF-3DGS: images from COLMAP cameras, without positions of transmitters; give "
             "spectrum/, tx_pos.csv and gateway_info.yml (docs/formats.md)"
         )
     if any(path.glob("*.npy")):
         raise UserError(
-            f"{path} holds arrays of NumPy; make a folder of images of them, spectrum/00001.png ..., with tx_pos.csv and "
+            f"{path} contains NumPy arrays; create a folder of images from them, spectrum/00001.png ..., with tx_pos.csv and "
             "gateway_info.yml, or a scene file of snapshots (docs/formats.md)"
         )
 
 
 DATA_VARIABLE = "WBGS_DATA"
-"""Environment variable: a folder of scene files to use instead of those released with the package."""
+"""Environment variable: folder of scene files that replaces those released with the package."""
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
 
 MOST_MATERIALS, REST = 64, "others"
-"""Materials of a scene that are told apart, and what the rest of them is called."""
+"""Maximum number of distinct materials of a scene, and the label of the others."""
 PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
-"""Of a split, as scene files number them."""
+"""Values of `split` in scene files by part."""
 
 
 def load_dataset(
@@ -156,15 +154,15 @@ def load_dataset(
     test_fraction: float = 0.2,
     convention: ConventionName | None = None,
 ) -> Dataset:
-    """Loads a data set from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
-    from several of one scene, with commas between them, as one data set of several receivers (`wbgs_jax.data.load`).
+    """Loads a dataset from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
+    or from several of one scene, separated by commas, as one dataset with several receivers.
 
     The other arguments are for folders that do not record them (`wbgs_jax.data.image_folder.load_layout`); scene files do.
 
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.
     """
-    from wbgs_jax.data.image_folder import load_layout  # here: it needs `scene_dataset`
+    from wbgs_jax.data.image_folder import load_layout  # imported here because that module imports `scene_dataset`
 
     if (path := released_scenes().get(str(source))) is not None:
         return scene_dataset(load_scene(path))
@@ -177,28 +175,29 @@ def load_dataset(
     if path.suffix == ".npz":
         return scene_dataset(load_scene(path))
     if path.is_file():
-        raise UserError(f"{path} is of no known kind; give a scene file (.npz) or a folder of spectra (docs/formats.md)")
-    known = ", ".join(released_scenes()) or f"none in {_scene_folder()} (make them with `make data`)"
-    raise UserError(f"there is no scene {str(source)!r}; give a released one ({known}), an .npz scene file or a folder")
+        raise UserError(f"{path} is of an unknown kind; give a scene file (.npz) or a folder of spectra (docs/formats.md)")
+    released = ", ".join(released_scenes()) or f"none in {_scene_folder()} (create them with `make data`)"
+    raise UserError(f"there is no scene {str(source)!r}; give a released one ({released}), an .npz scene file or a folder")
 
 
 def source_names(source: str | int | Path) -> list[str]:
-    """Returns the names of the data sets that a name with commas stands for; a file or folder may have commas in its own."""
+    """Returns the names of the datasets in a name with commas; the name of an existing file or folder may itself contain
+    commas."""
     word = str(source)
     return [word] if Path(word).exists() else [name for name in word.split(",") if name]
 
 
 def source_paths(source: str) -> list[Path]:
-    """Returns the files and folders that a data set is read from."""
+    """Returns the files and folders that a dataset is read from."""
     released = released_scenes()
     return [released.get(name, Path(name)) for name in source_names(source)]
 
 
 def scene_dataset(scene: SceneFile) -> Dataset:
-    """Returns the links of a scene file, transmitter by transmitter, then receiver by receiver, frequency fastest.
+    """Returns the links of a scene file, ordered by transmitter, receiver, and frequency (fastest).
 
-    The split is the file's own. Links that nobody observed are left out: those whose power is NaN, where a receiver does not
-    hear a transmitter, or whose snapshot is NaN, where nobody measured.
+    The split is that of the file. Links without an observation are omitted: those with a power of NaN (not received) or a
+    snapshot of NaN (not measured).
     """
     links = _observed(scene)
     tx, rx, freq = np.nonzero(links)
@@ -225,20 +224,22 @@ def scene_dataset(scene: SceneFile) -> Dataset:
 
 
 def released_scenes() -> dict[str, Path]:
-    """Returns scene numbers ("1", "2", ...) or names ("cabin") and the scene files that hold them."""
+    """Returns the scene files by number ("1", "2", ...) or name ("cabin")."""
     files = {path.stem.removeprefix("scene"): path for path in _scene_folder().glob("*.npz")}
     return dict(sorted(files.items(), key=lambda item: (len(item[0]), item[0])))
 
 
 def _label(part: Any, number: int, name: str) -> tuple[str, float]:
-    """Returns the material of a part and its thickness (metres; 0: not known)."""
+    """Returns the material of a part and its thickness (metres; 0: unknown)."""
     try:
         thickness = float(part.get("thickness", 0))
         material = str(part.get("material", part.get("name", number)))
     except (AttributeError, TypeError, ValueError):
         thickness, material = np.nan, ""
     if not 0 <= thickness <= LARGEST_COORDINATE_M:
-        raise UserError(f'part {number} of {name} must be {{"name", "material", "thickness"}}, its thickness metres from 0 on')
+        raise UserError(
+            f'part {number} of {name} must be {{"name", "material", "thickness"}} with a thickness in metres, 0 or more'
+        )
     return material, thickness
 
 
@@ -254,8 +255,8 @@ def _observed(scene: SceneFile) -> Bool[np.ndarray, "tx rx freq"]:
 
 
 def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tuple[str, float]]:
-    """Returns the labels of parts with at most `MOST_MATERIALS` of them, the largest by area, and one for the others of every
-    thickness: where each object is of a material of its own, searching them all takes hours."""
+    """Returns the labels of parts with at most `MOST_MATERIALS` distinct ones, those of the largest area; the others are
+    combined by thickness. If every object has a material of its own, the calibration of all of them would take hours."""
     kinds = sorted(set(labels))
     if len(kinds) <= MOST_MATERIALS:
         return labels
@@ -264,7 +265,7 @@ def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tupl
     area = np.bincount(of_face, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(kinds))
     largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:MOST_MATERIALS]}
     warnings.warn(
-        f"{name} names {len(kinds)} materials: all but the {MOST_MATERIALS} of the largest area are taken for one",
+        f"{name} has {len(kinds)} materials: all except the {MOST_MATERIALS} of the largest area are treated as one",
         stacklevel=3,
     )
     return [label if label in largest else (REST, label[1]) for label in labels]
@@ -281,12 +282,20 @@ def _receivers(scene: SceneFile) -> list[Receiver]:
 
 
 def materials_of(room: Room, name: str) -> Materials | None:
-    """Returns what triangles are made of: objects of one material and thickness share a material, and of very many materials
-    the smaller ones do. None if not all objects are named; what is no object is a `UserError` that names `name`."""
+    """Returns the materials of triangles: objects with the same material and thickness share one; if there are very many, the
+    smaller ones are combined. None if not all objects are named.
+
+    Args:
+        room: surfaces and parts.
+        name: of the file, for messages.
+
+    Raises:
+        UserError: an entry of the parts is invalid.
+    """
     parts = room.parts
     if not isinstance(parts, list) or len(parts) <= int(room.face_part.max(initial=-1)):
         if parts:
-            warnings.warn(f"{name} does not name all of its parts: they are taken to be of one material", stacklevel=2)
+            warnings.warn(f"{name} does not name all of its parts: they are treated as one material", stacklevel=2)
         return None
     labels = _common([_label(part, i, name) for i, part in enumerate(parts)], room, name)
     kinds = sorted(set(labels))

@@ -1,7 +1,7 @@
-"""A room by itself, for data that were measured in it: surfaces, the objects that they are of, and what these are made of.
+"""A room as a separate file, for data measured in it: surfaces, the objects that they belong to, and their materials.
 
-One `.npz` with the arrays `vertices` (metres, world frame), `faces`, `face_part` and `meta`, JSON with `parts`: of every object
-its name, material and thickness (metres; 0 where it is not known), as a scene file has them (docs/formats.md).
+One `.npz` with the arrays `vertices` (metres, world frame), `faces`, `face_part` and `meta`, JSON with `parts`: name, material
+and thickness (metres; 0 if unknown) of every object, as in a scene file (docs/formats.md).
 """
 
 import json
@@ -29,10 +29,10 @@ class Room:
     faces: Int[np.ndarray, "faces 3"]
     """int32."""
     face_part: Int[np.ndarray, " faces"]
-    """int32: the object that every triangle is of."""
+    """int32: index of the object that every triangle belongs to."""
     parts: Any = field(default_factory=list)
-    """A list: of every object a mapping of "name", "material" and "thickness" (metres; 0: not known). As a file has it:
-    `materials_of` checks it."""
+    """List of mappings with "name", "material" and "thickness" (metres; 0: unknown) of every object, as in the file;
+    `materials_of` checks them."""
 
 
 def save_room(path: Path | str, room: Room) -> None:
@@ -46,16 +46,16 @@ def load_room(path: Path | str) -> Room:
     """Reads a room from a room file, or from a scene file that has a mesh.
 
     Raises:
-        UserError: the file is missing, damaged or another one, or it holds no triangles.
+        UserError: the file is missing, damaged or of another kind, or has no triangles.
     """
-    path, advice = Path(path), "make it with `wbgs-jax convert room.glb --out room.npz`"
+    path, advice = Path(path), "create it with `wbgs-jax convert room.glb --out room.npz`"
     arrays = read_arrays(path, "room file", advice, {*ARRAYS, "meta"})
     if missing := [name for name in (*ARRAYS, "meta") if name not in arrays]:
-        raise UserError(f"{path} is no room file: it lacks {', '.join(missing)}; {advice}")
+        raise UserError(f"{path} is not a room file: it lacks {', '.join(missing)}; {advice}")
     with told(f"meta of room file {path}", advice):
         meta = json.loads(str(arrays.pop("meta")))
         parts = meta.get("parts", [])
     room = Room(**check_mesh(arrays, str(path)), parts=parts)
     if not len(room.faces):
-        raise UserError(f"{path} holds no triangles; {advice}")
+        raise UserError(f"{path} has no triangles; {advice}")
     return room

@@ -1,25 +1,25 @@
-"""Readings of received power at several fixed receivers from many places, read from folders and averaged over cells.
+"""Readings of received power at several fixed receivers from many positions, read from folders and averaged over cells.
 
-    readings.csv (or calibration.csv)   x,y[,z][,room][,floor], and a column of dBm a receiver, named by its id;
+    readings.csv (or calibration.csv)   x,y[,z][,room][,floor], and one column of dBm per receiver, named by its id;
                                         empty: not received
     receivers.csv (or anchors.csv)      id,x,y,z
     walls.csv (or layout.csv)           optional; floor_plan.py
 
-or in a layout of NeRF2 (below). Metres and one frame throughout. Headers may be in capitals.
+or in one of the layouts of NeRF2 (below). All positions are in metres in one frame. Headers may be in capitals.
 
-Received powers as NeRF2 (Zhao et al., MobiCom 2023) publishes them, and as those publish who followed.
+Received powers in the layouts published by NeRF2 (Zhao et al., MobiCom 2023) and its successors:
 
-    tx_pos.csv              x,y,z, a row a transmitter
+    tx_pos.csv              x,y,z, one row per transmitter
 
     gateway_position.yml    name: [x, y, z] of Bluetooth gateways, and
-    gateway_rssi.csv        dBm, one column a gateway, of its name; -100: not received
+    gateway_rssi.csv        dBm, one column per gateway, with its name; -100: not received
 
     base-station.yml        base_station: [[x, y, z], ...], the antennas, or rx_positions.yml, name: [x, y, z], and
     csidata.npy             complex channel state (transmitter, antenna, subcarrier)
 
-Of channel state its mean power over the subcarriers is taken, in dB of whatever it was measured in; carriers without a value
-(NaN, or zero throughout, as at direct current and at the edges of the band) do not count. NeRF2's own set of channel
-state has no `tx_pos.csv`: it asks for a downlink where an uplink is known, not where a transmitter stands.
+Channel state is reduced to its mean power over the subcarriers, in dB relative to its own unit; subcarriers without a value
+(NaN, or zero throughout, as at direct current and at the edges of the band) are ignored. NeRF2's own channel state data have no
+`tx_pos.csv`: their task is to predict the downlink from the uplink, not from the position of a transmitter.
 """
 
 import dataclasses
@@ -52,33 +52,37 @@ ANTENNAS = ("base-station.yml", "rx_positions.yml")
 NOT_RECEIVED = -100.0
 
 Powers = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n r"], Float[np.ndarray, "r 3"]]
-"""Places of the transmitter (metres), powers (dB; NaN: nothing received), and places of the receivers."""
+"""Transmitter positions (metres), powers (dB; NaN: nothing received), and receiver positions (metres)."""
 
 
 def is_nerf2(folder: Path) -> bool:
-    """Returns whether a folder holds one of these layouts."""
+    """Returns whether a folder has one of NeRF2's layouts."""
     return (folder / RSSI).exists() or (folder / CSI).exists()
 
 
 def load_nerf2(folder: Path) -> Powers:
-    """Reads a folder; a missing or damaged file is a `UserError`."""
+    """Reads a folder in one of NeRF2's layouts.
+
+    Raises:
+        UserError: a file is missing or damaged.
+    """
     if (folder / RSSI).exists():
-        heard, listed = folder / RSSI, found(folder, GATEWAYS)
+        source, listed = folder / RSSI, found(folder, GATEWAYS)
         names, receivers = _positions(listed)
-        values = _rssi(heard, names if names else len(receivers))
+        values = _rssi(source, names if names else len(receivers))
     else:
-        heard, listed = folder / CSI, found(folder, ANTENNAS)
-        (_, receivers), values = _positions(listed), _csi(heard)
+        source, listed = folder / CSI, found(folder, ANTENNAS)
+        (_, receivers), values = _positions(listed), _csi(source)
         if not (folder / TRANSMITTERS[0]).exists():
             raise UserError(
-                f"{folder} has no {TRANSMITTERS[0]} (x,y,z) that says where its transmitters stood; NeRF2's own channel "
-                "state is about uplinks and downlinks, not about places"
+                f"{folder} has no {TRANSMITTERS[0]} (x,y,z) with the positions of its transmitters; NeRF2's own channel "
+                "state is about uplinks and downlinks, not about positions"
             )
     tx = found(folder, TRANSMITTERS)
     places = numbers(tx, *read_table(tx), ["x", "y", "z"])
     if values.shape != (len(places), len(receivers)):
         raise UserError(
-            f"{heard} has powers of {values.shape[0]} transmitters at {values.shape[1]} receivers; there are {len(places)} "
+            f"{source} has powers of {values.shape[0]} transmitters at {values.shape[1]} receivers; there are {len(places)} "
             f"positions in {tx.name} and {len(receivers)} in {listed.name}"
         )
     return places, values, receivers
@@ -88,7 +92,7 @@ def _rssi(path: Path, gateways: list[str] | int) -> Float[np.ndarray, "n r"]:
     header, rows = read_table(path)
     count = gateways if isinstance(gateways, int) else len(gateways)
     if len(header) != count:
-        raise UserError(f"{path} has powers of {len(header)} gateways, {GATEWAYS[0]} {count}")
+        raise UserError(f"{path} has powers of {len(header)} gateways, but {GATEWAYS[0]} has {count}")
     values = numbers(path, header, rows, match_columns(path, header, gateways))
     values = not_received(path, np.where(values <= NOT_RECEIVED, np.nan, values))
     check_powers(path, values)
@@ -103,17 +107,17 @@ def _csi(path: Path) -> Float[np.ndarray, "n r"]:
     if not isinstance(state, np.ndarray) or state.ndim != 3 or not np.iscomplexobj(state):
         raise UserError(f"{path} must hold complex numbers (transmitter, antenna, subcarrier)")
     powers = np.abs(state.astype(np.complex128)) ** 2
-    powers[..., (powers == 0).all((0, 1))] = np.nan  # at direct current and the band's edges nothing is sent
+    powers[..., (powers == 0).all((0, 1))] = np.nan  # direct current and the edges of the band carry no signal
     with np.errstate(divide="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of antennas without any value: NaN is right
+        warnings.simplefilter("ignore", RuntimeWarning)  # antennas without any value are NaN, as intended
         power = np.nanmean(powers, -1)
         decibels: Float[np.ndarray, "n r"] = 10 * np.log10(power)
     return np.where(np.isfinite(decibels), decibels, np.nan)
 
 
 def _positions(path: Path) -> tuple[list[str], Float[np.ndarray, "r 3"]]:
-    """Returns the names and positions that a YAML file lists: of one list without names, or one a name; other entries are left
-    alone."""
+    """Returns the names and positions listed in a YAML file: one list without names, or one entry per name; other entries are
+    ignored."""
     entries = read_yaml(path)
     try:
         if "base_station" in entries:
@@ -130,7 +134,7 @@ def _positions(path: Path) -> tuple[list[str], Float[np.ndarray, "r 3"]]:
 
 
 def _position(entry: Any) -> Any:
-    """Returns the position that an entry stands for; None where it is a text or a number."""
+    """Returns the position in an entry; None for a text or a number."""
     if isinstance(entry, dict):
         return entry["position"]
     return entry if isinstance(entry, list) else None
@@ -138,45 +142,45 @@ def _position(entry: Any) -> Any:
 
 READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
 NAMES = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
-"""Columns that may name a receiver."""
+"""Names of columns that may identify a receiver."""
 ROOMS = ("room", "floor", "storey", "level")
-"""Columns that part readings; those of floors go with heights alone."""
+"""Names of columns that divide readings; those of floors require heights."""
 IGNORED = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
-"""Columns that change nothing."""
+"""Names of columns that are ignored."""
 
 
 @dataclass(frozen=True)
 class Readings:
-    """N places at which R receivers were, or were not, heard."""
+    """Powers received, or not received, by R receivers from N transmitter positions."""
 
     places: Float[np.ndarray, "n 3"]
-    """Of the transmitter, metres."""
+    """Positions of the transmitter, metres."""
     powers: Float[np.ndarray, "n r"]
     """dBm; NaN where nothing was received."""
     counts: Float[np.ndarray, "n r"]
-    """Readings that a power is the mean of."""
+    """Number of readings averaged in each power."""
     rooms: tuple[str, ...]
-    """Of every place; empty where nobody has said."""
+    """Room of every position; empty if not specified."""
     receivers: Float[np.ndarray, "r 3"]
     """Metres."""
 
     def without(self, places: Bool[np.ndarray, " n"]) -> "Readings":
-        """Returns them as if nothing had been received from some of the places."""
+        """Returns the readings as if nothing had been received from the given positions (mask)."""
         return dataclasses.replace(self, powers=np.where(places[:, None], np.nan, self.powers))
 
 
 def load_readings(folder: Path, height: float) -> Readings:
-    """Reads a folder.
+    """Reads a folder of readings.
 
     Args:
         folder: in one of the layouts above.
-        height: of the transmitter above the floor (metres), where the file has no column z.
+        height: of the transmitter above the floor (metres), for files without a column z.
 
     Raises:
         UserError: a file is missing or damaged.
     """
     if not folder.is_dir():
-        raise UserError(f"there is no folder {folder}")
+        raise UserError(f"folder {folder} does not exist")
     if is_nerf2(folder):
         places, powers, receivers = load_nerf2(folder)
         counts = np.isfinite(powers).astype(float)
@@ -192,15 +196,15 @@ def _load_tables(folder: Path, height: float) -> Readings:
     powers = [name for name in header if name not in ("x", "y", "z", *ROOMS, *IGNORED)]
     if len(powers) != len(receivers):
         raise UserError(
-            f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} {len(receivers)} receivers; "
-            "name columns by the ids of receivers, and leave out what is no power"
+            f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} has {len(receivers)} receivers; "
+            "name these columns by the ids of receivers, and remove columns that are not powers"
         )
     ids = next((names.index(name) for name in NAMES if name in names), None)
     powers = match_columns(path, powers, len(receivers) if ids is None else [entry[ids] for entry in entries])
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
     parts = [header.index(name) for name in ROOMS if name in header]
     if places.shape[1] == 2 and set(ROOMS[1:]) & set(header):
-        raise UserError(f"{path} has a column of floors but no heights; give the column z, metres in the receivers' frame")
+        raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])
     rooms = tuple("/".join(row[part] for part in parts) for row in rows)
@@ -210,7 +214,7 @@ def _load_tables(folder: Path, height: float) -> Readings:
 
 
 def _checked(readings: Readings, folder: Path) -> Readings:
-    """Returns readings whose positions are plausible."""
+    """Returns the readings after checking that positions are plausible."""
     check_positions(f"{folder}: places", readings.places)
     check_positions(f"{folder}: receivers", readings.receivers)
     check_metres(f"{folder}: receivers and places", np.concatenate([readings.receivers, readings.places]))
@@ -221,15 +225,20 @@ def _checked(readings: Readings, folder: Path) -> Readings:
 
 
 def cell_means(readings: Readings, size: float) -> Readings:
-    """Returns the means (of dBm) over cubic cells: what is left when fading is averaged. A cell stands where its readings were
-    taken on average; one that reaches into two rooms is two."""
+    """Returns means (of dBm) over cubic cells, which average out fading. The position of a cell is the mean position of its
+    readings; a cell that extends over two rooms is divided.
+
+    Args:
+        readings: to average.
+        size: of a cell, metres.
+    """
     names, room = np.unique(np.array(readings.rooms), return_inverse=True)
     cubes = np.column_stack([np.floor(readings.places / size).astype(int), room.reshape(-1)])
     cubes, cell = np.unique(cubes, axis=0, return_inverse=True)
     cell, n = cell.reshape(-1), len(cubes)
-    heard = np.isfinite(readings.powers)
-    counts = _sums(cell, n, np.where(heard, readings.counts, 0))
-    totals = _sums(cell, n, np.where(heard, readings.counts * np.nan_to_num(readings.powers), 0))
+    received = np.isfinite(readings.powers)
+    counts = _sums(cell, n, np.where(received, readings.counts, 0))
+    totals = _sums(cell, n, np.where(received, readings.counts * np.nan_to_num(readings.powers), 0))
     powers = np.where(counts > 0, totals / np.maximum(counts, 1), np.nan)
     places = _sums(cell, n, readings.places) / np.bincount(cell)[:, None]
     return Readings(places, powers, counts, tuple(names[cubes[:, -1]].tolist()), readings.receivers)
@@ -242,7 +251,7 @@ def _sums(cell: Int[np.ndarray, " m"], n: int, values: Float[np.ndarray, "m k"])
 
 
 def attribution(folder: Path) -> list[str]:
-    """Returns the paragraphs of a folder's README that say whose data they are, and on what terms."""
+    """Returns the paragraphs of a folder's README about the origin and licence of the data."""
     path = folder / "README.md"
     if not path.is_file():
         return []

@@ -1,8 +1,5 @@
-"""What fields may ask about a data set's scene: its box, points spread over its surfaces, the surfaces themselves.
-
-Which transmitters a receiver sees: the straight line between them meets no surface.
-
-Closed bodies among a scene's surfaces, in which no antenna can stand (NumPy, host).
+"""Information about a dataset's scene for fields: its bounding box, points on its surfaces, and the surfaces themselves; the
+visibility of transmitters from receivers; and closed bodies, in which no antenna can be (NumPy, host).
 """
 
 from dataclasses import dataclass
@@ -20,20 +17,20 @@ from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Mesh, Receiver, Surface, SurfaceSampling
 
 MESH_SIZED = (20_000, 70_000)
-"""Bounds of the number of points when it is left to the mesh."""
+"""Bounds on the number of points if it is derived from the mesh."""
 OVERSAMPLING = 30
-"""Candidates a point that are drawn by area before "solid_angle" chooses among them."""
+"""Candidates per point that are drawn by area before "solid_angle" selects among them."""
 MIN_DISTANCE = 0.3
 """Metres; nearer surfaces are not sampled more densely than at this distance."""
 BELOW_HORIZON = -0.1
-"""Cosine of the largest zenith angle at which points start: a little below the horizon, for footprints that reach above it."""
+"""Cosine of the largest zenith angle of initial points: slightly below the horizon, for footprints that extend above it."""
 BOX_MARGIN = 1.0
-"""Metres around transmitters and receivers in which points are drawn where no surface is known."""
+"""Margin (metres) around transmitters and receivers in which points are drawn if there are no surfaces."""
 
 
 @dataclass(frozen=True)
 class DatasetScene:
-    """A data set's place, as fields see it (`wbgs_jax.types.Scene`)."""
+    """A dataset's scene as an implementation of `wbgs_jax.types.Scene`."""
 
     dataset: Dataset
 
@@ -44,14 +41,14 @@ class DatasetScene:
 
     @property
     def spectra(self) -> int:
-        """Number of links that are trained."""
+        """Number of training links."""
         return len(self.dataset.train)
 
     @property
     def box(self) -> Float[np.ndarray, "2 3"]:
-        """Smallest and largest coordinates (metres) of surfaces, where they are known, and of all transmitters and receivers.
+        """Smallest and largest coordinates (metres) of surfaces, if available, and of all transmitters and receivers.
 
-        What a field says about transmitters outside is made up.
+        Predictions for transmitters outside this box are extrapolations without support in the data.
         """
         places = np.concatenate([np.asarray(self.dataset.vertices, np.float64), _antennas(self.dataset)])
         return np.stack([places.min(0), places.max(0)])
@@ -68,9 +65,9 @@ class DatasetScene:
 def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampling = "solid_angle") -> Surface:
     """Returns `count` points on the mesh; 0 means as many as the mesh has vertices, within `MESH_SIZED`.
 
-    "solid_angle" spreads them evenly over the directions of the receivers' hemispheres, hidden surfaces included: the image
-    has the same resolution everywhere and no Gaussian is spent where the image cannot show it. "area" spreads them evenly
-    over the surface. Without faces the points of the cloud are used; without any points, random ones in the box of
+    "solid_angle" distributes them uniformly over the directions of the receivers' hemispheres, including hidden surfaces: the
+    resolution is the same everywhere in the image, and no Gaussian is placed where the image cannot show it. "area" distributes
+    them uniformly over the surface. Without faces, points of the cloud are used; without any points, random ones in the box of
     transmitters and receivers.
     """
     rng = np.random.default_rng(seed)
@@ -87,15 +84,15 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
 
 
 def make_mesh(dataset: Dataset) -> Mesh:
-    """Returns the surfaces themselves, for fields that know where they are; where parts or materials are not known, all
-    triangles are of one.
+    """Returns the surfaces themselves, for fields that use their geometry; if parts or materials are unknown, all triangles
+    have the same one.
 
     Raises:
-        UserError: only points are known, or nothing.
+        UserError: there are only points, or no surfaces at all.
     """
     if not len(dataset.faces):
-        advice = "give a scene with a mesh or choose a field that does without"
-        raise UserError(f"{dataset.name} has no mesh, only points; this field needs surfaces: {advice}")
+        advice = "give a scene with a mesh or choose a field that does not need one"
+        raise UserError(f"{dataset.name} has no mesh, only points, but this field needs surfaces: {advice}")
     one = np.zeros(len(dataset.faces), np.int32)
     materials = dataset.materials or Materials(one, ("",), np.zeros(1))
     return Mesh(
@@ -108,7 +105,7 @@ def make_mesh(dataset: Dataset) -> Mesh:
 
 
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
-    """Returns a surface (float32) with the spacing of its points; needs at least 4 points."""
+    """Returns a surface (float32) with the spacing of its points; at least 4 points are needed."""
     neighbours, _ = cKDTree(points).query(points, 4)
     return Surface(jnp.asarray(points, jnp.float32), jnp.asarray(neighbours[:, 1:].mean(1), jnp.float32))
 
@@ -133,7 +130,7 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
 def _solid_angle(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], receiver: Receiver
 ) -> Float[np.ndarray, " n"]:
-    """Returns the solid angle at a receiver of unit pieces of surface, 0 below its horizon."""
+    """Returns the solid angle of surface elements of unit area at a receiver; 0 below its horizon."""
     offset = points - np.asarray(receiver.position)
     distance = np.maximum(np.linalg.norm(offset, axis=1), MIN_DISTANCE)
     facing = np.abs(np.sum(offset * normals, -1)) / distance
@@ -142,11 +139,11 @@ def _solid_angle(
 
 
 CLEARANCE = 1e-3
-"""Metres at both ends of a line in which a surface does not count: antennas may be mounted on it."""
+"""Metres at both ends of a line within which surfaces are ignored: antennas may be mounted on them."""
 
 
 def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
-    """Returns whether the receivers of some links see their transmitters; None where no mesh says so."""
+    """Returns whether links have a line of sight; None without a mesh."""
     if not len(dataset.faces):
         return None
     receivers = dataset.rx_positions(index)
@@ -156,7 +153,7 @@ def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray,
     lowest, highest = triangles.min(1), triangles.max(1)
     free = np.ones(len(lines), bool)
     for i, line in enumerate(lines):
-        near = np.flatnonzero(((lowest <= line.max(0)) & (highest >= line.min(0))).all(1))  # of all, a few in a hundred
+        near = np.flatnonzero(((lowest <= line.max(0)) & (highest >= line.min(0))).all(1))  # a few percent of all
         free[i] = not len(near) or not _obstructed(line, triangles[near], normals[near])
     return free[which.reshape(-1)]
 
@@ -164,7 +161,7 @@ def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray,
 def _obstructed(
     line: Float[np.ndarray, "2 3"], triangles: Float[np.ndarray, "faces 3 3"], normals: Float[np.ndarray, "faces 3"]
 ) -> bool:
-    """Returns whether any triangle lies between the two ends of a line."""
+    """Returns whether any triangle intersects the line between its two ends."""
     start, way = line[0], line[1] - line[0]
     starts, ways = (np.broadcast_to(vector, normals.shape) for vector in (start, way))
     points, cut, along = trimesh.intersections.planes_lines(triangles[:, 0], normals, starts, ways, return_distance=True)
@@ -174,26 +171,27 @@ def _obstructed(
 
 
 ALIKE_M = 1e-4
-"""Vertices nearer than this are one."""
+"""Metres: vertices nearer than this are identified."""
 MOST_TRIANGLES = 20_000
-"""Of all bodies together, the largest bodies left out."""
+"""Maximum number of triangles of all bodies together; the largest bodies are omitted."""
 
 
 def closed_bodies(dataset: Dataset) -> tuple[ClosedBody, ...]:
-    """Returns the closed parts of a scene's surfaces that no receiver is in, nor most transmitters: those are rooms."""
+    """Returns the closed parts of a scene's surfaces that contain neither a receiver nor most transmitters: such parts are
+    rooms."""
     faces = dataset.faces
     if not len(faces):
         return ()
     part = np.zeros(len(faces), int) if dataset.face_part is None else np.asarray(dataset.face_part)
     found: list[ClosedBody] = []
-    inhabitants = np.asarray(dataset.receivers.position, np.float64)
-    known = np.unique(dataset.tx_positions[np.concatenate([dataset.train, dataset.validation])], axis=0)
+    receivers = np.asarray(dataset.receivers.position, np.float64)
+    trained = np.unique(dataset.tx_positions[np.concatenate([dataset.train, dataset.validation])], axis=0)
     for number in np.unique(part):
         own = faces[part == number]
         if not _is_closed(dataset.vertices, own):
             continue
         body = ClosedBody(f"part {number}", np.asarray(dataset.vertices, np.float64)[own])
-        if not inside(body, inhabitants).any() and (not len(known) or inside(body, known).mean() < 0.5):
+        if not inside(body, receivers).any() and (not len(trained) or inside(body, trained).mean() < 0.5):
             found.append(body)
     found.sort(key=lambda body: len(body.triangles))
     total = np.cumsum([len(body.triangles) for body in found])
@@ -201,7 +199,7 @@ def closed_bodies(dataset: Dataset) -> tuple[ClosedBody, ...]:
 
 
 def _is_closed(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "t 3"]) -> bool:
-    """Returns whether every edge belongs to two triangles, once in each direction."""
+    """Returns whether every edge belongs to two triangles of opposite direction."""
     used, index = np.unique(faces, return_inverse=True)
     _, same = np.unique(
         np.round(np.asarray(vertices, np.float64)[used] / ALIKE_M).astype(np.int64), axis=0, return_inverse=True

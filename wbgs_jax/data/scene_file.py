@@ -1,12 +1,11 @@
-"""The scene file: one `.npz` a scene, the contract between the generator (`data_gen`) and the library (docs/formats.md).
+"""The scene file: one `.npz` per scene, the interface between the generator (`data_gen`) and the library (docs/formats.md).
 
 Positions are float64 metres in one z-up world frame, frequencies hertz. Element positions are in the receiver's local frame,
 in wavelengths or metres. Snapshots contain the carrier phase exp(-j 2 pi f tau). `meta` is a JSON object (generator and
 versions, parts with their materials, seed, solver settings, sha256 of the meshes, ceilings).
 
-Files are written in format 2. Format 1 knew snapshots of one receiver only; its files are read and look like one of format 2.
-
-What the arrays of a scene file must be; whatever else they are is told in one line.
+Files are written in format 2. Format 1 had only snapshots of a single receiver; its files are read and converted to format 2.
+Arrays that violate the format raise an error of one line.
 """
 
 import json
@@ -41,7 +40,7 @@ ARRAYS: dict[str, Spec] = {
 }
 """All of these are in a file, ..."""
 MESH = ("vertices", "faces", "face_part")
-"""Those of the surfaces."""
+"""Arrays of the surfaces."""
 TEXTS = ("element_unit", "element_pattern")
 """... these, arrays of text, and the observations of exactly one kind (`observation_kinds.KINDS`)."""
 BY_KEYWORD = ("snapshots", "pas", "power_db")
@@ -49,10 +48,10 @@ BY_KEYWORD = ("snapshots", "pas", "power_db")
 
 
 def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
-    """Returns the arrays of a scene file in their dtypes.
+    """Returns the arrays of a scene file, converted to their dtypes.
 
     Raises:
-        UserError: an array is missing, or they make no scene; the message starts with `where`.
+        UserError: an array is missing or invalid; the message starts with `where`.
     """
     try:
         kind = _kind(arrays)
@@ -64,12 +63,16 @@ def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
         cast = _cast(arrays, specs)
         _check_values(cast, kind, sizes["vertices"])
     except _Wrong as error:
-        raise UserError(f"{where}: {error}; mend the scene or make it again (docs/formats.md)") from None
+        raise UserError(f"{where}: {error}; correct the scene or create it again (docs/formats.md)") from None
     return cast | {key: arrays[key] for key in TEXTS}
 
 
 def check_mesh(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
-    """Returns the arrays of surfaces (`MESH`) in their dtypes, or raises a `UserError` that starts with `where`."""
+    """Returns the arrays of surfaces (`MESH`), converted to their dtypes.
+
+    Raises:
+        UserError: an array is missing or invalid; the message starts with `where`.
+    """
     specs = {key: ARRAYS[key] for key in MESH}
     try:
         count = _sizes(arrays, specs)["vertices"]
@@ -77,17 +80,17 @@ def check_mesh(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndarra
         cast = _cast(arrays, specs)
         _check_surfaces(cast, count)
     except _Wrong as error:
-        raise UserError(f"{where}: {error}; mend the mesh or make it again (docs/formats.md)") from None
+        raise UserError(f"{where}: {error}; correct the mesh or create it again (docs/formats.md)") from None
     return cast
 
 
 def _cast(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, np.ndarray]:
-    with np.errstate(over="ignore", invalid="ignore"):  # what has become infinite is found afterwards
+    with np.errstate(over="ignore", invalid="ignore"):  # values that become infinite are detected afterwards
         return {key: arrays[key].astype(dtype, copy=False) for key, (dtype, _) in specs.items()}
 
 
 class _Wrong(Exception):
-    """What is wrong, without a place."""
+    """Describes what is wrong, without the location."""
 
 
 def _demand(ok: bool | np.bool_, what: str) -> None:
@@ -106,7 +109,7 @@ def _kind(arrays: dict[str, np.ndarray]) -> Kind:
 
 
 def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, int]:
-    """Returns the lengths of the named axes, the same in all arrays."""
+    """Returns the lengths of the named axes, which must be the same in all arrays."""
     sizes: dict[str, int] = {}
     for key, (dtype, axes) in specs.items():
         value = arrays[key]
@@ -114,7 +117,7 @@ def _sizes(arrays: dict[str, np.ndarray], specs: dict[str, Spec]) -> dict[str, i
         _demand(value.ndim == len(axes) and castable, f"{key} must be a {len(axes)}-D {dtype.__name__} array")
         lengths = list(zip(axes, value.shape, strict=True))
         expected = tuple(sizes.get(axis, n) if isinstance(axis, str) else axis for axis, n in lengths)
-        _demand(value.shape == expected, f"{key} has shape {value.shape}, expected {expected} beside the other arrays")
+        _demand(value.shape == expected, f"{key} has shape {value.shape}, expected {expected} to match the other arrays")
         sizes |= {axis: n for axis, n in lengths if isinstance(axis, str)}
     return sizes
 
@@ -123,13 +126,15 @@ def _check_surfaces(arrays: dict[str, np.ndarray], n_vertices: int) -> None:
     _check_positions(arrays, "vertices")
     faces = arrays["faces"]
     _demand((arrays["face_part"] >= 0).all(), "face_part must not be negative")
-    _demand(((faces >= 0) & (faces < n_vertices)).all(), "faces point at vertices that do not exist")
+    _demand(((faces >= 0) & (faces < n_vertices)).all(), "faces refer to vertices that do not exist")
 
 
 def _check_positions(arrays: dict[str, np.ndarray], key: str) -> None:
     _demand(np.isfinite(arrays[key]).all(), f"{key} contains NaN or infinity")
     largest = np.abs(arrays[key]).max(initial=0)
-    _demand(largest <= LARGEST_COORDINATE_M, f"{key} holds {largest:g}; positions are in metres, from a place on the site")
+    _demand(
+        largest <= LARGEST_COORDINATE_M, f"{key} contains {largest:g}; positions are in metres, relative to a point on the site"
+    )
 
 
 def _check_values(arrays: dict[str, np.ndarray], kind: Kind, n_vertices: int) -> None:
@@ -141,25 +146,27 @@ def _check_values(arrays: dict[str, np.ndarray], kind: Kind, n_vertices: int) ->
     fault = kind.fault(arrays[kind.name])
     _demand(not fault, f"{kind.name} contains {fault}")
     lowest, highest = arrays["frequencies_hz"].min(), arrays["frequencies_hz"].max()
-    band = f"the model knows {LOWEST_OF_PATHS_HZ:g} to {MAX_FREQUENCY_HZ:g} Hz"
+    band = f"the valid range is {LOWEST_OF_PATHS_HZ:g} to {MAX_FREQUENCY_HZ:g} Hz"
     _demand(lowest > 0, "frequencies_hz must be positive")
-    _demand(lowest >= LOWEST_OF_PATHS_HZ, f"frequencies_hz holds {lowest:g}; they are in hertz, 28e9 for 28 GHz, and {band}")
-    _demand(highest <= MAX_FREQUENCY_HZ, f"frequencies_hz holds {highest:g}; they are in hertz, and {band}")
+    _demand(
+        lowest >= LOWEST_OF_PATHS_HZ, f"frequencies_hz contains {lowest:g}; values are in hertz, 28e9 for 28 GHz, and {band}"
+    )
+    _demand(highest <= MAX_FREQUENCY_HZ, f"frequencies_hz contains {highest:g}; values are in hertz, and {band}")
     split = np.isin(arrays["split"], (TRAIN, TEST, VALIDATION))
-    _demand(split.all(), "split must hold 0 (train), 1 (test) and 2 (validation) only")
+    _demand(split.all(), "split must contain only 0 (train), 1 (test) and 2 (validation)")
     lengths = np.linalg.norm(arrays["rx_orientation"], axis=-1)
-    _demand((np.abs(lengths - 1) < 1e-3).all(), "rx_orientation must hold unit quaternions (wxyz)")
+    _demand((np.abs(lengths - 1) < 1e-3).all(), "rx_orientation must contain unit quaternions (wxyz)")
 
 
 def _check_texts(arrays: dict[str, np.ndarray], n_receivers: int) -> None:
     unit, pattern = (arrays[key] for key in TEXTS)
     units, shape = get_args(ElementUnit), pattern.shape
     _demand(unit.shape == () and str(unit) in units, f"element_unit must be {' or '.join(units)}")
-    _demand(pattern.dtype.kind == "U" and shape in ((), (n_receivers,)), "element_pattern must be a name, or one a receiver")
+    _demand(pattern.dtype.kind == "U" and shape in ((), (n_receivers,)), "element_pattern must be a name, or one per receiver")
 
 
 FORMAT = 2
-"""Of files that are written; older ones are read."""
+"""Format of files that are written; older ones can be read."""
 
 
 @dataclass(frozen=True)
@@ -181,9 +188,9 @@ class SceneFile:
     face_part: Int[np.ndarray, " faces"]
     """int32 index into meta["parts"], a list of {"name", "material", "thickness"}."""
     split: Int[np.ndarray, " tx"]
-    """int8: 0 train, 1 test, 2 validation; one value a TX, shared by all receivers and frequencies."""
+    """int8: 0 train, 1 test, 2 validation; one value per TX, shared by all receivers and frequencies."""
     snapshots: Complex[np.ndarray, "tx rx freq elements"] | None = None
-    """complex64, carrier phase included."""
+    """complex64, including the carrier phase."""
     pas: UInt8[np.ndarray, "tx rx freq 90 360"] | None = None
     """Power angular spectra times 255."""
     power_db: Float[np.ndarray, "tx rx freq"] | None = None
@@ -191,9 +198,9 @@ class SceneFile:
     others: HostObservations = field(default_factory=dict)
     """Observations (tx, rx, freq, ...) of a kind that has no field here, by its name."""
     element_unit: ElementUnit = "wavelengths"
-    """Of `element_positions`: "metres" is an array of fixed size."""
+    """Unit of `element_positions`: "metres" for an array of fixed size."""
     element_pattern: str | tuple[str, ...] = ""
-    """Element pattern such as "tr38901" or "iso", one name for all receivers or one for each; empty where it is not known."""
+    """Element pattern such as "tr38901" or "iso": one name for all receivers or one for each; empty if unknown."""
     meta: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -215,7 +222,7 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
     meta = json.dumps(scene.meta | {"format": FORMAT, "name": scene.name}, sort_keys=True)
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for key, value in (arrays | {"meta": np.array(meta)}).items():
-            # A fixed date: numpy.savez stamps the time, and two equal scenes would differ in their checksum.
+            # A fixed date: numpy.savez stores the time, so that equal scenes would have different checksums.
             info = zipfile.ZipInfo(f"{key}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w") as member:
@@ -226,18 +233,18 @@ def load_scene(path: Path | str) -> SceneFile:
     """Reads and checks a scene file of this format or an older one.
 
     Raises:
-        UserError: the file is missing, truncated, of another format, or its content is not a scene.
+        UserError: the file is missing, truncated, in another format, or does not contain a valid scene.
     """
     path = Path(path)
     advice = "check the path, copy it again, or make it again (docs/formats.md)"
     arrays = read_arrays(path, "scene file", advice, {"meta", *ARRAYS, *KINDS, *TEXTS})
     if "meta" not in arrays:
-        raise UserError(f"{path} is not a scene file: it lacks meta; make one with `save_scene` (docs/formats.md)")
+        raise UserError(f"{path} is not a scene file: it lacks meta; create one with `save_scene` (docs/formats.md)")
     with told(f"meta of scene file {path}", advice):
         meta = json.loads(str(arrays.pop("meta")))
     found = meta.get("format") if isinstance(meta, dict) else None
     if found not in (1, FORMAT):
-        raise UserError(f"{path} has scene format {str(found)[:20]}, this version reads 1 and {FORMAT}; update wbgs-jax")
+        raise UserError(f"{path} has scene format {str(found)[:20]}, but this version reads 1 and {FORMAT}; update wbgs-jax")
     if found == 1:
         arrays = _from_format_1(arrays, meta)
     arrays = check_arrays(arrays, str(path))
@@ -248,7 +255,7 @@ def load_scene(path: Path | str) -> SceneFile:
 
 
 def _from_format_1(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns the arrays of format 1, one receiver without an axis of its own and an array in wavelengths, as format 2."""
+    """Returns the arrays of format 1 (one receiver without its own axis, array in wavelengths) converted to format 2."""
     array = meta.get("rx_array", {})
     texts = {"element_unit": "wavelengths", "element_pattern": array.get("pattern", "") if isinstance(array, dict) else ""}
     axis = {"snapshots": 1, "rx_position": 0, "rx_orientation": 0, "element_positions": 0}

@@ -1,5 +1,5 @@
-"""Which links train, which decide between settings, which test. A split never cuts through a transmitter: its other receivers
-and frequencies would give it away."""
+"""Splits of links into training, validation (choice of settings) and test. The links of one transmitter are never divided,
+since those at other receivers and frequencies would reveal the held-out ones."""
 
 import dataclasses
 import itertools
@@ -15,13 +15,14 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 
 VALIDATION = 0.1
-"""Share of the training transmitters that decide between settings, where the data do not name them."""
+"""Fraction of the training transmitters used for validation, unless the data specify a validation part."""
 FEW_TX, LARGEST_SHARE = 8, 0.25
-"""Fewer validation transmitters decide little; but no more than this share for the sake of that number."""
+"""Desired minimum number of validation transmitters, and maximum fraction used to reach it."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Returns the transmitter (0, 1, ... by first appearance) of every link; positions (metres) agree to a micrometre."""
+    """Returns the index of the transmitter (0, 1, ... by first appearance) of every link; equal positions agree to a
+    micrometre."""
     _, first, group = np.unique(np.round(positions, 6), axis=0, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[group.reshape(-1)]
 
@@ -30,14 +31,14 @@ def note_shared_transmitters(name: str, tx_index: Int[np.ndarray, " n"], split: 
     """Warns of transmitters with links in two parts of a split."""
     for first, second in itertools.combinations(split, 2):
         if shared := len(np.intersect1d(tx_index[split[first]], tx_index[split[second]])):
-            text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will flatter"
+            text = f"{name}: {shared} TX positions are both in {first} and in {second}; scores will be too high"
             warnings.warn(text, stacklevel=4)
 
 
 def tx_disjoint_split(
     tx_index: Int[np.ndarray, " n"], test_fraction: float = 0.2, seed: int = 0
 ) -> tuple[Int[np.ndarray, " n_train"], Int[np.ndarray, " n_test"]]:
-    """Returns ascending indices of training and test links with `test_fraction` of the transmitters, drawn by `seed`, in the
+    """Returns ascending indices of training and test links, with `test_fraction` of the transmitters (drawn with `seed`) in the
     test.
 
     Raises:
@@ -50,11 +51,11 @@ def tx_disjoint_split(
 
 
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
-    """Returns the data set with `fraction` of its training transmitters moved to the validation part; with fewer than
-    `FEW_TX` of them, as many, but no more than a quarter of all: less decides nothing.
+    """Returns the dataset with `fraction` of its training transmitters moved to the validation part. If these are fewer than
+    `FEW_TX`, that many are moved, but at most a quarter of all, since fewer would decide nothing.
 
-    Which ones depends on the split alone: neither a run's seed nor what is trained changes them. Data that name a validation
-    part themselves, and data of a single training transmitter, stay as they are.
+    The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own,
+    and data with a single training transmitter, are unchanged.
 
     Raises:
         UserError: the fraction is not between 0 and 1.
@@ -62,10 +63,10 @@ def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Datas
     tx_index = dataset.tx_index[dataset.train]
     if len(dataset.validation) or len(np.unique(tx_index)) < 2:
         return dataset
-    known = np.unique(tx_index)
-    if 0 < fraction < 1:  # others are refused below
-        fraction = max(fraction, min(FEW_TX / len(known), LARGEST_SHARE))
-    seed = zlib.crc32(known.astype("<i8").tobytes())
+    transmitters = np.unique(tx_index)
+    if 0 < fraction < 1:  # other values are rejected below
+        fraction = max(fraction, min(FEW_TX / len(transmitters), LARGEST_SHARE))
+    seed = zlib.crc32(transmitters.astype("<i8").tobytes())
     moved = _draw(tx_index, fraction, np.random.default_rng(seed), "validation")
     return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])
 
@@ -75,10 +76,10 @@ def select_frequencies(
 ) -> Dataset:
     """Returns the same links with training, validation and test restricted to some frequencies (GHz); None keeps all of them.
 
-    The validation keeps the training frequencies: settings must not be chosen by what is to be predicted.
+    Validation has the training frequencies, since settings must not be chosen by the frequencies to be predicted.
 
     Raises:
-        UserError: a frequency does not occur in the data set, or a selection leaves no link.
+        UserError: a frequency does not occur in the dataset, or a selection leaves no links.
     """
     train = _keep(dataset, dataset.train, train_ghz, "training")
     validation = _keep(dataset, dataset.validation, train_ghz, "validation") if len(dataset.validation) else dataset.validation
@@ -87,38 +88,41 @@ def select_frequencies(
 
 
 def unseen_frequencies(dataset: Dataset, train_ghz: Sequence[float]) -> Dataset:
-    """Returns a data set with training at some frequencies (GHz) alone, tests at all others and at held-out transmitters; the
-    name says so."""
-    known = np.unique(dataset.frequencies_hz) / 1e9
-    others = [float(f) for f in known if not np.isclose(f, train_ghz, rtol=1e-6, atol=0).any()]
+    """Returns a dataset that trains only at some frequencies (GHz) and tests at all others, at held-out transmitters; its name
+    records this."""
+    available = np.unique(dataset.frequencies_hz) / 1e9
+    others = [float(f) for f in available if not np.isclose(f, train_ghz, rtol=1e-6, atol=0).any()]
     name = f"{dataset.name}_f" + "-".join(f"{f:g}" for f in train_ghz)
     return dataclasses.replace(select_frequencies(dataset, train_ghz, others), name=name)
 
 
 def fewer_transmitters(dataset: Dataset, count: int, seed: int) -> Dataset:
-    """Returns a data set with `count` of the training transmitters; larger counts contain the smaller ones. The name says so.
+    """Returns a dataset with `count` of the training transmitters; larger counts include the smaller ones. Its name records
+    this.
 
     Raises:
-        UserError: there are not so many.
+        UserError: there are fewer transmitters.
     """
-    known = np.unique(dataset.tx_index[dataset.train])
-    if not 0 < count <= len(known):
-        raise UserError(f"{dataset.name} has {len(known)} training transmitters; choose 1 to {len(known)} of them, not {count}")
-    chosen = np.random.default_rng([seed, 4]).permutation(known)[:count]
+    transmitters = np.unique(dataset.tx_index[dataset.train])
+    if not 0 < count <= len(transmitters):
+        raise UserError(
+            f"{dataset.name} has {len(transmitters)} training transmitters, not {count}; choose 1 to {len(transmitters)}"
+        )
+    chosen = np.random.default_rng([seed, 4]).permutation(transmitters)[:count]
     train = dataset.train[np.isin(dataset.tx_index[dataset.train], chosen)]
     return dataclasses.replace(dataset, train=train, name=f"{dataset.name}_tx{count}")
 
 
 def hold_out_box(dataset: Dataset, low: Sequence[float | int], high: Sequence[float | int]) -> Dataset:
-    """Returns a data set that tests at all transmitters within a box (corners in metres), such as a room, and trains at none of
-    them. Test transmitters elsewhere are left out. The name says so.
+    """Returns a dataset that tests at all transmitters in a box (corners in metres), such as a room, and trains at none of
+    them. Test transmitters elsewhere are omitted. Its name records this.
 
     Raises:
-        UserError: the box is empty, or it leaves nothing to train or to test.
+        UserError: the box is empty, or nothing remains for training or test.
     """
     lowest, highest = np.asarray(low, float), np.asarray(high, float)
     if not (lowest < highest).all():
-        raise UserError(f"a box from {list(low)} to {list(high)} is empty; give its lowest corner first, then its highest")
+        raise UserError(f"the box from {list(low)} to {list(high)} is empty; give its lowest corner first, then its highest")
     inside = np.all((dataset.tx_positions >= lowest) & (dataset.tx_positions <= highest), axis=1)
     train, validation = (part[~np.take(inside, part)] for part in (dataset.train, dataset.validation))
     if not inside.any() or not len(train):
@@ -131,12 +135,13 @@ def hold_out_box(dataset: Dataset, low: Sequence[float | int], high: Sequence[fl
 
 
 def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
-    """Returns a data set of the links of some receivers, which are numbered 0, 1, ... in the order given. The name says so.
+    """Returns a dataset of the links of some receivers, which are renumbered 0, 1, ... in the given order. Its name records
+    this.
 
-    Transmitters that none of them hears are gone, and the others numbered anew.
+    Transmitters without any such link are removed, and the others renumbered.
 
     Raises:
-        UserError: there is no such receiver, one is named twice, or none is.
+        UserError: there is no such receiver, one is named twice, or none is named.
     """
     if not which or len(set(which)) < len(which) or not all(0 <= i < dataset.n_receivers for i in which):
         raise UserError(f"{dataset.name} has receivers 0 to {dataset.n_receivers - 1}; choose each once, not {list(which)}")
@@ -152,23 +157,23 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
 
 
 def training_links(dataset: Dataset) -> Int[np.ndarray, " n"]:
-    """Returns the indices of all links that a training may look at, ascending."""
+    """Returns the indices of all links that training may use, including validation, ascending."""
     return np.sort(np.concatenate([dataset.train, dataset.validation]))
 
 
 def with_validation_trained(dataset: Dataset) -> Dataset:
-    """Returns the data set whose validation part is trained, too: what those may look at that choose nothing by it."""
+    """Returns the dataset with its validation part used for training as well, for methods that choose nothing by validation."""
     return dataclasses.replace(dataset, train=training_links(dataset), validation=dataset.validation[:0])
 
 
 def without_test(dataset: Dataset) -> Dataset:
-    """Returns the data set of its `training_links` alone."""
+    """Returns the dataset with only its `training_links`."""
     return _keep_links(dataset, training_links(dataset))
 
 
 def _keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
-    """Returns a data set of some links alone, in their order; the remaining transmitters are numbered anew."""
-    place = np.full(len(dataset), -1)  # of every link among those that stay
+    """Returns a dataset of some links in order; the remaining transmitters are renumbered."""
+    place = np.full(len(dataset), -1)  # new index of every link that is kept
     place[kept] = np.arange(len(kept))
 
     def remaining(index: np.ndarray) -> np.ndarray:
@@ -199,10 +204,10 @@ def _draw(tx_index: Int[np.ndarray, " n"], fraction: float, rng: np.random.Gener
 def _keep(dataset: Dataset, index: np.ndarray, wanted_ghz: Sequence[float] | None, role: str) -> np.ndarray:
     if wanted_ghz is None:
         return index
-    known_ghz = np.unique(dataset.frequencies_hz) / 1e9
+    available_ghz = np.unique(dataset.frequencies_hz) / 1e9
     for frequency in wanted_ghz:
-        if not np.isclose(known_ghz, frequency, rtol=1e-6, atol=0).any():
-            have = ", ".join(f"{f:g}" for f in known_ghz)
+        if not np.isclose(available_ghz, frequency, rtol=1e-6, atol=0).any():
+            have = ", ".join(f"{f:g}" for f in available_ghz)
             raise UserError(f"{dataset.name} has no spectra at {frequency:g} GHz; choose {role} frequencies among {have} GHz")
     ghz = dataset.frequencies_hz[index] / 1e9
     kept = index[np.isclose(ghz[:, None], np.asarray(wanted_ghz, np.float64).reshape(1, -1), rtol=1e-6, atol=0).any(1)]

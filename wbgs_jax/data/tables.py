@@ -1,8 +1,6 @@
-"""Which column of a table belongs to which receiver: by its name, in any usual spelling.
-
-CSV files that people write: headers in any case, empty cells, one line for every mistake.
-
-What numbers of readings may mean: values that stand for "not received", and numbers that are no metres and no dBm.
+"""Tables written by users: CSV files with headers in any case and empty cells, whose errors are reported on one line;
+assignment of columns to receivers by name, in any usual spelling; values that stand for "not received", and plausibility of
+positions and powers.
 """
 
 import csv
@@ -20,14 +18,19 @@ Tokens = tuple[str, ...]
 
 
 def match_columns(where: Path, columns: Sequence[str], ids: Sequence[str] | int) -> list[str]:
-    """Returns the columns in the order of the receivers that they name; of so many receivers without names those that are
-    numbered from 1, or from 0.
+    """Returns the columns in the order of the receivers that they name; for receivers without names, the columns must be
+    numbered from 1 or from 0.
 
-    Names are compared without case, separators and leading zeros, then without what all of them share (`rssi_`, `ap`), then as
+    Names are compared ignoring case, separators and leading zeros, then without their common parts (`rssi_`, `ap`), then as
     parts of each other.
 
+    Args:
+        where: file, for messages.
+        columns: names of the columns.
+        ids: names or number of the receivers.
+
     Raises:
-        UserError: a column names no receiver, or one names several, or several name one.
+        UserError: columns and receivers do not correspond one to one.
     """
     own = [tokens(name) for name in columns]
     if isinstance(ids, int):
@@ -45,12 +48,12 @@ def match_columns(where: Path, columns: Sequence[str], ids: Sequence[str] | int)
 
 
 def tokens(name: str) -> Tokens:
-    """Returns the words and numbers of a name, in small letters, numbers without leading zeros."""
+    """Returns the words and numbers of a name, in lower case, numbers without leading zeros."""
     return tuple(word.lstrip("0") or "0" if word.isdigit() else word for word in re.findall(r"[^\W\d_]+|\d+", name.lower()))
 
 
 def distinguishing(names: list[Tokens]) -> list[Tokens]:
-    """Returns names without what they all begin or all end with."""
+    """Returns names without their common beginning and end."""
     if len(names) < 2:
         return names
     while all(names) and len({one[0] for one in names}) == 1:
@@ -65,7 +68,7 @@ def _equal(own: list[Tokens], wanted: list[Tokens]) -> Callable[[int, int], bool
 
 
 def _within(own: list[Tokens], wanted: list[Tokens]) -> Callable[[int, int], bool]:
-    """Returns whether the longest of the receivers' names that a column begins or ends with is that of a receiver."""
+    """Returns a predicate: the longest receiver name that a column begins or ends with is that of the receiver."""
 
     def holds(column: Tokens, name: Tokens) -> bool:
         return bool(name) and (column[: len(name)] == name or column[-len(name) :] == name)
@@ -79,39 +82,51 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def found(folder: Path, names: tuple[str, ...]) -> Path:
-    """Returns the first of these files that exists; none is a `UserError`."""
+    """Returns the first of these files that exists.
+
+    Raises:
+        UserError: none of them exists.
+    """
     for name in names:
         if (folder / name).exists():
             return folder / name
-    raise UserError(f"{folder} has no {' or '.join(names)}; write it as docs/measured.md shows")
+    raise UserError(f"{folder} has no {' or '.join(names)}; create it as described in docs/measured.md")
 
 
 def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Returns the header of a CSV file in small letters, and its rows, all of one length."""
+    """Returns the header of a CSV file in lower case, and its rows, all of the same length.
+
+    Raises:
+        UserError: the file is missing, not a CSV file, or has no rows.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
             lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))]
     except UnicodeDecodeError:
-        raise UserError(f"{path} is no text in UTF-8; save it as CSV in UTF-8") from None
+        raise UserError(f"{path} is not a text file in UTF-8; save it as CSV in UTF-8") from None
     except (OSError, csv.Error) as error:
         raise UserError(f"{path} cannot be read: {error}; check the path, or save it again as CSV") from None
     if len(lines) < 2:
-        raise UserError(f"{path} has no rows below its header")
+        raise UserError(f"{path} has no rows after its header")
     header = [name.lower() for name in lines[0][1]]
     for sign, name in ((";", "';'"), ("\t", "tabs")):
         if len(header) == 1 and sign in header[0]:
             raise UserError(f"{path} has {name} between its cells; separate them by commas")
     if len(set(header)) < len(header):
-        raise UserError(f"{path} names two columns alike: {', '.join(header)}")
+        raise UserError(f"{path} has two columns of the same name: {', '.join(header)}")
     for number, row in lines[1:]:
         if len(row) != len(header):
-            raise UserError(f"{path}, line {number} has {len(row)} cells, the header {len(header)}")
+            raise UserError(f"{path}, line {number} has {len(row)} cells, but the header has {len(header)}")
     return header, [row for _, row in lines[1:]]
 
 
 def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[str]) -> Float[np.ndarray, "n k"]:
-    """Returns some columns as numbers; empty cells are NaN."""
+    """Returns columns as numbers; empty cells become NaN.
+
+    Raises:
+        UserError: a column is missing, or a cell is not a number.
+    """
     if missing := [name for name in columns if name not in header]:
         raise UserError(f"{path} has no column {missing[0]!r}; its columns are {', '.join(header)}")
     where, values = [header.index(name) for name in columns], np.full((len(rows), len(columns)), np.nan)
@@ -121,12 +136,12 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
                 values[i, k] = float(row[column]) if row[column] else np.nan
             except ValueError:
                 hint = "leave cells empty where nothing was received"
-                raise UserError(f"{path}, row {i + 1}: {row[column]!r} is no number; {hint}") from None
+                raise UserError(f"{path}, row {i + 1}: {row[column]!r} is not a number; {hint}") from None
     return values
 
 
 POWERS_DBM = (-200.0, 50.0)
-"""Beyond it numbers are no powers."""
+"""Range of plausible powers."""
 SENTINELS = (
     0.0,
     1.0,
@@ -145,22 +160,23 @@ SENTINELS = (
     -200.0,
     -999.0,
 )
-"""Numbers that devices write where they received nothing ..."""
+"""Numbers that devices write if they received nothing ..."""
 APART_DB = 8.0
-"""... if all others lie so far to one side of them ..."""
+"""... if all other values are at least this far to one side of them ..."""
 OFTEN = 0.2
-"""... or so many readings are exactly the lowest."""
+"""... or if at least this fraction of the readings equals the lowest value."""
 FURTHEST = 1e4
-"""Metres."""
+"""Largest coordinate, metres."""
 DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
-"""Largest longitude and latitude; extent of a site in degrees; and how many times as far it lies from the origin."""
+"""Largest longitude and latitude; largest extent of a site in degrees; and minimum ratio of its distance from the origin to its
+extent."""
 FEWEST, ELSEWHERE = 5, 50.0
-"""Places that may be degrees, powers of a receiver that may lack their sign; and how many times the extent of such places lies
-between them and the nearest receiver, if that is in metres."""
+"""Minimum number of positions that may be degrees, or of powers of a receiver that may lack their sign; and minimum ratio of
+the distance to the nearest receiver (in metres) to the extent of such positions."""
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
-    """Returns powers with NaN where a number stands for nothing; a note names the number."""
+    """Returns powers with NaN in place of numbers that mean "not received"; a warning names these numbers."""
     powers = np.where(np.isneginf(powers), np.nan, powers)
     for number in SENTINELS:
         is_it = powers == number
@@ -171,55 +187,55 @@ def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndar
         floor = number < others.min() and is_it.sum() >= OFTEN * len(others)
         if apart or floor:
             share = is_it.sum() / powers.size
-            warnings.warn(f"{where}: {number:g} stands for nothing received ({100 * share:.0f} % of its powers)", stacklevel=2)
+            warnings.warn(f"{where}: {number:g} is taken as not received ({100 * share:.0f} % of the powers)", stacklevel=2)
             powers = np.where(is_it, np.nan, powers)
     return powers
 
 
 def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
-    """Raises a `UserError` for numbers that are no powers in dBm."""
-    heard = powers[~np.isnan(powers)]
-    if not len(heard):
+    """Raises a `UserError` for numbers that are not powers in dBm."""
+    received = powers[~np.isnan(powers)]
+    if not len(received):
         raise UserError(f"{where}: nothing was received anywhere")
-    if heard.min() >= 0:
+    if received.min() >= 0:
         raise UserError(
-            f"{where}: powers are {heard.min():g} to {heard.max():g}, which no receiver has in dBm; convert milliwatts "
-            "(10 log10), give magnitudes their sign, leave cells empty where nothing was received"
+            f"{where}: powers are {received.min():g} to {received.max():g}, which is not plausible in dBm; convert milliwatts "
+            "(10 log10), give magnitudes their sign, and leave cells empty where nothing was received"
         )
     for number, column in enumerate(powers.T, 1):
         own = column[~np.isnan(column)]
         if len(own) >= FEWEST and own.min() >= 0:
             raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
-    if not ((heard >= POWERS_DBM[0]) & (heard <= POWERS_DBM[1])).all():
+    if not ((received >= POWERS_DBM[0]) & (received <= POWERS_DBM[1])).all():
         span = " to ".join(f"{power:g}" for power in POWERS_DBM)
         raise UserError(f"{where}: powers must be dBm, {span}; leave cells empty where nothing was received")
 
 
 def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
-    """Raises a `UserError` for positions that are none."""
+    """Raises a `UserError` for invalid positions."""
     if not (np.abs(positions) < FURTHEST).all():
-        raise UserError(f"{what} must be numbers of metres, each nearer than {FURTHEST:g} m to the origin")
+        raise UserError(f"{what} must be coordinates in metres, each less than {FURTHEST:g} m from the origin")
 
 
 def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
-    """Raises a `UserError` for positions whose first two coordinates are longitudes and latitudes."""
+    """Raises a `UserError` for positions whose first two coordinates are longitude and latitude."""
     plane = positions[:, :2]
     extent, offset = np.ptp(plane, axis=0).max(), np.abs(plane.mean(0)).max()
     ranged = (np.abs(plane) <= DEGREES).all() or (np.abs(plane) <= DEGREES[::-1]).all()
     if len(plane) > 1 and ranged and extent < TINY and offset > FAR * max(extent, 1e-12):
         raise UserError(
             f"{what} all lie within {extent:.2g}, {offset:.3g} from the origin: degrees of longitude and latitude; project "
-            "them to metres (UTM, say), from an origin on the site"
+            "them to metres (for example UTM), relative to an origin on the site"
         )
 
 
 def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np.ndarray, "r 3"]) -> None:
-    """Raises a `UserError` for places in degrees around receivers in metres."""
+    """Raises a `UserError` for positions in degrees with receivers in metres."""
     plane = np.unique(places[:, :2], axis=0)
     extent = np.ptp(plane, axis=0).max()
     nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
     if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
         raise UserError(
             f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
-            "latitude; project them to metres (UTM, say), from the origin of the receivers"
+            "latitude; project them to metres (for example UTM), relative to the origin of the receivers"
         )

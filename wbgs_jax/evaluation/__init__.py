@@ -1,1 +1,1 @@
-"""Scores, baselines, reports and pictures of trained fields."""
+"""Scores, baselines and reports of trained fields."""

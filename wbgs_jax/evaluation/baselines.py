@@ -1,7 +1,7 @@
-"""Baselines that learn nothing, reported beside every model: a model below inverse-distance weighting is of no use.
+"""Baselines that learn nothing, reported beside every model: a model worse than inverse-distance weighting is of no use.
 
-A baseline takes indices of spectra of its data set and gives their predicted PAS. It looks at training spectra only; where
-a frequency does not occur among them, those of the nearest one (in log f) stand in.
+A baseline takes indices of spectra of its data set and returns their predicted PAS. It uses training spectra only; if a
+frequency does not occur among them, those of the nearest one (in log f) are used instead.
 """
 
 import functools
@@ -20,19 +20,19 @@ from wbgs_jax.radio.geometry import to_local
 Baseline = Callable[[Int[np.ndarray, " b"]], Float[np.ndarray, "b 90 360"]]
 
 BLOCK = 256
-"""Spectra held at a time: a scene has thousands, of 32,400 pixels each."""
+"""Spectra processed together: a scene has thousands, of 32,400 pixels each."""
 
 
 def can_lend(dataset: Dataset, index: Int[np.ndarray, " n"]) -> bool:
-    """Returns whether every receiver of some links has training links, from which they can be predicted."""
+    """Returns whether every receiver of the links has training links, so that baselines can predict them."""
     return bool(np.isin(dataset.receiver_index[index], dataset.receiver_index[dataset.train]).all())
 
 
 def baselines(dataset: Dataset) -> dict[str, Baseline]:
-    """Returns the baselines of a data set by name; each call gives float32 PAS (b, 90, 360) of b spectra.
+    """Returns the baselines of a data set by name; each call returns float32 PAS (b, 90, 360) for b indices.
 
     Raises:
-        UserError: the data set has no training spectrum to predict from.
+        UserError: the data set has no training spectra to predict from.
     """
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
@@ -45,7 +45,7 @@ def baselines(dataset: Dataset) -> dict[str, Baseline]:
 
 
 def mean_image(dataset: Dataset) -> Baseline:
-    """Returns the mean of all training spectra, whatever is asked."""
+    """Returns a baseline that always predicts the mean of all training spectra."""
 
     @functools.cache
     def mean() -> np.ndarray:
@@ -58,7 +58,7 @@ def mean_image(dataset: Dataset) -> Baseline:
 
 
 def nearest_tx(dataset: Dataset) -> Baseline:
-    """Returns the training spectrum of the nearest transmitter at the same frequency and receiver."""
+    """Returns a baseline that predicts the training spectrum of the nearest transmitter at the same frequency and receiver."""
 
     def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
@@ -70,21 +70,21 @@ def nearest_tx(dataset: Dataset) -> Baseline:
     return predict
 
 
-def nearest_links(dataset: Dataset, index: Int[np.ndarray, " b"], known: Int[np.ndarray, " m"]) -> Int[np.ndarray, " b"]:
-    """Returns for every link the one among `known` of the nearest transmitter, at the same frequency and receiver."""
+def nearest_links(dataset: Dataset, index: Int[np.ndarray, " b"], among: Int[np.ndarray, " m"]) -> Int[np.ndarray, " b"]:
+    """Returns, for every link, the one in `among` with the nearest transmitter, at the same frequency and receiver."""
     nearest = np.zeros(len(index), int)
-    for chosen, neighbours in _by_frequency(dataset, index, known):
+    for chosen, neighbours in _by_frequency(dataset, index, among):
         nearest[chosen] = neighbours[_squared_distances(dataset, index[chosen], neighbours).argmin(1)]
     return nearest
 
 
 def inverse_distance(dataset: Dataset) -> Baseline:
-    """Returns the mean of all training spectra at the same frequency and receiver, weighted by 1/d^2 of their transmitters."""
+    """Returns a baseline: the mean of all training spectra at the same frequency and receiver, weighted by 1/d^2."""
 
     def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
         for chosen, neighbours in _by_frequency(dataset, index, dataset.train):
-            # A square micrometre keeps a transmitter that itself trained (at another frequency) from dividing by zero.
+            # The lower bound, a square micrometre, avoids a division by zero for transmitters that train at another frequency.
             weights = 1 / np.maximum(_squared_distances(dataset, index[chosen], neighbours), 1e-12)
             weights = (weights / weights.sum(1, keepdims=True)).astype(np.float32)
             mixed = np.zeros((len(chosen), *PAS_SHAPE), np.float32)
@@ -97,8 +97,8 @@ def inverse_distance(dataset: Dataset) -> Baseline:
 
 
 def line_of_sight(dataset: Dataset) -> Baseline:
-    """Returns the PAS of one plane wave from the transmitter's direction: geometry alone, also for directions below the
-    horizon."""
+    """Returns a baseline that predicts the PAS of one plane wave from the transmitter's direction: geometry only, including
+    directions below the horizon."""
 
     def predict(index: Int[np.ndarray, " b"]) -> Float[np.ndarray, "b 90 360"]:
         predicted = np.zeros((len(index), *PAS_SHAPE), np.float32)
@@ -108,7 +108,7 @@ def line_of_sight(dataset: Dataset) -> Baseline:
                 query = dataset.query(index[part])
                 offsets = jnp.asarray(dataset.tx_positions[index[part]] - np.asarray(receiver.position), jnp.float32)
                 distances = jnp.linalg.norm(offsets, axis=-1, keepdims=True)
-                directions = to_local(offsets / jnp.maximum(distances, 1e-9), receiver.orientation)  # a TX at the receiver
+                directions = to_local(offsets / jnp.maximum(distances, 1e-9), receiver.orientation)  # for a TX at the receiver
                 elements = receiver.element_wavelengths(query.frequency_hz)
                 each = elements.ndim == 3
                 waves = (jax.vmap(steering_vector) if each else steering_vector)(elements, directions)
@@ -119,21 +119,22 @@ def line_of_sight(dataset: Dataset) -> Baseline:
 
 
 def _by_frequency(dataset: Dataset, index: np.ndarray, among: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields for every receiver and frequency asked: places in `index`, and the links `among` which to predict them from."""
-    asked, asked_of = dataset.frequencies_hz[index], dataset.receiver_index[index]
-    for number in np.unique(asked_of):
+    """Yields, for every receiver and frequency of `index`: positions in `index`, and the links of `among` to predict them
+    from."""
+    frequencies, receivers = dataset.frequencies_hz[index], dataset.receiver_index[index]
+    for number in np.unique(receivers):
         own = among[dataset.receiver_index[among] == number]
         if not len(own):
-            raise UserError(f"{dataset.name} has no training spectra of receiver {number}; choose another split")
+            raise UserError(f"{dataset.name} has no training spectra for receiver {number}; choose another split")
         trained = dataset.frequencies_hz[own]
-        known = np.unique(trained)
-        for frequency in np.unique(asked[asked_of == number]):
-            stand_in = known[np.abs(np.log(known / frequency)).argmin()]
-            yield np.flatnonzero((asked == frequency) & (asked_of == number)), own[trained == stand_in]
+        available = np.unique(trained)
+        for frequency in np.unique(frequencies[receivers == number]):
+            stand_in = available[np.abs(np.log(available / frequency)).argmin()]
+            yield np.flatnonzero((frequencies == frequency) & (receivers == number)), own[trained == stand_in]
 
 
 def _squared_distances(dataset: Dataset, index: np.ndarray, neighbours: np.ndarray) -> Float[np.ndarray, "b m"]:
-    """Returns square metres between transmitters, axis by axis to keep one (b, m) array rather than (b, m, 3)."""
+    """Returns squared distances (m^2) between transmitters, one axis after the other to avoid a (b, m, 3) array."""
     a, b = dataset.tx_positions[index], dataset.tx_positions[neighbours]
     return sum(((a[:, None, axis] - b[None, :, axis]) ** 2 for axis in range(3)), np.zeros((len(a), len(b))))
 

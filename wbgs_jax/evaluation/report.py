@@ -1,4 +1,4 @@
-"""Reports for people and for files: tables, and where a figure comes from."""
+"""Reports as tables and files, with the provenance of their figures."""
 
 import platform
 import shlex
@@ -17,7 +17,7 @@ from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 
 
 def environment() -> dict[str, Any]:
-    """Returns code version and device of this process."""
+    """Returns the code version and the device of this process."""
     device = jax.devices()[0]
     return {
         "version": wbgs_jax.__version__,
@@ -28,7 +28,7 @@ def environment() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """Returns the commit of the code; None where there is no repository, or no git."""
+    """Returns the commit of the code; None without a repository or git."""
     describe = ["git", "describe", "--always", "--dirty"]
     try:
         git = subprocess.run(describe, capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
@@ -79,18 +79,18 @@ def device_name() -> str:
 
 
 def result_path(folder: Path, report: dict[str, Any], preset: str) -> Path:
-    """Returns FOLDER/quality_<dataset>_<field>_<preset>_<device>.json; of another part than the test, its name at the end."""
+    """Returns FOLDER/quality_<dataset>_<field>_<preset>_<device>.json; parts other than the test are appended to the name."""
     name = f"quality_{report['scene']}_{report['field']}_{preset}_{device_name()}"
     return folder / f"{with_part(name, report['part'])}.json"
 
 
 def with_part(name: str, part: str) -> str:
-    """Returns the name of what belongs to a part of the data: figures for choices never replace those of the test."""
+    """Returns a name with the part of the data appended unless it is the test, so that validation figures never replace it."""
     return name if part == "test" else f"{name}_{part}"
 
 
 def table(report: dict[str, Any]) -> Table:
-    """Returns the report as a table: one row a frequency, the baselines beside the field."""
+    """Returns the report as a table with one row per frequency and the baselines beside the field."""
     if "median_ssim" not in report:
         return _power_table(report)
     names = list(report["baselines"])
@@ -128,43 +128,44 @@ def _power_table(report: dict[str, Any]) -> Table:
 
 
 def closing_lines(report: dict[str, Any], block: int) -> list[str]:
-    """Returns what stands below the table."""
+    """Returns the lines printed below the table."""
     lines = []
     if "median_ssim" in report:
-        lines.append(f"SSIM of the worst: {report['p5_ssim']:.3f} (5th percentile), {report['p10_ssim']:.3f} (10th)")
-        parts = {"in sight of the receiver": report.get("in_sight"), "out of sight": report.get("out_of_sight")}
-        seen = [f"{name} {part['median_ssim']:.3f} (n = {part['n']})" for name, part in parts.items() if part]
-        lines += [f"SSIM {', '.join(seen)} (medians)"] if seen else []
+        lines.append(f"SSIM of the worst spectra: {report['p5_ssim']:.3f} (5th percentile), {report['p10_ssim']:.3f} (10th)")
+        parts = {"line of sight": report.get("in_sight"), "no line of sight": report.get("out_of_sight")}
+        by_sight = [f"{name} {part['median_ssim']:.3f} (n = {part['n']})" for name, part in parts.items() if part]
+        lines += [f"SSIM by visibility (median): {', '.join(by_sight)}"] if by_sight else []
         if each := report.get("per_receiver"):
-            said = [f"{own['receiver']}: {own['median_ssim']:.3f} / {own['mean_ssim']:.3f}" for own in each]
-            lines.append(f"SSIM by receiver (median / mean): {', '.join(said)}")
+            by_receiver = [f"{own['receiver']}: {own['median_ssim']:.3f} / {own['mean_ssim']:.3f}" for own in each]
+            lines.append(f"SSIM by receiver (median / mean): {', '.join(by_receiver)}")
         lines.append(
-            f"strongest direction: {report['angle_error_deg']:.1f} degrees off (median); best predicted beam: "
-            f"{report['beam_loss_db']:.2f} dB lost, best of three {report['beam_loss_top3_db']:.2f} dB (means)"
+            f"strongest direction: median error {report['angle_error_deg']:.1f} degrees; power lost by the best predicted beam "
+            f"{report['beam_loss_db']:.2f} dB, by the best of three {report['beam_loss_top3_db']:.2f} dB (means)"
         )
     if noisy := report.get("as_observed"):
         lines.append(
             f"with the noise of the training spectra: {noisy['median_ssim']:.3f} / {noisy['mean_ssim']:.3f} (median / mean; "
-            "the answers leave it out, and score lower where these spectra have it too)"
+            "predictions are noise-free, and score lower against noisy spectra)"
         )
     if (same := report.get("truth_repeats")) is not None:
-        lines.append(f"truth against itself, traced with more rays: {same:.3f} (median): no score says more than that")
+        lines.append(f"truth against itself, traced with more rays: {same:.3f} (median), the highest meaningful score")
     if "snapshot_correlation" in report:
-        alike, error = report["snapshot_correlation"], report["power_error_db"]
-        lines.append(f"snapshots: correlation {alike:.3f}, power error {error:.2f} dB (medians)")
+        correlation, error = report["snapshot_correlation"], report["power_error_db"]
+        lines.append(f"snapshots: correlation {correlation:.3f}, power error {error:.2f} dB (medians)")
     if power := report.get("power"):
         others = ", ".join(f"{name.replace('_', ' ')} {own['power_mae_db']:.2f} dB" for name, own in power["baselines"].items())
-        lines.append(f"received power: {power['power_mae_db']:.2f} dB off ({others}; means)")
-    if sure := (report.get("power") or report).get("confidence_db"):
+        lines.append(f"received power: mean absolute error {power['power_mae_db']:.2f} dB ({others})")
+    if intervals := (report.get("power") or report).get("confidence_db"):
         lines.append(
-            f"expected error of powers {sure['expected']:.2f} dB (mean; scored {sure['scored']:.2f}); "
-            f"{100 * sure['coverage']:.0f} % are as near as {100 * sure['level']:.0f} % should be; "
-            f"the surer half is {sure['risk_coverage']['0.5']:.2f} dB off"
+            f"expected error of powers {intervals['expected']:.2f} dB (mean; actual {intervals['scored']:.2f}); "
+            f"{100 * intervals['level']:.0f} % intervals contain {100 * intervals['coverage']:.0f} % of the powers; "
+            f"mean error of the more certain half {intervals['risk_coverage']['0.5']:.2f} dB"
         )
-    if sure := report.get("confidence"):
+    if intervals := report.get("confidence"):
         lines.append(
-            f"expected SSIM {sure['expected']:.3f} (mean; scored {sure['scored']:.3f}); {100 * sure['level']:.0f} % intervals "
-            f"hold {100 * sure['coverage']:.0f} % of the scores; the surer half scores {sure['risk_coverage']['0.5']:.3f}"
+            f"expected SSIM {intervals['expected']:.3f} (mean; actual {intervals['scored']:.3f}); "
+            f"{100 * intervals['level']:.0f} % intervals contain {100 * intervals['coverage']:.0f} % of the scores; "
+            f"mean SSIM of the more certain half {intervals['risk_coverage']['0.5']:.3f}"
         )
     single = report["ms_per_pas_single"]
-    return [*lines, f"{report['ms_per_pas']:.2f} ms a PAS in blocks of {block}, {single:.2f} ms for a single query"]
+    return [*lines, f"{report['ms_per_pas']:.2f} ms per PAS in blocks of {block}, {single:.2f} ms for a single query"]

@@ -1,1 +1,1 @@
-"""Maps of received power, learned from readings."""
+"""Maps of received power, learned from measured powers (readings)."""

@@ -1,8 +1,8 @@
-"""How well a map says what was measured where nothing was known: whole rooms held out, and squares of one metre; beside
-rivals, most of which know no walls.
+"""Validation of a map on held-out measurements: whole rooms and squares of one metre, compared with baselines, most of which
+ignore walls.
 
-Scored is the mean absolute error of the means of small cells, and how many of them lie within the 90 % intervals. Such a mean
-has an error of its own: fading over the square root of its readings.
+Scores are the mean absolute error of the means of small cells, and the fraction of these within the 90 % intervals. The means
+have an error of their own: fading divided by the square root of the number of readings.
 """
 
 from collections.abc import Callable
@@ -19,30 +19,31 @@ from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, Scales, alike, distances, learn_map, noise, received_power
 
 BLOCK, FOLDS = 1.0, 40
-"""Metres: squares that are held out; and how often at most, several of them together."""
+"""Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
 NINETY = 1.6449
-"""Standard deviations to each side that hold 90 % of a normal distribution."""
+"""Half width of the 90 % interval of a normal distribution, in standard deviations."""
 Parts = list[Bool[np.ndarray, " n"]]
 Rival = Callable[[Readings], Float[np.ndarray, "n r"]]
 
 
 @dataclass(frozen=True)
 class Score:
-    """Of one way of holding out."""
+    """Scores for one way of holding out measurements."""
 
     held_out: str
     means: int
-    """Of cells, at all receivers, that were scored."""
+    """Number of cell means that were scored, over all receivers."""
     error_db: float
     """Mean absolute error of the map ..."""
     within: float
-    """... and the share of means in its 90 % intervals."""
+    """... and the fraction of means within its 90 % intervals."""
     rivals_db: dict[str, float]
-    """Mean absolute errors of the others."""
+    """Mean absolute errors of the baselines."""
 
 
 def scores(cells: Readings, walls: Walls) -> list[Score]:
-    """Returns the scores of a map with walls, a room at a time and then squares of one metre, and those of its rivals.
+    """Returns the scores of a map with walls and of its baselines, holding out one room at a time and then squares of one
+    metre.
 
     Raises:
         UserError: all powers are from one square metre, so that nothing can be held out.
@@ -50,85 +51,87 @@ def scores(cells: Readings, walls: Walls) -> list[Score]:
     rooms = [room for room in dict.fromkeys(cells.rooms) if room]
     splits = [(f"room {room}", [np.array([own == room for own in cells.rooms])]) for room in rooms]
     splits.append((f"squares of {BLOCK:g} m", folds(cells)))
-    usable = [(name, told) for name, parts in splits if (told := _usable(parts, cells))]
+    usable = [(name, scored) for name, parts in splits if (scored := _usable(parts, cells))]
     if not usable:
-        raise UserError(f"all powers lie within {BLOCK:g} m: nothing can be held out")
+        raise UserError(f"all powers lie within {BLOCK:g} m, so nothing can be held out")
     return [_score(name, parts, cells, walls) for name, parts in usable]
 
 
 def folds(cells: Readings) -> Parts:
-    """Returns the cells of every square of the plan; of many squares, those of several that are drawn together."""
+    """Returns masks of the cells of every square of the plan; if there are many squares, of random groups of them."""
     _, square = np.unique(np.floor(cells.places[:, :2] / BLOCK).astype(int), axis=0, return_inverse=True)
     fold = np.random.default_rng(0).permutation(square.max() + 1)[square.reshape(-1)] % FOLDS
     return [fold == number for number in np.unique(fold)]
 
 
 def _usable(parts: Parts, cells: Readings) -> Parts:
-    """Returns the parts in which something was heard; none of them, if one leaves too little to learn from."""
-    heard = np.isfinite(cells.powers)
-    told = [part for part in parts if heard[part].any()]
-    return told if all(heard[~part].sum() >= MIN_POWERS for part in told) else []
+    """Returns the parts in which something was received; none if leaving one out leaves too little to learn from."""
+    received = np.isfinite(cells.powers)
+    scored = [part for part in parts if received[part].any()]
+    return scored if all(received[~part].sum() >= MIN_POWERS for part in scored) else []
 
 
 def _score(name: str, parts: Parts, cells: Readings, walls: Walls) -> Score:
     mean, spread = _mapped(parts, cells, walls)
-    answers = {"without walls": _mapped(parts, cells, NO_WALLS)[0]}
-    for rival, ask in RIVALS.items():
-        answers[rival] = np.full(mean.shape, np.nan)
+    predictions = {"without walls": _mapped(parts, cells, NO_WALLS)[0]}
+    for rival, predict in RIVALS.items():
+        predictions[rival] = np.full(mean.shape, np.nan)
         for part in parts:
-            answers[rival][part] = ask(cells.without(part))[part]
+            predictions[rival][part] = predict(cells.without(part))[part]
     scored = np.isfinite(cells.powers) & np.any(parts, 0)[:, None]
-    off = {rival: np.abs(said - cells.powers)[scored] for rival, said in (("map", mean), *answers.items())}
+    off = {rival: np.abs(powers - cells.powers)[scored] for rival, powers in (("map", mean), *predictions.items())}
     errors = {rival: float(error.mean()) for rival, error in off.items()}
     within = float((off["map"] <= NINETY * spread[scored]).mean())
     return Score(name, int(scored.sum()), errors.pop("map"), within, errors)
 
 
 def _mapped(parts: Parts, cells: Readings, walls: Walls) -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
-    """Returns what maps say of each part that knew nothing of it, and the standard deviations of its means around that. Scales
-    are learned once, from what the largest part leaves."""
+    """Returns the predictions for each part by maps learned without it, and the standard deviations of the cell means around
+    these. Scales are learned only once, without the largest part."""
     scales: Scales | None = None
     mean, spread = (np.full(cells.powers.shape, np.nan) for _ in range(2))
     places = jnp.asarray(cells.places, jnp.float32)
     for part in sorted(parts, key=np.sum, reverse=True):
-        learned = learn_map(cells.without(part), walls, scales)  # shapes stay as they are, for the sake of one compilation
+        learned = learn_map(cells.without(part), walls, scales)  # shapes stay the same, so that one compilation suffices
         scales = Scales(*(float(x) for x in learned.scales))
-        said, std = (np.asarray(a, float) for a in _received(learned, places))
-        mean[part], spread[part] = said[part], np.sqrt(std**2 + noise(scales, np.maximum(cells.counts, 1)))[part]
+        power, std = (np.asarray(a, float) for a in _received(learned, places))
+        mean[part], spread[part] = power[part], np.sqrt(std**2 + noise(scales, np.maximum(cells.counts, 1)))[part]
     return mean, spread
 
 
 _received = jax.jit(received_power)
 
 
-def log_distance(known: Readings) -> Float[np.ndarray, "n r"]:
-    """Returns what one law of the distance for all receivers says of all places (least squares)."""
-    distance = distances(known.places, known.receivers)
+def log_distance(measured: Readings) -> Float[np.ndarray, "n r"]:
+    """Returns the predictions of one log-distance law for all receivers (least squares) at all positions."""
+    distance = distances(measured.places, measured.receivers)
     features = np.stack([np.ones_like(distance), -10 * np.log10(np.maximum(distance, NEAREST))], -1)
-    heard = np.isfinite(known.powers)
-    law, *_ = np.linalg.lstsq(features[heard], known.powers[heard], rcond=None)
+    received = np.isfinite(measured.powers)
+    law, *_ = np.linalg.lstsq(features[received], measured.powers[received], rcond=None)
     return features @ law
 
 
-def inverse_distance(known: Readings) -> Float[np.ndarray, "n r"]:
-    """Returns the mean of what each receiver heard, weighted by 1 / distance^2 to the places (Shepard 1968)."""
-    weights = 1 / np.maximum(distances(known.places, known.places), NEAREST) ** 2
-    total = weights @ np.isfinite(known.powers)
-    return np.where(total > 0, weights @ np.nan_to_num(known.powers) / np.where(total > 0, total, 1), np.nanmean(known.powers))
+def inverse_distance(measured: Readings) -> Float[np.ndarray, "n r"]:
+    """Returns the mean of each receiver's powers, weighted by 1 / distance^2 to the positions (Shepard 1968)."""
+    weights = 1 / np.maximum(distances(measured.places, measured.places), NEAREST) ** 2
+    total = weights @ np.isfinite(measured.powers)
+    return np.where(
+        total > 0, weights @ np.nan_to_num(measured.powers) / np.where(total > 0, total, 1), np.nanmean(measured.powers)
+    )
 
 
-def kriging(known: Readings) -> Float[np.ndarray, "n r"]:
-    """Returns what a Gaussian process of every receiver by itself says, around what it heard on average."""
-    scales, answer = Scales(), np.full(known.powers.shape, np.nanmean(known.powers))
-    k = APART**2 * alike(known.places, known.places)
-    for r, heard in enumerate(np.isfinite(known.powers).T):
-        own = np.flatnonzero(heard)
+def kriging(measured: Readings) -> Float[np.ndarray, "n r"]:
+    """Returns the predictions of a separate Gaussian process for each receiver, around its mean power."""
+    scales, predicted = Scales(), np.full(measured.powers.shape, np.nanmean(measured.powers))
+    k = APART**2 * alike(measured.places, measured.places)
+    for r, mask in enumerate(np.isfinite(measured.powers).T):
+        own = np.flatnonzero(mask)
         if len(own):
-            powers, covariance = known.powers[own, r], k[np.ix_(own, own)] + np.diag(noise(scales, known.counts[own, r]))
-            answer[:, r] = powers.mean() + k[:, own] @ np.linalg.solve(covariance, powers - powers.mean())
-    return answer
+            powers, covariance = measured.powers[own, r], k[np.ix_(own, own)] + np.diag(noise(scales, measured.counts[own, r]))
+            predicted[:, r] = powers.mean() + k[:, own] @ np.linalg.solve(covariance, powers - powers.mean())
+    return predicted
 
 
 RIVALS: dict[str, Rival] = {"log-distance": log_distance, "inverse distance": inverse_distance, "kriging": kriging}
 COMPARED = (*RIVALS, "without walls")
-"""Names of all rivals."""
+"""Names of all baselines."""
