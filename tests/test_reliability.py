@@ -104,10 +104,11 @@ def test_a_checksum_is_of_every_number_and_of_no_name(rng):
         values = np.asarray(getattr(dataset, name)).copy()
         flat, at = values.reshape(-1), rng.integers(values.size)
         flat[at] = flat[at] * (1 + 1e-6) + 1e-6
-        changed = type(dataset)(**{**vars(dataset), name: values})
+        own = {"observations": {name: values}} if name in dataset.observations else {name: values}
+        changed = dataclasses.replace(dataset, **own)
         assert checksum(changed) != checksum(dataset), name
-    assert checksum(type(dataset)(**{**vars(dataset), "name": "other"})) == checksum(dataset)
-    moved = type(dataset)(**{**vars(dataset), "train": dataset.test, "test": dataset.train})
+    assert checksum(dataclasses.replace(dataset, name="other")) == checksum(dataset)
+    moved = dataclasses.replace(dataset, train=dataset.test, test=dataset.train)
     assert checksum(moved) != checksum(dataset)
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.mirrors import MirrorsField, Trained, trained
+from builders.mirrors import MirrorsField, trained, trained_field
 from builders.rooms import METAL, field_of, rectangle
 from builders.synthetic import RX
 
@@ -93,7 +93,7 @@ class Noisy(MirrorsField):
 
 def test_an_observation_has_the_noise_that_the_data_had(rng):
     field = Noisy()
-    asked = locator(Trained(field, field.init(jax.random.key(0))), HZ, box=BOX, step=2.0)
+    asked = locator(trained_field(field, field.init(jax.random.key(0))), HZ, box=BOX, step=2.0)
     place = jnp.asarray(somewhere(rng, 1)[0])
     clean = said(asked, place, "pas")[0]
     losses = [float(asked.loss(place[None], observed, 0.0)[0]) for observed in (with_floor(clean, 0.1), clean)]
@@ -148,7 +148,7 @@ def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_r
     with pytest.raises(UserError, match="is not enough"):
         locator(trained(), HZ[:1], "power", RECEIVERS[:1], BOX, known_power=False)
     with pytest.raises(UserError, match="predicts no snapshots"):
-        locator(Trained(Silent(), None), HZ, "snapshots")
+        locator(trained_field(Silent(), None), HZ, "snapshots")
 
 
 class Silent(MirrorsField):

@@ -1,14 +1,15 @@
 """A field whose answers are known in closed form and compile in no time: mirror images of a transmitter, their powers added."""
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from builders.synthetic import tiny_dataset
+from builders.toys import toy_settings
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields import Field, Observation
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.propagation.paths import REFLECTED
 from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
 from wbgs_jax.radio.channel import Arrivals, decibels
@@ -62,25 +63,22 @@ class MirrorsField(Field):
         return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance, paths)
 
 
-@dataclass(frozen=True)
-class Trained:
-    """A field and its data."""
-
-    field: Field
-    params: Any
+class Mirrored(TrainedField):
+    """A field of mirrors and its data."""
 
     def dataset(self):
         return tiny_dataset()
 
-    def origin(self):
-        return {}
 
-    neighbours = confidence = power_confidence = None
+def trained_field(field: Field, params: Any) -> Mirrored:
+    """Returns a field of mirrors as a trained one."""
+    config = RunConfig("mirrors", field.name, "smoke", 0, None, toy_settings())
+    return Mirrored(config, field, params, 0, 0.0)
 
 
-def trained(images=5) -> Trained:
+def trained(images=5) -> Mirrored:
     field = MirrorsField(images=images)
-    return Trained(field, field.init(jax.random.key(0)))
+    return trained_field(field, field.init(jax.random.key(0)))
 
 
 class Blind(MirrorsField):

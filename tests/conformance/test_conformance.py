@@ -51,7 +51,7 @@ def test_a_file_is_right_or_refused(entry: Entry, tmp_path: Path):
 
 
 def test_the_catalogue_is_wide():
-    """More files and writers than issue 47 wants, each of its own name, most of which have to be right."""
+    """At least a hundred files by a dozen writers, each with a name of its own, and most of them read right."""
     entries = catalogue()
     assert len({entry.name for entry in entries}) == len(entries) >= 100
     assert len({entry.writer for entry in entries}) >= 12

@@ -45,7 +45,7 @@ class LevelField(RippleField):
     """A toy that says one power for all links."""
 
     name = "level"
-    gives = ("pas", "power")
+    outputs = ("pas", "power")
 
     def init(self, key):
         return super().init(key) | {"power": jnp.full((), -40.0)}

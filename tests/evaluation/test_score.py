@@ -2,19 +2,18 @@
 
 import dataclasses
 import json
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import FREQUENCIES_HZ, tiny_dataset
-from builders.toys import NoisyField, RippleConfig, RippleField
+from builders.toys import NoisyField, RippleConfig, RippleField, toy_settings
 
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import in_sight
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.baselines import baselines
@@ -22,6 +21,7 @@ from wbgs_jax.evaluation.report import closing_lines, table
 from wbgs_jax.evaluation.score import evaluate, held_out, power_figures, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.metrics import plane_normal
 
 
@@ -37,32 +37,22 @@ class KnowingField(RippleField):
         return Observation(seen.pas, 1e-3 * jnp.exp(1j * phases), -60 + query.tx_position[:, 0])
 
 
-class Toy(NamedTuple):
-    """What an evaluation needs of a run folder."""
-
-    field: RippleField
-    params: Any
-    neighbours: None = None
-    confidence: None = None
-    power_confidence: None = None
-
-    def origin(self):
-        return {"field": self.field.name, "preset": "none", "seed": 0, "step": 3}
-
-    def dataset(self) -> Dataset:
-        raise AssertionError("the data are given")
+def as_trained(field: RippleField) -> TrainedField:
+    """Returns a field with initial parameters as a trained one, without data: these are given."""
+    config = RunConfig("gone", field.name, "none", 0, None, toy_settings())
+    return TrainedField(config, field, field.init(jax.random.key(1)), 3, 0.0)
 
 
 @pytest.fixture(scope="module")
 def knowing():
     field = KnowingField(RippleConfig())
-    return Toy(field, field.init(jax.random.key(1)))
+    return as_trained(field)
 
 
 @pytest.fixture(scope="module")
 def blind():
     field = RippleField(RippleConfig())
-    return Toy(field, field.init(jax.random.key(1)))
+    return as_trained(field)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +97,7 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
 
 
 def test_answers_are_scored_with_the_noise_of_the_training_too(blind, dataset):
-    report, predicted = evaluate(blind._replace(field=NoisyField(RippleConfig())), dataset)
+    report, predicted = evaluate(dataclasses.replace(blind, field=NoisyField(RippleConfig())), dataset)
     alike = metrics.ssim(np.sqrt((predicted**2 + 0.3) / 1.3), np.asarray(dataset.pas(dataset.test)))
     assert report["as_observed"] == pytest.approx({"median_ssim": np.median(alike), "mean_ssim": np.mean(alike)}, abs=1e-5)
     assert report["mean_ssim"] != pytest.approx(np.mean(alike), abs=1e-3)

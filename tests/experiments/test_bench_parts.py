@@ -95,7 +95,7 @@ def test_a_training_is_watched_until_its_plateau(monkeypatch):
             clock.now += 10
             self.step += self.settings.loop.epoch_steps
 
-        def control(self):
+        def run_hooks(self):
             clock.now += 1
 
         def evaluate(self):

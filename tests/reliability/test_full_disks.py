@@ -9,7 +9,7 @@ import pytest
 from builders.reliability.faults import ERRORS, Fault
 from builders.reliability.forking import Ended
 from builders.reliability.ledger import count
-from conftest import outcome
+from builders.reliability.outcomes import outcome
 
 WRITERS = (
     "generate data",

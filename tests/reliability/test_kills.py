@@ -7,8 +7,8 @@ import signal
 import pytest
 from builders.reliability.faults import Fault
 from builders.reliability.ledger import count
+from builders.reliability.outcomes import outcome
 from builders.synthetic import FIELDS
-from conftest import outcome
 
 KILLS = {
     **{f"train {field}": 3 for field in FIELDS},

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import wbgs_jax as wb
+from wbgs_jax.fields.coherent_model import WavePlan
 
 CONFIG = wb.WidebandConfig(width=8, depth=2)
 LIMITS = wb.TileLimits(entries=4096, jobs=1024)
@@ -23,7 +24,7 @@ def planned(field):
     """Parameters of 64 slots and their plan, by their shapes alone: the door is in front of everything that computes."""
     params = jax.eval_shape(field.init, jax.random.key(0))
     receiver = wb.make_receiver([0.0, 0.0, 1.0])
-    return params, jax.eval_shape(lambda params: field.plan(params, receiver, LIMITS), params)
+    return params, jax.eval_shape(lambda params: field.plan(params, receiver, capacity=LIMITS), params)
 
 
 @pytest.fixture(autouse=True)
@@ -66,9 +67,11 @@ def test_a_wrong_query_is_refused(planned, tx, frequency, error, message):
 def test_the_other_fields_have_the_same_door(planned):
     """A wrong query is refused before anything of the field is looked at."""
     query = wb.Query(jnp.zeros((2, 3)), jnp.full(2, 2.4))
+    plan = object.__new__(WavePlan)
+    object.__setattr__(plan, "prepared", None)  # all that is looked at
     for field in (wb.wave, wb.nerf2):
         with pytest.raises(ValueError, match="in hertz"):
-            field.render(None, None, query)
+            field.render(None, plan, query)
 
 
 def test_shapes_are_checked_under_jit_too(planned):

@@ -205,8 +205,8 @@ def export_layout(scene: SceneFile, folder: Path | str) -> None:
     """
     dataset = scene_dataset(scene)
     if dataset.n_receivers > 1 or not dataset.has_spectra:
-        what = f"{dataset.n_receivers} receivers" if dataset.has_spectra else f"{dataset.observed.words} alone"
-        raise UserError(f"scene {scene.name} has {what}, which the layout has no form for; keep the scene file")
+        what = f"{dataset.n_receivers} receivers" if dataset.has_spectra else f"only {dataset.observed.words}"
+        raise UserError(f"scene {scene.name} has {what}, which the layout cannot represent; keep the scene file")
     if len(dataset.train) == 0 or len(dataset.test) == 0:
         raise UserError(
             f"scene {scene.name} lacks {'test' if len(dataset.train) else 'training'} spectra; its split needs both"

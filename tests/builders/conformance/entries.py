@@ -18,7 +18,7 @@ from wbgs_jax._util.errors import UserError
 Outcome = Literal["right", "refused", "different"]
 REMEDY = re.compile(
     r"\b(give|export|write|make|choose|name|convert|leave|separate|mend|project|trace|save|copy|read it|subtract|number|scale"
-    r"|goe?s? (in)?to|must (be|hold)|put|a spectrum is|its first line|are named|check)\b"
+    r"|goe?s? (in)?to|must (be|hold)|put|spectra have|its first line|are named|check|reconstruct|replace|create|add|needs)\b"
 )
 """Words of what is to be done."""
 

@@ -183,7 +183,7 @@ def warm() -> None:
     from orbax.checkpoint import v1
 
     from wbgs_jax import plotting
-    from wbgs_jax.inference import answers
+    from wbgs_jax.inference import export
 
-    assert pyplot and v1 and answers and plotting
+    assert pyplot and v1 and export and plotting
     assert not xla_bridge.backends_are_initialized(), "JAX runs already: a fork would hang"
