@@ -26,6 +26,7 @@ CHECKED = (
     "wbgs_jax/config.py",
     "wbgs_jax/types.py",
     "wbgs_jax/fields",
+    "wbgs_jax/training",
     "data_gen",
 )
 """Packages and modules whose text is checked; to be extended to all of `wbgs_jax` and `experiments`."""
