@@ -69,7 +69,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(saved, error, monkeypatch):
         raise error
 
     monkeypatch.setattr(ocp, "save", full)
-    with pytest.raises(UserError, match=r"cannot write checkpoint .*; the checkpoint of step 8 is whole") as caught:
+    with pytest.raises(UserError, match=r"cannot write checkpoint .*; the checkpoint of step 8 is intact") as caught:
         checkpoint.save(saved, 12, {"a": np.zeros(3)}, {}, {}, keep=3)
     assert "\n" not in str(caught.value)
     assert {entry.name for entry in saved.iterdir()} == {"4", "8"}

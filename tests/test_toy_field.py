@@ -308,7 +308,7 @@ def test_simple_methods_answer_unless_their_file_is_gone(tmp_path):
     save_scene(tmp_path / "box.npz", tiny_scene(24))
     run = tmp_path / "run"
     result = call(train_command.main, "--scene", tmp_path / "box.npz", *TRAIN, "--out", run)
-    assert result.code == 0 and "the field's share is 0.00" in result.err, result.err
+    assert result.code == 0 and "the field's weight is 0.00" in result.err, result.err
 
     def median() -> float:
         report = json.loads(call(eval_command.main, "--run", run, "--json", "--no-pictures").out)

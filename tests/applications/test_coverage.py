@@ -88,5 +88,5 @@ def test_the_soft_minimum_lies_between_minimum_and_mean(rng):
 
 
 def test_a_field_that_holds_at_its_receiver_alone_places_nothing():
-    with pytest.raises(UserError, match="no receivers but those"):
+    with pytest.raises(UserError, match="predicts only the receivers"):
         power_at_users(make_field(), make_params(), [0, 0, 1], HZ)

@@ -90,7 +90,7 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         ([*ASK, "--rx", "1,2", "--out", "OUT/a.npz"], ["--rx 1,2 "]),
         ([*ASK, "--rx", "1,2,nan", "--out", "OUT/a.npz"], ["1,2,nan"]),
         ([*ASK, "--rx", "1,2,1,0,0,0,0", "--out", "OUT/a.npz"], ["quaternion"]),
-        ([*ASK, "--rx", "1,1,1", "--out", "OUT/a.npz"], ["the wideband field knows no receivers but", "wave or hybrid"]),
+        ([*ASK, "--rx", "1,1,1", "--out", "OUT/a.npz"], ["the wideband field predicts only the receivers", "wave or hybrid"]),
         (["--export", "RUN/config.json/a.zip"], ["cannot write"]),
     ],
 )

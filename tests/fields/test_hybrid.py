@@ -236,7 +236,7 @@ def test_elsewhere_it_is_the_coherent_field(run):
 def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     nothing = np.zeros((0, 3), np.int32)
     dataset = dataclasses.replace(tiny_dataset(12), faces=nothing, materials=None, face_part=None)
-    with pytest.warns(UserWarning, match="is its wideband half alone: box has no mesh"):
+    with pytest.warns(UserWarning, match="uses its wideband component only: box has no mesh"):
         result = train(hold_out_validation(dataset), "hybrid", SETTINGS, 0, tmp_path)
     assert result.field.wave is None and set(outputs_of(result.field)) == {"pas", "power"}
     seen = observe_links(result.field, result.params, dataset, dataset.test)
@@ -245,7 +245,7 @@ def test_without_a_mesh_it_is_the_splatting_field(tmp_path):
     plan = result.field.plan(result.params, dataset.receiver())
     with pytest.raises(UserError, match="no paths"):
         paths_of(result.field, result.params, plan, dataset.query(dataset.test))
-    with pytest.raises(UserError, match="no receivers but those"):
+    with pytest.raises(UserError, match="predicts only the receivers"):
         result.field.receiver_independent(result.params)
 
 
@@ -270,7 +270,7 @@ def test_the_presets_have_both_fields_settings():
         assert (settings.field.wave, settings.field.wideband) == (wave[name].field, wideband[name].field)
         assert settings.search == wave[name].search and settings.density == wideband[name].density
     phase_blind = dataclasses.replace(settings.field.wave, coherent=False)
-    with pytest.raises(UserError, match="nothing to mix"):
+    with pytest.raises(UserError, match="no coherent field to mix"):
         dataclasses.replace(settings.field, wave=phase_blind).check("hybrid")
 
 

@@ -92,7 +92,7 @@ def test_a_checkpoint_on_a_full_disk(small_disk, forks, fresh, undisturbed):
     folder.mkdir()
     ended = forks.run("write checkpoints", folder)
     assert_told(ended)
-    assert "the checkpoint of step 1 is whole" in ended.err or "there is no checkpoint yet" in ended.err
+    assert "the checkpoint of step 1 is intact" in ended.err or "there is no checkpoint yet" in ended.err
     assert [path.name for path in (folder / "kept").iterdir()] in (["1"], [])
     count("disks that are full", "write checkpoints", 1)
     subprocess.run(["mount", "-o", "remount,size=20m", small_disk], check=True)

@@ -122,10 +122,10 @@ def test_simple_methods_are_no_worse_than_the_best_of_them(dataset, known, membe
 def test_a_field_that_knows_nothing_has_no_share_and_one_that_knows_stands_alone(dataset, known, rng):
     truth = np.asarray(dataset.pas(dataset.validation))
     bad = learn_mixture(dataset, known, held(dataset, known, rng.random(truth.shape)))
-    assert not bad.alone and bad.mixture.field[0] < -5 and "share is 0.00" in bad.line
+    assert not bad.alone and bad.mixture.field[0] < -5 and "weight is 0.00" in bad.line
     close = 0.98 * truth
     good = learn_mixture(dataset, known, held(dataset, known, close), ERRORS_WITH_PATHS)
-    assert good.alone and "answers alone" in good.line
+    assert good.alone and "used alone" in good.line
     none = learn_mixture(dataset, known, HeldOut(*(part[:0] for part in held(dataset, known, truth))))
     assert not none.alone and none.mixture.field[0] < -5
 

@@ -1,4 +1,4 @@
-"""The models, one file each, behind one interface (`base.Field`). docs/new_field.md shows how to write another."""
+"""The models, one file each, with a common interface (`base.Field`). docs/new_field.md shows how to write another."""
 
 from wbgs_jax.fields import coherent as wave
 from wbgs_jax.fields import hybrid, nerf2, wideband, wrfgs

@@ -1,9 +1,9 @@
 """The interface between models and everything else.
 
-A field is a small frozen object: its settings and what never changes (where Gaussians start, the frame of its inputs, the
-facets of a mesh). What is trained lives in `params`, a pytree of floats. All methods but those that say "host" are pure and
-jittable; a field is itself a pytree, so it passes through `jax.jit` as an argument. Training, evaluation, predictors, export
-and experiments ask a field nothing else.
+A field is a small frozen object: its settings and its constants (initial positions of Gaussians, the frame of its inputs, the
+facets of a mesh). All trained values are in `params`, a pytree of floats. Methods are pure and can be compiled by `jax.jit`,
+except those marked "(host)"; a field is itself a pytree, so it can be an argument of a compiled function. Training, evaluation,
+predictors, export and experiments use a field through this interface only.
 """
 
 import contextlib
@@ -30,29 +30,29 @@ from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene
 
 T = TypeVar("T")
 Params = Any
-"""What is trained of a field: a pytree of floats whose structure is the field's own business."""
+"""Trained parameters: a pytree of floats. Its structure is private to the field."""
 Output = Literal["pas", "snapshots", "power", "paths"]
-"""What a field may know of a link."""
+"""A quantity that a field may predict for a link."""
 
 
 class Observation(NamedTuple):
-    """What a field says of B links of one receiver."""
+    """A field's predictions for B links of one receiver."""
 
     pas: Float[Array, "b 90 360"]
     """Normalised power angular spectra."""
     snapshots: Complex[Array, "b elements"] | None = None
-    """Complex array snapshots, of a field that knows phases."""
+    """Complex array snapshots, if the field predicts phases."""
     power_db: Float[Array, " b"] | None = None
-    """Received power relative to the transmitted power (dB), of a field that knows it."""
+    """Received power relative to the transmitted power (dB), if the field predicts it."""
     covariance: Complex[Array, "b elements elements"] | None = None
-    """Mean product y y^H of the snapshots, scaled to a trace of 1, of a field that knows how far to trust its phases."""
+    """Mean product y y^H of the snapshots, scaled to a trace of 1, if the field predicts the uncertainty of its phases."""
     paths: Arrivals | None = None
-    """Every path with its amplitude, delay and direction, leading axis B, of a field that knows paths. They take half as much
-    memory as the spectra: whoever compiles a call and wants none replaces them by None inside."""
+    """All paths with amplitude, length and direction, leading axis B, if the field predicts paths. They take half as much
+    memory as the spectra; a compiled function that does not need them should replace them by None."""
 
 
 class GaussianState(NamedTuple):
-    """The Gaussians of a field that splats, and what its networks make of them for B queries."""
+    """The Gaussians of a splatting field, with the outputs of its networks for B queries."""
 
     gaussians: Gaussians
     attenuation: Float[Array, "n b"]
@@ -62,7 +62,7 @@ class GaussianState(NamedTuple):
 
 
 class MaterialProperties(NamedTuple):
-    """What a field knows of M materials (ITU-R P.2040): relative permittivity, conductivity c f^d with f in GHz, thickness."""
+    """Properties of M materials (ITU-R P.2040): relative permittivity, conductivity c f^d with f in GHz, thickness."""
 
     permittivity: Float[np.ndarray, " m"]
     conductivity: Float[np.ndarray, " m"]
@@ -74,58 +74,58 @@ class MaterialProperties(NamedTuple):
 
 
 class Inspection(NamedTuple):
-    """What is in a trained field, for reports and pictures; None where it has nothing of the kind."""
+    """Contents of a trained field, for reports and pictures; None for what the field does not have."""
 
     sizes: dict[str, int]
-    """Numbers that tell how large it is."""
+    """Counts that describe the field's size, by name."""
     materials: MaterialProperties | None = None
-    """As far as they were learned."""
+    """Learned properties of the materials."""
     displaced_surfaces: tuple[Float[np.ndarray, "f k 3"], Float[np.ndarray, "f 3"]] | None = None
-    """Corners of its surfaces and by how much each was moved, metres, where a training has moved any."""
+    """Corners and displacements of its surfaces, metres, if training has displaced any."""
     gaussians: GaussianState | None = None
-    """For the links that were asked for."""
+    """State for the queried links."""
 
 
 class Prepared(Protocol):
-    """What `Field.prepare` found out about links: a pytree."""
+    """The result of `Field.prepare` for some links: a pytree."""
 
     def subset(self, links: Links) -> Any:
-        """Returns what it holds of B of its links alone, in a shape that depends on B and not on how many others there are."""
+        """Returns the data of B of its links; the shapes depend on B only, not on the number of prepared links."""
         ...
 
 
 class Capacity(Protocol):
-    """Static sizes that planning needs under jit: a frozen dataclass of numbers, kept in checkpoints."""
+    """Static sizes that planning needs under jit: a frozen dataclass of numbers, stored in checkpoints."""
 
     def scaled(self, factor: float) -> Any:
-        """Returns sizes that hold so many times as much."""
+        """Returns these sizes multiplied by a factor."""
         ...
 
     def grown_to(self, others: Any) -> Any:
-        """Returns sizes that hold what these and others do."""
+        """Returns sizes that are sufficient for both these and others."""
         ...
 
 
 class Aux(NamedTuple):
-    """What a step reports beside its loss."""
+    """The outputs of a training step in addition to its loss."""
 
     metrics: dict[str, Float[Array, ""]]
-    """Figures for the curves; NaN where a figure means nothing."""
+    """Values for the training curves, by name; NaN if undefined."""
     required: Int[Array, " k"] | None = None
-    """What the capacity should have been; None for a field that needs none."""
+    """The sizes that the step needed; None for a field without a capacity."""
     overflow: Bool[Array, ""] | None = None
-    """The capacity was too small: the step must not be used."""
+    """Whether the capacity was too small; the step must then be discarded."""
 
 
 Optimizer = Literal["adam", "muon"]
 
 
 class Group(NamedTuple):
-    """How a group of parameters is optimised."""
+    """Optimiser settings of a group of parameters."""
 
     learning_rate: float
     optimizer: Optimizer = "adam"
-    """"muon": matrices by Muon, whose steps have Adam's size, and everything else by Adam."""
+    """"muon" uses Muon for matrices, with steps scaled to those of Adam, and Adam for everything else."""
     weight_decay: float = 0.0
     """Decoupled weight decay."""
     eps: float = 1e-15
@@ -133,77 +133,103 @@ class Group(NamedTuple):
 
 
 class Field(ABC):
-    """A model. Subclasses are decorated with `pytree` and declare `config` as their static field; `build`, `init`, `plan` and
-    `render` make a field, and everything else has a default.
+    """A model. Subclasses are decorated with `pytree` and declare `config` as a static attribute. They must define `build`,
+    `init`, `plan` and `render`; everything else has a default.
 
-    A field that is made of others names them as `components`. Unless it overrides them, `prepare`, `capacity`, `ability` and
-    `receiver_independent` are then those of the first component that has any, and `param_groups`, `smoothed` and `inspect` go
-    through all of them. `init`, `plan`, `render` and `loss` are its own.
+    A field composed of other fields lists them in `components`. Unless it overrides them, `prepare`, `capacity`, `ability` and
+    `receiver_independent` then return the result of the first component that has one, and `param_groups`, `smoothed` and
+    `inspect` combine those of all components. It always defines `init`, `plan`, `render` and `loss` itself.
     """
 
     name: ClassVar[str]
-    """What command lines and files call it."""
+    """Name in command lines and files."""
     presets: ClassVar[Mapping[str, Settings]] = PRESETS
     """Settings by preset; `Settings.field` has the type of `config`."""
     seconds: ClassVar[Mapping[str, float]] = {}
-    """How long trainings take on two cores of an AMD EPYC, by preset, search and compilation included (scenes 1 to 6)."""
+    """Training times on two cores of an AMD EPYC, by preset, including calibration and compilation (scenes 1 to 6)."""
     outputs: ClassVar[tuple[Output, ...]] = ("pas",)
-    """What it knows of a link; `outputs_of` says what a field of this class knows whose scene lacks a component."""
+    """Quantities that it predicts for a link; `outputs_of` returns those of a field whose scene lacks a component."""
     hooks: ClassVar[tuple[str, ...]] = ()
-    """Hooks between epochs that it asks for: names in `training.loop.HOOKS`, "component.name" for one of a component alone."""
+    """Hooks that training runs between epochs: names in `training.loop.HOOKS`, "component.name" for one that acts on a single
+    component."""
     components: ClassVar[Mapping[str, type["Field"]]] = {}
-    """Of a field that is made of others: their classes by name. Field, settings, parameters and plans then have an attribute of
-    that name for each; that of field, parameters and plans is None where the scene does not allow the component."""
+    """Classes of the fields that it is composed of, by name. The field, its settings, parameters and plans have an attribute of
+    that name for each; in the field, its parameters and plans it is None if the scene does not support the component."""
     config: Any
-    """Its settings: a frozen dataclass, which may have a method `check(name)` (`Checked`)."""
+    """Settings: a frozen dataclass, which may have a method `check(name)` (`Checked`)."""
 
     @classmethod
     @abstractmethod
     def build(cls, config: Any, scene: Scene, seed: int) -> "Field":
-        """Returns the field of a scene (host)."""
+        """Returns the field of a scene (host).
+
+        Args:
+            config: settings.
+            scene: scene, with the receivers of the data.
+            seed: seed of everything random in the field itself.
+        """
 
     @abstractmethod
     def init(self, key: Key[Array, ""]) -> Params:
-        """Returns initial parameters: only what is trained, all floats."""
+        """Returns initial parameters: trained values only, all of them floats."""
 
     @abstractmethod
     def plan(self, params: Params, receiver: Receiver, prepared: Any = None, capacity: Any = None) -> Any:
-        """Returns what is independent of the query.
+        """Returns everything that is independent of the query.
 
-        A plan that is made outside of a differentiated function is a constant to its gradient: parameters that it holds get
-        none, or a part. `pas` plans inside. Under jit a field with a `capacity` needs it, and one that plans on the host what
-        is `prepared` of its links: the plan carries it.
+        A plan made outside a differentiated function is a constant there: parameters that enter through the plan receive no
+        gradient, or only part of it. `pas` makes its plan inside.
+
+        Args:
+            params: parameters.
+            receiver: one receiver.
+            prepared: result of `prepare`, which the plan then carries; needed under jit by a field that plans on the host.
+            capacity: static sizes; needed under jit by a field with a `capacity`.
         """
 
     @abstractmethod
     def render(self, params: Params, plan: Any, links: Query | Links) -> Observation:
-        """Returns what the receiver of a plan observes on B links.
+        """Returns the predicted observations of a plan's receiver on B links.
 
-        Both kinds have `tx_position` (b, 3) and `frequency_hz` (b,). A plan with something prepared is asked about `Links`.
+        Args:
+            params: parameters.
+            plan: result of `plan`.
+            links: transmitter positions `tx_position` (b, 3) and frequencies `frequency_hz` (b,), which both classes have; a
+                plan with prepared data requires `Links`.
         """
 
     def prepare(self, links: Links, receivers: Receiver) -> Any:
-        """Returns what can be known of links before training (host), a `Prepared`; None: nothing. `receivers` has a leading
-        axis."""
+        """Returns everything about links that can be computed before training (host), a `Prepared`, or None if there is nothing
+        to prepare.
+
+        Args:
+            links: links of the data.
+            receivers: all receivers, with a leading axis.
+        """
         found = (component.prepare(links, receivers) for component in components_of(self).values())
         return next((prepared for prepared in found if prepared is not None), None)
 
     def loss(
         self, params: Params, prepared: Any, batch: Batch, capacity: Any = None, probe: Any = None
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the loss of a batch. By default it compares spectra, and power where the data have nothing else.
+        """Returns the loss of a batch. By default it compares spectra, or received power if the data contain nothing else.
 
-        `probe` is zeros to be added where a hook wants to know the gradient (`training.hooks.Hook.probe`); None: nowhere.
+        Args:
+            params: parameters.
+            prepared: result of `prepare`.
+            batch: links of one receiver, with observations.
+            capacity: static sizes.
+            probe: zeros to be added at the place where a hook needs the gradient (`training.hooks.Hook.probe`), or None.
         """
         return compare(self.render(params, self.plan(params, batch.receiver, prepared, capacity), batch.links), batch)
 
     def capacity(self, params: Params, receivers: Receiver, required: Int[np.ndarray, " k"] | None = None) -> Any:
-        """Returns the static sizes that planning needs under jit, with room to grow (host): a `Capacity`, or None.
+        """Returns the static sizes that planning needs under jit, with a margin (host): a `Capacity`, or None.
 
         Args:
             params: parameters.
-            receivers: all of them, with a leading axis.
-            required: what a step required that overflowed (`Aux.required`), if one did: the sizes are then to hold that.
+            receivers: all receivers, with a leading axis.
+            required: sizes needed by a step that overflowed (`Aux.required`), if any; the result then suffices for that step.
         """
         parts = components_of(self).items()
         found = (component.capacity(getattr(params, name), receivers, required) for name, component in parts)
@@ -211,8 +237,8 @@ class Field(ABC):
 
     @classmethod
     def param_groups(cls, config: Any, params: Params | None = None) -> tuple[dict[str, Group], Any]:
-        """Returns the optimiser's groups by name, and the group of every parameter: a tree of names like the parameters, or a
-        prefix of one; None without parameters. Groups of components are called "component.group"."""
+        """Returns the optimiser's groups by name, and the group of every parameter: a tree of names with the structure of the
+        parameters or a prefix of it; None without parameters. Groups of components are called "component.group"."""
         if not cls.components:
             return {"all": Group(1e-2)}, None if params is None else jax.tree.map(lambda _: "all", params)
         groups, labels = dict[str, Group](), {}
@@ -223,36 +249,41 @@ class Field(ABC):
         return groups, None if params is None else replaced(params, **labels)
 
     def ability(self, kind: type[T]) -> "Ability[T] | None":
-        """Returns what else can be done with it: itself, or the component that is of a kind (a class or a protocol that can be
-        checked at run time, such as `calibratable.Calibratable`); None if nothing is."""
+        """Returns the field itself, or its component, that is an instance of a class or of a protocol that can be checked at
+        run time, such as `calibratable.Calibratable`; None if there is none."""
         if isinstance(self, kind):
             return Ability(self)
         found = ((name, component.ability(kind)) for name, component in components_of(self).items())
         return next((Ability(one.field, (name, *one.path)) for name, one in found if one is not None), None)
 
     def receiver_independent(self, params: Params) -> tuple["Field", Params]:
-        """Returns the part of a trained field that holds for receivers that it was not trained for, and its parameters.
+        """Returns the part of a trained field that is valid for receivers it was not trained with, and its parameters.
 
         Raises:
-            UserError: there is none.
+            UserError: the field has no such part.
         """
         for name, component in components_of(self).items():
             with contextlib.suppress(UserError):
                 return component.receiver_independent(getattr(params, name))
         raise UserError(
-            f"the {self.name} field knows no receivers but those that it was trained for; "
+            f"the {self.name} field predicts only the receivers that it was trained with; "
             "train --field wave or hybrid, on data with a mesh"
         )
 
     def smoothed(self, params: Params, metres: Float[Array, ""] | float) -> Params:
-        """Returns parameters whose spectra and powers are means over transmitters that stand about so many metres (standard
-        deviation along each axis) from where they are asked for: without the fringes of interference that change over less.
-        By default, of a field that has none, the parameters as they are."""
+        """Returns parameters whose spectra and powers are means over transmitter positions, normally distributed about the
+        queried one, which removes interference fringes that are finer. By default, for fields without fringes, the parameters
+        are returned unchanged.
+
+        Args:
+            params: parameters.
+            metres: standard deviation of the position along each axis.
+        """
         parts = {name: component.smoothed(getattr(params, name), metres) for name, component in components_of(self).items()}
         return dataclasses.replace(params, **parts) if parts else params
 
     def inspect(self, params: Params, plan: Any = None, links: Query | Links | None = None) -> Inspection:
-        """Returns what is in it (host); Gaussians for B links, where these and a plan are given."""
+        """Returns the contents of the field (host), including its Gaussians for B links if links and a plan are given."""
         parts = components_of(self).items()
         if not parts:
             return Inspection({"parameters": sum(int(np.size(leaf)) for leaf in jax.tree.leaves(params))})
@@ -265,19 +296,19 @@ class Field(ABC):
 
 @dataclasses.dataclass(frozen=True)
 class Ability(Generic[T]):
-    """The part of a field that can do something, and where parameters and plans hold what belongs to it."""
+    """A part of a field with certain methods, and its location in parameters and plans."""
 
     field: T
     """The field itself, or a component."""
     path: tuple[str, ...] = ()
-    """Names of the components that lead to it."""
+    """Names of the nested components, outermost first."""
 
     def of(self, tree: Any) -> Any:
-        """Returns its own part of the parameters, a plan, or the field."""
+        """Returns the part of the parameters, of a plan or of the field that belongs to it."""
         return functools.reduce(getattr, self.path, tree)
 
     def put(self, tree: Any, own: Any) -> Any:
-        """Returns the tree with its part replaced."""
+        """Returns the tree with this part replaced."""
         if not self.path:
             return own
         name, *rest = self.path
@@ -286,46 +317,46 @@ class Ability(Generic[T]):
 
 @runtime_checkable
 class Checked(Protocol):
-    """Settings that can tell whether they work."""
+    """Settings that can be validated."""
 
     def check(self, name: str) -> None:
-        """Raises a `UserError` for settings that cannot; `name` is that of the field, for the option that is named."""
+        """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
         ...
 
 
 def check_config(name: str, config: Any) -> None:
-    """Raises a `UserError` for settings of a field, by its name, that cannot work: before there is a scene."""
+    """Raises a `UserError` for invalid settings of the field of this name; no scene is needed."""
     if isinstance(config, Checked):
         config.check(name)
 
 
 @runtime_checkable
 class Noisy(Protocol):
-    """A field that knows what noise has added to the spectra that it was trained on, and leaves it out of its answers."""
+    """A field that has estimated the noise floor of the spectra it was trained on, and predicts spectra without it."""
 
     def as_observed(self, params: Params, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
-        """Returns its answers as they would appear in those data."""
+        """Returns predicted spectra with the noise floor of those data."""
         ...
 
 
 def as_observed(field: Field, params: Params, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
-    """Returns the answers of a field as they would appear in the data that it was trained on: as they are, unless it is
-    `Noisy`."""
+    """Returns predicted spectra as they would appear in the data that the field was trained on: with the noise floor if it is
+    `Noisy`, unchanged otherwise."""
     noisy = field.ability(Noisy)
     return pas if noisy is None else noisy.field.as_observed(noisy.of(params), pas)
 
 
 @runtime_checkable
 class Portable(Protocol):
-    """A plan, or a part of one, of which files hold less."""
+    """A plan, or a part of one, that has a smaller form for files."""
 
     def portable(self) -> Any:
-        """Returns it without what is cheaply computed again from the parameters."""
+        """Returns it without the parts that are cheap to recompute from the parameters."""
         ...
 
 
 def portable(plan: Any) -> Any:
-    """Returns a plan without what is cheaply computed again from the parameters: what a file holds of it."""
+    """Returns a plan in its form for files: without the parts that are cheap to recompute from the parameters."""
 
     def small(part: Any) -> Any:
         return part.portable() if isinstance(part, Portable) else part
@@ -334,8 +365,13 @@ def portable(plan: Any) -> Any:
 
 
 def field_from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) -> Field:
-    """Returns a field from its flattened arrays, `{".frame.centre": array, ...}`, and its settings. A field that is made of
-    components has nothing else."""
+    """Returns a field from its flattened arrays and its settings. A field with components has no further arrays of its own.
+
+    Args:
+        cls: class of the field.
+        arrays: flattened arrays, `{".frame.centre": array, ...}`.
+        config: settings.
+    """
     if not cls.components:
         return from_leaves(cls, arrays, {"config": config})
     parts = dict[str, Field | None]()
@@ -347,34 +383,35 @@ def field_from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) 
 
 @jax.jit
 def paths_of(field: Field, params: Params, plan: Any, links: Query | Links) -> Arrivals:
-    """Returns every path of B links, leading axis B, of a field whose `outputs` name "paths".
+    """Returns all paths of B links, leading axis B, from a field whose `outputs` include "paths".
 
     Raises:
-        UserError: it knows none.
+        UserError: the field predicts no paths.
     """
     paths = field.render(params, plan, links).paths
     if paths is None:
-        raise UserError(f"the {field.name} field of this run knows no paths; train the default one on data with a mesh")
+        raise UserError(f"the {field.name} field of this run predicts no paths; train the default one on data with a mesh")
     return paths
 
 
 def components_of(field: Field) -> dict[str, Field]:
-    """Returns the components that a field of a scene has, by name."""
+    """Returns the components of a field that its scene supports, by name."""
     found = {name: getattr(field, name) for name in field.components}
     return {name: component for name, component in found.items() if component is not None}
 
 
 def outputs_of(field: Field) -> tuple[Output, ...]:
-    """Returns what a field knows of a link: the `outputs` of its class, of which a missing component may leave fewer."""
+    """Returns the quantities that a field predicts for a link: the `outputs` of its class, without those that only missing
+    components predict."""
     found = components_of(field)
     if len(found) == len(field.components):
         return field.outputs
-    known = {output for component in found.values() for output in outputs_of(component)}
-    return tuple(output for output in field.outputs if output in known)
+    predicted = {output for component in found.values() for output in outputs_of(component)}
+    return tuple(output for output in field.outputs if output in predicted)
 
 
 def heard_alone(batch: Batch, seen: Observation) -> Batch:
-    """Returns a batch whose black spectra are what was predicted."""
+    """Returns a batch with its all-zero spectra (nothing received) replaced by the predicted ones, so that they add no loss."""
     if batch.pas is None:
         return batch
     black = jnp.max(batch.pas, (1, 2), keepdims=True) == 0
@@ -383,41 +420,55 @@ def heard_alone(batch: Batch, seen: Observation) -> Batch:
 
 
 def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stride: int = 1) -> tuple[Float[Array, ""], Aux]:
-    """Returns the image loss (paper, equation 5) of observed spectra, or the loss of a kind that has none (`LOSSES`).
+    """Returns the loss of predictions on a batch: the image loss (paper, equation 5) if the batch has spectra, else the loss of
+    its kind of observation (`LOSSES`), or that of received power if the kind has no loss or the field does not predict it.
 
-    It is that of received power where the kind has no other, or the field says nothing else.
+    Args:
+        seen: predictions.
+        batch: links and observations.
+        ssim_weight: lambda of equation 5.
+        ssim_stride: stride of the SSIM windows along both axes.
+
+    Raises:
+        UserError: the field predicts nothing that can be compared with the observations.
     """
     if batch.pas is not None:
         loss, similarity = image_loss(seen.pas, batch.pas, ssim_weight, ssim_stride)
         return loss, Aux({"batch_ssim": similarity})
     kind = only_kind(batch.observations, "the batch")
     error = LOSSES[kind.name](seen, batch.observations[kind.name]) if kind.name in LOSSES else None
-    if error is None:  # the power that follows from what was observed
+    if error is None:  # the received power that follows from the observations
         error = LOSSES["power_db"](seen, batch.received_db)
     if error is None:
-        raise UserError(f"these data are {kind.words}, of which this field knows nothing; choose another field")
+        raise UserError(f"these data are {kind.words}, which this field does not predict; choose another field")
     return error, Aux({})
 
 
 def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
-    """Returns the mean absolute error of received power (dB) over the links that are heard; None where one side does not know
-    it."""
+    """Returns the mean absolute error of received power (dB) over the links on which a signal was received; None if the field
+    does not predict it or the batch does not contain it."""
     received = batch.received_db
     if seen.power_db is None or received is None:
         return None
-    heard = received > NOT_HEARD_DB
-    error, count = jnp.sum(jnp.abs(seen.power_db - received) * heard), jnp.sum(heard)
+    measured = received > NOT_HEARD_DB
+    error, count = jnp.sum(jnp.abs(seen.power_db - received) * measured), jnp.sum(measured)
     return over_all_links(error) / jnp.maximum(over_all_links(count), 1)
 
 
 def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity: Any = None) -> Float[Array, "b 90 360"]:
-    """Returns the power angular spectra of B queries: the differentiable function from parameters, receiver and query.
+    """Returns the power angular spectra of B queries, as a differentiable function of parameters, receiver and query (reverse
+    mode only).
 
-    Nothing is frozen: the plan is made inside. Under `jit` or `grad` a field with a capacity needs it given
-    (`field.capacity(params, receiver)`, on the host); too small a one gives NaN, never a wrong spectrum. Reverse mode only.
+    The plan is made inside, so that all gradients are complete. The wave field finds mirror images on the host: neither the
+    field nor the receiver's position can be traced, and spectra have no gradient with respect to that position.
 
-    The wave field finds mirror images on the host: neither it nor the receiver's position can be traced, and spectra have no
-    gradient with respect to that position.
+    Args:
+        field: field.
+        params: its parameters.
+        receiver: one receiver.
+        query: transmitter positions (metres) and frequencies (hertz).
+        capacity: static sizes, which a field with a capacity needs under `jit` or `grad` (`field.capacity(params, receiver)`,
+            on the host). A capacity that is too small gives NaN, never a wrong spectrum.
     """
     return field.render(params, field.plan(params, receiver, None, capacity), query).pas
 
@@ -426,7 +477,7 @@ _FIELDS: dict[str, type[Field]] = {}
 
 
 def register(cls: type[Field]) -> type[Field]:
-    """Makes a field known to command lines and run folders by its name; usable as a decorator."""
+    """Registers a field by its name for command lines and run folders; usable as a decorator."""
     _FIELDS[cls.name] = cls
     return cls
 
@@ -437,21 +488,26 @@ def field_names() -> list[str]:
 
 
 def get_field(name: str) -> type[Field]:
-    """Returns the class of a field by its name; an unknown name is a `UserError`."""
+    """Returns the class of a field by its name.
+
+    Raises:
+        UserError: no field of this name is registered.
+    """
     if name not in _FIELDS:
         raise UserError(f"unknown field {name!r}; choose one of: {', '.join(_FIELDS)}")
     return _FIELDS[name]
 
 
 def default_field() -> str:
-    """Returns the name of the field that is trained where none is asked for."""
+    """Returns the name of the field that is trained by default."""
     return "hybrid"
 
 
 def with_field(
     presets: Mapping[str, Settings], configs: Mapping[str, Any], **sections: Mapping[str, Any]
 ) -> dict[str, Settings]:
-    """Returns presets with a field's settings in them, and other sections where given, by preset."""
+    """Returns presets with the settings of a field inserted, and with other sections replaced where given; all mappings are by
+    the name of the preset."""
     return {
         name: dataclasses.replace(base, field=configs[name], **{key: values[name] for key, values in sections.items()})
         for name, base in presets.items()

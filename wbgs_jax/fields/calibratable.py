@@ -1,8 +1,8 @@
-"""Fields that trace rays in the surfaces of a mesh, and can be calibrated: surfaces moved or left out, materials named, arrays
-tuned.
+"""Interface of fields that trace paths between the surfaces of a mesh and can be calibrated: surfaces are displaced or removed,
+materials and gains of array elements are changed.
 
-`training.calibration` knows a field as this alone. What it changes is the field (where surfaces stand, what is absent, gains of
-array elements) or its parameters (`WaveParams`); both come back as new objects.
+`training.calibration` uses a field through this interface only. It changes the field (positions of surfaces, absent bodies,
+array gains) or its parameters (`WaveParams`); both are returned as new objects.
 """
 
 from abc import abstractmethod
@@ -19,20 +19,19 @@ from wbgs_jax.types import Links, Receiver
 
 
 class Calibratable(Field):
-    """A field of rays; a base class of those that are."""
+    """Base class of fields that trace paths."""
 
     facets: Facets
-    """Surfaces, each of a material and of a mover: a rigid body."""
+    """Surfaces, each with the index of its material and of its rigid body (`Facets.mover`)."""
     known_thickness: Float[Array, " m"]
-    """Thickness of every material, metres; 0 where it is not known, and learned."""
+    """Thickness of every material, metres; 0 if the scene does not define it, in which case it is learned."""
     motion: Motion
-    """How far movers and receivers stand from where the data say, as far as that has been found out; the facets are there
-    already."""
+    """Estimated displacements of rigid bodies and receivers from their nominal positions; the facets are already displaced."""
     tuning: Float[Array, "r elements 2"] | None
-    """Logarithm of amplitude, and phase (radians), by which elements of the receivers' arrays differ from what their positions
-    say; None: they are in tune."""
+    """Array gains: logarithm of amplitude, and phase (radians), of the elements of all receivers relative to ideal elements;
+    None for ideal elements."""
     first_clutter: Float[Array, "x y z 2"] | None
-    """`WaveParams.clutter` before training; None: the field has no absorption grid."""
+    """Initial `WaveParams.clutter`; None if the field has no absorption grid."""
     config: WaveConfig
 
     @abstractmethod
@@ -43,46 +42,51 @@ class Calibratable(Field):
     def plan(
         self, params: WaveParams | None, receiver: Receiver, prepared: PreparedPaths | None = None, capacity: None = None
     ) -> WavePlan:
-        """Returns what is independent of the query: geometry alone, no parameters."""
+        """Returns everything that is independent of the query: geometry only, no parameters."""
 
     @abstractmethod
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
-        """Returns the paths of all receivers and transmitters of some links (host)."""
+        """Returns the paths between the transmitters and receivers of links (host)."""
 
     @abstractmethod
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
-        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
-        shift and the turn of the plan's receiver alone."""
+        """Returns a plan whose surfaces and receiver are displaced, to first order, from where its paths were traced.
+
+        Args:
+            plan: plan of one receiver.
+            motion: displacements; those of receivers are of the plan's receiver only.
+        """
 
     @abstractmethod
     def moved(self, motion: Motion) -> "Calibratable":
-        """Returns the field of a scene in which things stand elsewhere (host)."""
+        """Returns the field with surfaces and receivers displaced further (host)."""
 
     @abstractmethod
     def without(self, movers: Int[np.ndarray, " k"]) -> "Calibratable":
-        """Returns the field of a scene in which some movers are not there (host)."""
+        """Returns the field without some rigid bodies, given by their indices (host)."""
 
     @abstractmethod
     def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "Calibratable":
-        """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
+        """Returns the field with the array gains of its receivers multiplied by these complex gains."""
 
     @abstractmethod
     def with_absorption(self) -> "Calibratable":
-        """Returns the field that knows of clutter: none of it yet, anywhere around its surfaces and receivers (host)."""
+        """Returns the field with an absorption grid around its surfaces and receivers, which is nearly transparent at first
+        (host)."""
 
     @abstractmethod
     def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
-        """Returns parameters in which one material has another relative permittivity (above 1) and conductivity at 1 GHz, S/m
+        """Returns parameters with another relative permittivity (above 1) and conductivity (at 1 GHz, S/m) of one material
         (host)."""
 
     @abstractmethod
     def with_thickness(self, plan: WavePlan, material: int, metres: float) -> tuple["Calibratable", WavePlan]:
-        """Returns the field and a plan in which all walls of one material are this thick, whatever data say (host)."""
+        """Returns the field and a plan with the thickness of one material fixed, in metres (host)."""
 
     @abstractmethod
     def material_properties(self, params: WaveParams) -> MaterialProperties:
-        """Returns the properties of the materials, as far as they were learned (host)."""
+        """Returns the learned properties of the materials (host)."""
 
     @abstractmethod
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
-        """Returns what its loss adds for parameters that stray from physics, whatever data say."""
+        """Returns the regularisation of its loss, which depends on the parameters only."""

@@ -1,12 +1,12 @@
-"""The coherent field: the snapshot as a sum of waves, its phases from geometry, its materials learned.
+"""The coherent field: the snapshot is a sum of waves, with phases from geometry and learned materials.
 
     y = sum over paths  a(direction) g(direction) E(f) exp(-j k d) / d        PAS = |a^H y| / max
 
-The mesh gives planar facets and the edges between them, the receiver's mirror images in them give the paths (propagation/).
-What arrives over a path follows from the slabs it is reflected by and passes through, and those are learned: permittivity,
-conductivity and (where it is not known) thickness of every material, a small correction of every facet, how far every surface
-may stand from where the mesh has it, and the antennas where nobody has said what they are. Phase-blind models cannot follow
-interference; this one does, as far as lengths are known, and it yields the channel itself.
+The mesh consists of planar facets with edges between them; the receiver's mirror images in the facets determine the paths
+(propagation/). The amplitude of a path follows from the slabs that reflect and transmit it. Their properties are learned:
+permittivity, conductivity and (if the scene does not define it) thickness of every material, a small correction of every facet,
+the standard deviation of the position of every rigid body, and the antennas. Phase-blind models cannot reproduce interference;
+this model does, as far as path lengths are accurate, and it also predicts the channel itself.
 """
 
 import dataclasses
@@ -73,32 +73,32 @@ __all__ = [
 ]
 
 SAME_PLACE_M = 1e-3
-"""Distance of two receivers that are the same."""
+"""Distance, metres, below which two receiver positions count as the same."""
 
 
 @register
 @pytree
 class WaveField(Calibratable):
-    """Facets and edges of the scene, and the thicknesses that are known."""
+    """Facets and edges of the scene, known thicknesses, and the results of calibration."""
 
     facets: Facets
     edges: Edges
     known_thickness: Float[Array, " m"]
-    """Thickness of every material, metres; 0 where it is not known, and learned."""
+    """Thickness of every material, metres; 0 if the scene does not define it, in which case it is learned."""
     first_placement: Float[Array, " places"]
-    """`WaveParams.placement` before training."""
+    """Initial `WaveParams.placement`."""
     receivers: Float[Array, "r 3"]
-    """Where the receivers of the data are said to stand, world frame, metres."""
+    """Nominal positions of the receivers of the data, world frame, metres."""
     motion: Motion
-    """How far things and those receivers stand from where the data say, as far as that has been found out; the facets are
-    there already."""
+    """Estimated displacements of rigid bodies and of those receivers from their nominal positions; the facets are already
+    displaced."""
     tuning: Float[Array, "r elements 2"] | None
-    """Logarithm of amplitude, and phase (radians), by which elements of those receivers differ from what their positions say,
-    as far as that has been found out; None: they are in tune."""
+    """Estimated array gains: logarithm of amplitude, and phase (radians), of the elements of those receivers relative to ideal
+    elements; None for ideal elements."""
     grid: Grid | None
-    """Of clutter; None: there is none."""
+    """Cells of the absorption grid, or None without one."""
     first_clutter: Float[Array, "x y z 2"] | None
-    """`WaveParams.clutter` before training."""
+    """Initial `WaveParams.clutter`; None without an absorption grid."""
     config: WaveConfig = static()
 
     name: ClassVar[str] = "wave"
@@ -109,19 +109,23 @@ class WaveField(Calibratable):
 
     @classmethod
     def build(cls, config: WaveConfig, scene: Scene, seed: int) -> "WaveField":
-        """Returns the field of a scene's surfaces; a scene without any is a `UserError`."""
+        """Returns the field of a scene's surfaces.
+
+        Raises:
+            UserError: the settings are invalid, or the scene has no surfaces.
+        """
         config.check(cls.name)
         return make_field(scene.mesh(), config, scene.receivers.position)
 
     def init(self, key: Key[Array, ""]) -> WaveParams:
-        """Returns parameters in which all materials are alike; nothing is random."""
+        """Returns initial parameters, in which all materials are the same; nothing is random."""
         facets, materials = self.facets.offset.shape[0], self.known_thickness.shape[0]
         return first_params(self.config, facets, materials, self.first_placement, self.first_clutter)
 
     def plan(
         self, params: WaveParams | None, receiver: Receiver, prepared: PreparedPaths | None = None, capacity: None = None
     ) -> WavePlan:
-        """Returns all mirror images of a receiver (host), or none of them where the paths of its links are prepared."""
+        """Returns a plan with all mirror images of a receiver (host), or without them if its paths are prepared."""
         check_receiver(receiver)
         receiver, tuning = self._as_found(receiver)
         surfaces, beams = (
@@ -130,8 +134,12 @@ class WaveField(Calibratable):
         return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, prepared, self.config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
-        """Returns a plan in which things stand elsewhere, to first order, than where its paths were found; the motion has the
-        shift and the turn of the plan's receiver alone."""
+        """Returns a plan whose surfaces and receiver are displaced, to first order, from where its paths were traced.
+
+        Args:
+            plan: plan of one receiver.
+            motion: displacements; those of receivers are of the plan's receiver only.
+        """
         orientation = turned(plan.receiver.orientation, jnp.asarray(motion.receiver_turn))
         return dataclasses.replace(plan, motion=motion, receiver=dataclasses.replace(plan.receiver, orientation=orientation))
 
@@ -139,18 +147,19 @@ class WaveField(Calibratable):
         config = self.config
         if _traced(self.facets, self.edges, receiver.position):
             raise TypeError(
-                "the wave field finds a receiver's mirror images on the host: neither the field nor receiver.position can be "
-                "traced or differentiated; close over both, or plan outside of jax.jit and jax.grad"
+                "the wave field computes a receiver's mirror images on the host: neither the field nor receiver.position can "
+                "be traced or differentiated; close over both, or make the plan outside jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
         return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
-        """Returns a receiver of the data where it has been found to stand, and its tuning; any other one as it is, in tune."""
+        """Returns a receiver of the data at its estimated position and orientation, with its array gains; any other receiver is
+        returned unchanged, without gains."""
         if not len(self.receivers):
             return receiver, None
         known = self.receivers, receiver.position, self.motion.receiver
-        xp = jnp if _traced(*known) else np  # the mirror images of a position are found on the host, within `jit` too
+        xp = jnp if _traced(*known) else np  # mirror images are computed on the host, also inside `jit`
         places, position, shifts = map(xp.asarray, known)
         away = xp.linalg.norm(places - position, axis=-1)
         own = xp.argmin(away)
@@ -167,11 +176,11 @@ class WaveField(Calibratable):
         return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
-        """Returns the paths of all receivers and transmitters of some links (host): geometry is not trained."""
+        """Returns the paths between the transmitters and receivers of links (host); geometry is not trained."""
         return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
     def render(self, params: WaveParams, plan: WavePlan, links: Query | Links) -> Observation:
-        """Returns spectra, snapshots, received power and paths of B links; where paths are prepared, of `Links`."""
+        """Returns spectra, snapshots, received power and paths of B links, which must be `Links` if paths are prepared."""
         paths = plan.paths_of(links)
         return observe(params, dataclasses.replace(plan, prepared=None), paths, links.frequency_hz)
 
@@ -183,13 +192,13 @@ class WaveField(Calibratable):
         capacity: None = None,
         probe: None = None,
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the image loss, the correlation and power losses of snapshots where the data have them, and a penalty on
-        facet corrections and clutter. Of links on which nothing was heard it learns nothing: a spectrum of paths has a maximum
-        of 1."""
+        """Returns the image loss, plus the correlation and power losses of snapshots if the data contain them, plus a penalty
+        on facet corrections and absorption. The spectra of links on which nothing was received are ignored: predicted spectra
+        have a maximum of 1."""
         return self.compared(params, self.render(params, self.plan(params, batch.receiver, prepared), batch.links), batch)
 
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
-        """Returns the loss of what it says of a batch."""
+        """Returns the loss of predictions on a batch."""
         config = self.config
         loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight)
         if seen.snapshots is not None and batch.snapshots is not None:
@@ -198,19 +207,19 @@ class WaveField(Calibratable):
         return loss + self.penalty(params), aux
 
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
-        """Returns what corrections of facets and clutter cost."""
+        """Returns the penalty on facet corrections and absorption."""
         corrections = self.config.correction_weight * jnp.sum(jnp.mean(params.facet_correction**2, 0))
         if params.clutter is None:
             return corrections
         return corrections + self.config.clutter_weight * jnp.mean(densities(params.clutter))
 
     def moved(self, motion: Motion) -> "WaveField":
-        """Returns the field of a scene in which things stand elsewhere (host)."""
+        """Returns the field with surfaces and receivers displaced further (host)."""
         facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
         return self._of(facets, jax.tree.map(lambda a, b: a + b, self.motion, motion))
 
     def without(self, movers: Int[np.ndarray, " k"]) -> "WaveField":
-        """Returns the field of a scene in which some movers are not there (host)."""
+        """Returns the field without some rigid bodies, given by their indices (host)."""
         stays = np.setdiff1d(np.arange(len(self.motion.shift)), movers)
         motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
         placement = self.first_placement[np.append(stays, -1)]
@@ -221,24 +230,26 @@ class WaveField(Calibratable):
         return dataclasses.replace(self, **{name: to_device(part) for name, part in parts.items()})
 
     def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
-        """Returns the field of receivers whose elements have these complex gains beside those that they have by now."""
+        """Returns the field with the array gains of its receivers multiplied by these complex gains."""
         further = jnp.asarray(np.stack([np.log(np.abs(gains)), np.angle(gains)], -1), jnp.float32)
         return dataclasses.replace(self, tuning=further if self.tuning is None else self.tuning + further)
 
     def with_absorption(self) -> "WaveField":
-        """Returns the field that knows of clutter: none of it yet, anywhere around its surfaces and receivers (host)."""
+        """Returns the field with an absorption grid around its surfaces and receivers, which is nearly transparent at first
+        (host)."""
         around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
         grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
         return dataclasses.replace(self, grid=to_device(grid), first_clutter=no_clutter(shape))
 
     def material_properties(self, params: WaveParams) -> MaterialProperties:
-        """Returns the properties of the materials, as far as they were learned."""
+        """Returns the learned properties of the materials (host)."""
         m, known = jax.tree.map(np.asarray, (params.materials, self.known_thickness))
         thickness = np.where(known > 0, known, np.exp(m.log_thickness))
         return MaterialProperties(1 + np.exp(m.log_susceptibility), np.exp(m.log_conductivity), m.slope, thickness)
 
     def with_material(self, params: WaveParams, material: int, permittivity: float, conductivity: float) -> WaveParams:
-        """Returns parameters in which one material has another permittivity (above 1) and conductivity."""
+        """Returns parameters with another relative permittivity (above 1) and conductivity (at 1 GHz, S/m) of one material
+        (host)."""
         m = params.materials
         polarised = m.log_susceptibility.at[material].set(np.log(permittivity - 1))
         conducting = m.log_conductivity.at[material].set(np.log(conductivity))
@@ -246,21 +257,22 @@ class WaveField(Calibratable):
         return dataclasses.replace(params, materials=changed)
 
     def with_thickness(self, plan: WavePlan, material: int, metres: float) -> tuple["WaveField", WavePlan]:
-        """Returns the field and the plan in which one material has a thickness that is known."""
+        """Returns the field and a plan with the thickness of one material fixed, in metres (host)."""
         known = self.known_thickness.at[material].set(metres)
         return tuple(dataclasses.replace(one, known_thickness=known) for one in (self, plan))  # type: ignore[return-value]
 
     def smoothed(self, params: WaveParams, metres: Float[Array, ""] | float) -> WaveParams:
-        """Returns parameters of transmitters that stand about so many metres from where they are asked for."""
+        """Returns parameters with a larger standard deviation of the transmitter's position: `metres` along each axis, added in
+        quadrature."""
         variance = jnp.exp(2 * params.placement[-1]) + jnp.asarray(metres, jnp.float32) ** 2
         return dataclasses.replace(params, placement=params.placement.at[-1].set(0.5 * jnp.log(variance)))
 
     def receiver_independent(self, params: WaveParams) -> tuple["WaveField", WaveParams]:
-        """Returns the field as it is: what was found out about a receiver's place is asked for at that place alone."""
+        """Returns the field unchanged: estimated displacements and array gains of receivers apply to these receivers only."""
         return self, params
 
     def inspect(self, params: WaveParams, plan: WavePlan | None = None, links: Query | Links | None = None) -> Inspection:
-        """Returns the numbers of materials, facets and edges, the materials, and how far surfaces were moved."""
+        """Returns the numbers of materials, facets and edges, the properties of the materials, and the displaced surfaces."""
         edges = int(np.count_nonzero(np.asarray(self.edges.length)))
         sizes = {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
         shift, displaced = np.asarray(self.motion.shift), None
@@ -270,7 +282,8 @@ class WaveField(Calibratable):
 
     @classmethod
     def param_groups(cls, config: WaveConfig, params: WaveParams | None = None) -> tuple[dict[str, Group], Any]:
-        """Returns the groups of parameters, and which is whose; idealisations are searched, and not trained."""
+        """Returns the groups of parameters, and the group of every parameter; propagation options are not trained, but chosen
+        by calibration."""
         groups = {
             "materials": Group(config.materials_lr),
             "thickness": Group(config.thickness_lr),
@@ -288,12 +301,12 @@ class WaveField(Calibratable):
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
-    """Returns the field of a mesh: its facets and edges are found on the host.
+    """Returns the field of a mesh, with facets and edges computed on the host.
 
     Args:
-        mesh: of the scene.
+        mesh: mesh of the scene.
         config: settings.
-        receivers: (r, 3), positions (world frame, metres) of those whose own place may be learned; none by default.
+        receivers: positions (r, 3), world frame, metres, of the receivers that may be calibrated; none by default.
     """
     config = config or WaveConfig()
     facets = facets_that_fit(mesh, config.max_facets)
@@ -306,7 +319,7 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
 
 
 def _beams(receiver: Receiver) -> Beams | None:
-    """Returns the beams of an array that is the same at all frequencies and known on the host."""
+    """Returns the beams of an array whose positions are in wavelengths and available on the host; None for any other array."""
     positions = receiver.element_positions
     if receiver.unit != "wavelengths" or _traced(positions):
         return None
@@ -328,5 +341,5 @@ def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array
 
 
 def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
-    """Returns every path of B queries, leading axis B: amplitudes, directions, lengths."""
+    """Returns all paths of B queries, leading axis B, with amplitudes, directions and lengths."""
     return path_arrivals(params, plan, plan.paths_of(query), query.frequency_hz)

@@ -1,13 +1,13 @@
-"""What the coherent field's parameters make of paths that are known: what arrives over each, snapshots, and spectra.
+"""Arrivals, snapshots and spectra of the coherent field, computed from its parameters and from traced paths.
 
-Waves are coherent as far as the places of surfaces are known:
+The coherence of waves depends on the uncertainty of the positions of surfaces and transmitters:
 
     R = sum over pairs of paths  coherence(i, j) y_i y_j^H        PAS = sqrt(a^H R a) / max
 
-with y_i the snapshot of path i alone. Where all places are known the coherence is 1 and the PAS that of the snapshot itself;
-where nobody knows them within a wavelength, powers add.
+with y_i the snapshot of path i alone. If all positions are exact, the coherence is 1 and the PAS is that of the snapshot
+itself; if they are uncertain by more than a wavelength, powers add.
 
-The paths of many links, found on the host before a training: whoever trains materials asks for them again and again.
+`PreparedPaths` holds the paths of many links, traced on the host before training, since every training step needs them.
 """
 
 import dataclasses
@@ -42,18 +42,20 @@ from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
 FAINTEST_SUM = 1e-12
-"""Of the power of several paths, relative to the strongest: what cancels further, or is nothing, has no spectrum."""
+"""Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
+there is no spectrum."""
 CLUTTER_HZ = 1e9, 1e11
-"""Frequencies at which clutter has a density of its own; in between it follows the logarithm of the frequency."""
+"""Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
+between, constant beyond."""
 THIN = 1e-3
-"""Density of clutter before training, nepers per metre: a tenth of a decibel in a room."""
+"""Initial density of the absorption grid, nepers per metre: a tenth of a decibel across a room."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
-"""Beyond it (S/m) every material is a mirror, and single precision ends."""
+"""Logarithm of the largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows."""
 
 
 @pytree
 class Materials:
-    """Stored (unconstrained) properties of M materials, those of ITU-R P.2040: eps_r, and sigma = c f^d with f in GHz."""
+    """Stored (unconstrained) properties of M materials as in ITU-R P.2040: eps_r, and sigma = c f^d with f in GHz."""
 
     log_susceptibility: Float[Array, " m"]
     """log(eps_r - 1)."""
@@ -62,60 +64,60 @@ class Materials:
     slope: Float[Array, " m"]
     """d."""
     log_thickness: Float[Array, " m"]
-    """log of metres, where the scene does not say."""
+    """log of the thickness in metres; used if the scene does not define it."""
 
 
 @pytree
 class WaveParams:
-    """What is trained."""
+    """Parameters of the coherent field."""
 
     materials: Materials
     facet_correction: Float[Array, "f 2"]
-    """Logarithm of amplitude and phase (radians) by which a facet's reflection differs from its material's."""
+    """Logarithm of amplitude, and phase (radians), of a facet's reflection relative to that of its material."""
     excess_loss: Float[Array, "2 3"]
-    """Loss per interaction beyond its slab or wedge (nepers), of (specular, diffracted) paths at (transmission, reflection,
-    diffraction)."""
+    """Additional loss per interaction beyond that of the slab or wedge, nepers. Rows: specular and diffracted paths; columns:
+    transmission, reflection, diffraction."""
     log_gain: Float[Array, ""]
-    """Logarithm of the gain of the transmitter and whatever else scales all snapshots."""
+    """Logarithm of the overall gain: that of the transmitter, and any other common factor of all snapshots."""
     transmitter: Antenna
-    """Of all transmitters, in the world frame."""
+    """Antenna of all transmitters, in the world frame."""
     element: Antenna
-    """What every element of the array is besides its known pattern, in the receiver's frame."""
+    """Antenna of every element of the array in addition to its known pattern, in the receiver's frame."""
     placement: Float[Array, " places"]
-    """Logarithm of how far (metres, standard deviation along each axis) the movers of the facets and, last, the transmitters
-    stand from where they are said to be."""
+    """Logarithm of the standard deviation (metres, along each axis) of the positions of all rigid bodies and, last, of the
+    transmitters."""
     thick: Float[Array, ""]
-    """1 where waves behind slabs lack the phase of the air that stood there, as in nature, 0 where not, as in ray tracers
-    (`materials.slab_coefficients`)."""
+    """Propagation option: 1 to subtract the phase of the air that a slab replaces, as in reality, 0 to keep it, as in ray
+    tracers (`materials.slab_coefficients`)."""
     curved: Float[Array, ""]
-    """1 where waves reach the array as spheres, as in nature, 0 where they are plane (`transport.element_voltages`)."""
+    """Propagation option: 1 for spherical waves at the array, as in reality, 0 for plane waves
+    (`transport.element_voltages`)."""
     clutter: Float[Array, "x y z 2"] | None
-    """Stored (unconstrained) density of what stands in the way and is not in the mesh, at both of `CLUTTER_HZ`; `densities`
-    gives nepers per metre. None: nothing does."""
+    """Stored (unconstrained) density of the absorption grid at both of `CLUTTER_HZ`, for objects that are not in the mesh;
+    `densities` returns nepers per metre. None without an absorption grid."""
 
 
 @pytree
 class PreparedPaths:
-    """The paths of some pairs of a receiver and a transmitter."""
+    """Traced paths of pairs of a receiver and a transmitter."""
 
     surfaces: Surfaces
-    """That they meet, of all receivers alike."""
+    """Facets and edges, shared by all receivers."""
     beams: Beams | None
-    """Of the receivers' array; None where they differ from frequency to frequency or from receiver to receiver."""
+    """Beams of the receivers' array; None if they depend on the frequency or on the receiver."""
     paths: TracedPaths
-    """Leading axis: pairs, ascending by receiver, then by transmitter."""
+    """Paths; the leading axis is that of the pairs, sorted by receiver, then by transmitter."""
     receiver_index: Int[Array, " pairs"]
     tx_index: Int[Array, " pairs"]
 
     def place(self, links: Links) -> Int[Array, "*b"]:
-        """Returns which of the pairs links belong to."""
+        """Returns the index of each link's pair."""
         numbers = jnp.max(self.tx_index) + 1
-        pairs, asked = (one.receiver_index * numbers + one.tx_index for one in (self, links))
-        return jnp.searchsorted(pairs, asked)
+        pairs, queried = (one.receiver_index * numbers + one.tx_index for one in (self, links))
+        return jnp.searchsorted(pairs, queried)
 
     def subset(self, links: Links) -> "PreparedPaths":
-        """Returns the pairs of links, one for each, so that what is done with them does not depend on how many others there
-        are."""
+        """Returns the pairs of links only, one per link, so that shapes do not depend on the number of prepared pairs."""
         place = jnp.sort(self.place(links))
         paths, receiver_index, tx_index = jax.tree.map(
             lambda leaf: leaf[place], (self.paths, self.receiver_index, self.tx_index)
@@ -123,7 +125,7 @@ class PreparedPaths:
         return dataclasses.replace(self, paths=paths, receiver_index=receiver_index, tx_index=tx_index)
 
     def of(self, links: Links) -> TracedPaths:
-        """Returns the paths of links, with their axes."""
+        """Returns the paths of links; leading axes are those of the links."""
         place = self.place(links)
         paths: TracedPaths = jax.tree.map(lambda leaf: leaf[place], self.paths)
         return paths
@@ -131,36 +133,37 @@ class PreparedPaths:
 
 @pytree
 class WavePlan:
-    """What is independent of the query: geometry alone. No parameter is frozen in it."""
+    """Everything that is independent of the query: geometry only, no parameters."""
 
     surfaces: Surfaces
-    """A `Search` of the receiver where paths have still to be found."""
+    """Facets and edges; a `Search` with the receiver's mirror images unless paths are prepared."""
     receiver: Receiver
     tuning: Float[Array, "elements 2"] | None
-    """Logarithm of amplitude, and phase (radians), of its elements; None: they are in tune."""
+    """Array gains of the receiver: logarithm of amplitude, and phase (radians), of its elements; None for ideal elements."""
     known_thickness: Float[Array, " m"]
     motion: Motion | None
-    """How far things, and this receiver, stand from where paths were found, while that is being learned."""
+    """Displacements of rigid bodies and of this receiver since the paths were traced, while they are being estimated."""
     beams: Beams | None
-    """Of the array; None where they differ from frequency to frequency, or are traced."""
+    """Beams of the array; None if they depend on the frequency, or if the positions of its elements are traced by JAX."""
     grid: Grid | None
-    """Of clutter, if there is any."""
+    """Cells of the absorption grid, or None without one."""
     prepared: PreparedPaths | None
-    """Paths of the links that it will be asked about; None: they are traced."""
+    """Paths of the links that will be queried; None if paths are to be traced for each query."""
     config: WaveConfig = static()
 
     def paths_of(self, links: Query | Links) -> TracedPaths:
-        """Returns the paths of B links: those that are prepared, or traced anew."""
+        """Returns the paths of B links, from the prepared ones or by tracing."""
         if self.prepared is None:
             check_query(links.query)
             return trace(self, links.tx_position)
         if isinstance(links, Query):
-            raise TypeError("a plan that was made with prepared paths traces no others; plan without, or ask about `Links`")
+            raise TypeError("a plan with prepared paths traces no others; make a plan without them, or query `Links`")
         return self.prepared.of(links)
 
 
 def first_params(config: WaveConfig, facets: int, materials: int, placement: Any, clutter: Any) -> WaveParams:
-    """Returns parameters before training, in which all materials are alike; nothing is random."""
+    """Returns initial parameters, in which all materials are the same; nothing is random. `facets` and `materials` are numbers;
+    `placement` and `clutter` are initial values."""
     m = Materials(
         log_susceptibility=jnp.full(materials, np.log(config.permittivity - 1), jnp.float32),
         log_conductivity=jnp.full(materials, np.log(config.conductivity), jnp.float32),
@@ -170,7 +173,7 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
     amplitude = jnp.array([[1.0, 1.0, 1.0], [config.excess_amplitude, config.excess_amplitude, 1.0]], jnp.float32)
     nothing = jnp.zeros((), jnp.float32)
     corrections = jnp.zeros((facets, 2), jnp.float32), -jnp.log(amplitude), jnp.zeros_like(nothing)
-    # Training gives every array away once.
+    # Training donates every array once, so that none may be shared.
     transmitter, element = (upright(jnp.zeros(2, jnp.float32)) for _ in range(2))
     placement, clutter = jax.tree.map(jnp.array, (placement, clutter))
     return WaveParams(m, *corrections, transmitter, element, placement, nothing, jnp.zeros_like(nothing), clutter)
@@ -180,13 +183,13 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
 def path_snapshots(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Complex[Array, "b elements"]:
-    """Returns the snapshots of B transmitters whose paths are known."""
+    """Returns the snapshots of B transmitters from their paths."""
     return _snapshots(params, plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
 
 
 @jax.jit
 def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Arrivals:
-    """Returns every path of B transmitters whose paths are known, leading axis B."""
+    """Returns the arrivals over all paths of B transmitters, leading axis B."""
     found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, frequency_hz)
     return found
 
@@ -199,13 +202,13 @@ def _snapshots(
 
 
 def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elements"]:
-    """Returns the complex gains of elements that are out of tune."""
+    """Returns the complex gains of elements from their stored logarithms and phases."""
     return jnp.exp(tuning[:, 0] + 1j * tuning[:, 1])
 
 
 @jax.jit
 def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
-    """Returns spectra, snapshots, received power and all that arrives of B transmitters whose paths are known."""
+    """Returns spectra, snapshots, received power and arrivals of B transmitters from their paths."""
     if not plan.config.coherent:
         blind = phase_blind_pas(params, plan, paths, frequency_hz)
         return Observation(blind, paths=path_arrivals(params, plan, paths, frequency_hz))
@@ -223,16 +226,16 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz
 def path_covariances(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, " b"]
 ) -> tuple[Complex[Array, "b elements elements"], Float[Array, " b"]]:
-    """Returns the mean products y y^H of the snapshots of B transmitters over the places where surfaces may stand
-    (`WaveParams.placement`), scaled to a trace of 1; and the mean power that an element receives."""
+    """Returns the mean products y y^H of the snapshots of B transmitters over the possible positions of surfaces and
+    transmitters (`WaveParams.placement`), scaled to a trace of 1, and the mean power received by an element."""
     spread = jnp.exp(params.placement)
 
     def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
         strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude)))
-        strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # without any path: 1 / FAINTEST^2 is no float
+        strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # no paths: 1 / FAINTEST^2 would overflow
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
-        left = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
-        covariance = covariance_from_paths(arrived, plan.receiver, f, left)
+        coherence = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
+        covariance = covariance_from_paths(arrived, plan.receiver, f, coherence)
         if plan.tuning is not None:
             gains = element_gains(plan.tuning)
             covariance = covariance * gains[:, None] * gains.conj()
@@ -247,14 +250,14 @@ def path_covariances(
 def phase_blind_pas(
     params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
 ) -> Float[Array, "b 90 360"]:
-    """Returns spectra with the powers of all paths added: what is left of this model without its phases."""
+    """Returns spectra with the powers of all paths added, which is this model without phases."""
     return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
         paths, frequency_hz
     )
 
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
-    """Returns what every facet is made of at one frequency."""
+    """Returns the slabs of all facets at one frequency."""
     m, material = params.materials, plan.surfaces.facets.material
     sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
@@ -263,7 +266,7 @@ def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""])
 
 
 def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
-    """Returns what one transmitter sends over all of its paths."""
+    """Returns the arrivals over all paths of one transmitter."""
     slabs, found = slabs_at(params, plan, frequency_hz), []
     clutter = None if params.clutter is None else _clutter_at(params.clutter, frequency_hz)
     for row, some in enumerate((paths.specular, paths.diffracted)):
@@ -271,42 +274,48 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequenc
         one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         if clutter is not None:
-            assert plan.grid is not None, "the field has both"
+            assert plan.grid is not None, "a field with absorption parameters has a grid"
             gain = gain * jnp.exp(-attenuation(one.points, clutter, plan.grid))
         if plan.motion is not None:
-            turns = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
-            gain = gain * phasor(-turns)
-        assert one.polarised is not None, "paths that were traced have it"
+            cycles = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
+            gain = gain * phasor(-cycles)
+        assert one.polarised is not None, "arrivals of traced paths have it"
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
     joined: Any = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     return joined._replace(curved=params.curved)
 
 
 def no_clutter(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
-    """Returns `WaveParams.clutter` of an empty room."""
+    """Returns the initial `WaveParams.clutter`, which is nearly transparent (`THIN`)."""
     return stored(jnp.full((*shape, len(CLUTTER_HZ)), THIN, jnp.float32))
 
 
 def densities(clutter: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
-    """Returns nepers per metre."""
+    """Returns the densities, nepers per metre, of stored values."""
     return jax.nn.softplus(clutter)
 
 
 def stored(density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
-    """Returns the clutter that has these `densities`, all of them positive."""
+    """Returns the stored values of positive densities, nepers per metre: the inverse of `densities`."""
     return jnp.log(jnp.expm1(density))
 
 
 def _clutter_at(clutter: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]) -> Float[Array, "x y z"]:
-    """Returns the density at one frequency."""
+    """Returns the smoothed density at one frequency, nepers per metre."""
     low, high = CLUTTER_HZ
     share = jnp.clip(jnp.log(frequency_hz / low) / np.log(high / low), 0, 1)
-    at_low, at_high = jnp.moveaxis(smoothed(densities(clutter)), -1, 0)  # once for all links of a batch
+    at_low, at_high = jnp.moveaxis(smoothed(densities(clutter)), -1, 0)  # computed once for all links of a batch
     return (1 - share) * at_low + share * at_high
 
 
 def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:
-    """Returns the factor by which paths differ from their slabs and wedges."""
+    """Returns the factors of paths due to facet corrections and additional losses.
+
+    Args:
+        params: parameters.
+        paths: K paths.
+        row: 0 for specular paths, 1 for diffracted paths.
+    """
     kind = paths.interaction_type
     counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
     reflects = kind == REFLECTED
@@ -317,21 +326,21 @@ def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, "
 
 
 TRACED_AT_ONCE = 16
-"""Transmitters."""
+"""Number of transmitters that are traced together."""
 
 
 def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedPaths:
-    """Returns the paths of all receivers and transmitters of some links (host).
+    """Returns the paths between the transmitters and receivers of links (host).
 
     Args:
-        links: any number of them, of any receivers.
-        plan_of: plans a receiver by its number.
+        links: any number of links, of any receivers.
+        plan_of: returns the plan of a receiver by its index.
     """
     numbers = np.stack([np.asarray(links.receiver_index), np.asarray(links.tx_index)], -1)
     pairs, first = np.unique(numbers, axis=0, return_index=True)
     positions, found, beams = np.asarray(links.query.tx_position)[first], [], []
     for receiver in np.unique(pairs[:, 0]):
-        plan = plan_of(int(receiver))  # one at a time: mirror images of many receivers are many
+        plan = plan_of(int(receiver))  # one at a time: the mirror images of many receivers would need much memory
         found.append(_traced_in_blocks(plan, positions[pairs[:, 0] == receiver]))
         beams.append(plan.beams)
     paths = TracedPaths(_stacked([one.specular for one in found]), _stacked([one.diffracted for one in found]))
@@ -344,7 +353,7 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     """Returns the paths of B transmitters; independent of frequency and materials."""
     config, search = plan.config, plan.surfaces
     if not isinstance(search, Search):
-        raise TypeError("a plan that was made with prepared paths traces no others; plan without them")
+        raise TypeError("a plan with prepared paths traces no others; make a plan without them")
     sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
     return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
 
@@ -354,7 +363,7 @@ def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> An
 
 
 def _stacked(some: list[Paths]) -> Paths:
-    """Returns paths one after the other, all with as much room as those that have most: receivers have different numbers."""
+    """Returns concatenated paths, padded to the largest number of paths, which differs between receivers."""
     room = max(paths.alive.shape[1] for paths in some)
 
     def filled(leaf: np.ndarray, mode: Any) -> np.ndarray:
@@ -368,6 +377,6 @@ def _stacked(some: list[Paths]) -> Paths:
 
 
 def _shared(beams: list[Beams | None]) -> Beams | None:
-    """Returns the beams of all receivers, if they are the same."""
+    """Returns the beams of all receivers if they are the same, else None."""
     first, *others = beams
     return first if all(same(first, other) for other in others) else None

@@ -1,5 +1,5 @@
-"""What the EM feature networks say of every Gaussian and query (paper, sections 4.2 and 4.5), in two steps: what depends on the
-Gaussian alone, once for all queries, and the rest."""
+"""Outputs of the EM feature networks for every Gaussian and query (paper, sections 4.2 and 4.5), computed in two steps: the
+part that depends on the Gaussian only, once for all queries, and the rest."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -28,28 +28,31 @@ from wbgs_jax.radio.geometry import smooth_length, to_local
 from wbgs_jax.types import Gaussians, Query, Receiver
 
 MAX_ATTENUATION = 0.99
+"""Upper bound of the final attenuation delta."""
 RELATIVE_FEATURES, GIVEN_FEATURES = 7, 3
+"""Numbers of relative inputs (`WidebandConfig.relative`) and of inputs from a conditioning spectrum (`given_features`)."""
 DARK = 0.02
-"""Keeps the logarithm of dark pixels finite."""
+"""Offset that keeps the logarithm of dark pixels finite."""
 POWER_UNIT_DB = 10.0
+"""Unit of the power network's output, dB."""
 Weights = dict[str, Any]
-"""Of all networks, by name."""
+"""Weights of all networks, by name."""
 
 
 class QueryFeatures(NamedTuple):
-    """What the networks say of N Gaussians and B queries."""
+    """Outputs of the networks for N Gaussians and B queries."""
 
     attenuation: Float[Array, "n b"]
     """The final attenuation delta."""
     signal: Float[Array, "n b"]
     """Sig."""
     summary: Float[Array, "b width"]
-    """The mean over the Gaussians of the hidden features h."""
+    """Mean of the hidden features h over the Gaussians."""
 
 
 @pytree
 class Frame:
-    """Maps world positions to network inputs of about unit size. Set once from the surface, never trained."""
+    """Map from world positions to network inputs of about unit size, computed once from the surface and not trained."""
 
     centre: Float[Array, "3"]
     half_extent: Float[Array, ""]
@@ -57,20 +60,21 @@ class Frame:
 
 @pytree
 class GaussianFeatures:
-    """What the networks' inputs need of every Gaussian, whatever is asked."""
+    """Network inputs of every Gaussian that are independent of the query."""
 
     sums: GaussianSums
-    """What the attenuation network's layers make of P(G)."""
+    """Sums of the attenuation network's layers over P(G)."""
     direction: Float[Array, "n 3"]
     """Unit vectors from the receiver to the Gaussians, receiver's frame."""
     back: Float[Array, "n 3"]
     """Unit vectors from the Gaussians to the receiver, world frame."""
     steering: Complex[Array, "n elements"] | None
-    """The array's response to waves from the Gaussians; None for an array of fixed size, whose response has a frequency."""
+    """Response of the array to waves from the Gaussians; None for an array with positions in metres, whose response depends on
+    the frequency."""
 
 
 def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceNetwork, PowerNetwork]:
-    """Returns the EM feature networks, and that of the received power."""
+    """Returns the EM feature networks and the power network."""
     heads = 1 + config.frequency_heads
     attenuation = AttenuationNetwork(config.width, config.depth, config.skip, config.fusion, heads, config.precision)
     return attenuation, RadianceNetwork(config.radiance_widths, heads, config.precision), PowerNetwork(config.width)
@@ -80,7 +84,7 @@ def make_networks(config: WidebandConfig) -> tuple[AttenuationNetwork, RadianceN
 def gaussian_features(
     gaussians: Gaussians, weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig
 ) -> GaussianFeatures:
-    """Returns what the networks' inputs need of every Gaussian, whatever is asked."""
+    """Returns the network inputs of every Gaussian that are independent of the query."""
     means = gaussians.means
     encoded = positional_encoding((means - frame.centre) / frame.half_extent, config.gaussian_octaves)
     if gaussians.features is not None:
@@ -107,13 +111,24 @@ def query_features(
     given: Float[Array, "n b 3"] | None = None,
 ) -> QueryFeatures:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
-    4.5), and a summary of every query. Networks that were made for it see what another field gives (`given_features`)."""
+    4.5), and a summary of every query.
+
+    Args:
+        gaussians: Gaussians.
+        weights: weights of all networks.
+        features: result of `gaussian_features`.
+        frame: frame of the inputs.
+        receiver: one receiver.
+        config: settings.
+        query: B queries.
+        given: features of conditioning spectra (`given_features`), for networks that have inputs for them.
+    """
     attenuation, radiance, _ = make_networks(config)
     both, frequency = _query_inputs(gaussians.means, features, frame, receiver, config, query)
-    seen = [] if given is None else [given]
-    outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both + seen, method="of_queries")
+    conditioning = [] if given is None else [given]
+    outputs: Any = attenuation.apply(weights["attenuation"], features.sums, both + conditioning, method="of_queries")
     hidden, delta_f = outputs
-    signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency, *seen])
+    signal: Any = radiance.apply(weights["radiance"], [hidden, *frequency, *conditioning])
     if config.frequency_heads:
         u = scale_frequency(query.frequency_hz)
         powers = jnp.concatenate([jnp.ones_like(u)[:, None], legendre(u, config.frequency_heads)], -1)
@@ -127,12 +142,12 @@ def query_features(
 def received_power_db(
     summary: Float[Array, "b width"], weights: Weights, frame: Frame, receiver: Receiver, config: WidebandConfig, query: Query
 ) -> Float[Array, " b"]:
-    """Returns the power that an element receives, relative to the transmitted power (dB): free space, and what the network adds
-    to it."""
+    """Returns the power received by an element relative to the transmitted power (dB): that of free space plus the output of
+    the power network."""
     distance = smooth_length(query.tx_position - receiver.position)[:, 0]
     scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
-    known = [scale_frequency(query.frequency_hz)[:, None]] if config.sees_frequency else []
-    parts = [summary, positional_encoding(scaled_tx, config.tx_octaves), *known]
+    frequency = [scale_frequency(query.frequency_hz)[:, None]] if config.sees_frequency else []
+    parts = [summary, positional_encoding(scaled_tx, config.tx_octaves), *frequency]
     correction: Any = make_networks(config)[2].apply(weights["power"], parts)
     return free_space_db(distance, query.frequency_hz) + POWER_UNIT_DB * correction
 
@@ -146,7 +161,7 @@ def _query_inputs(
     query: Query,
 ) -> tuple[list[Float[Array, "_ b _"]], list[Float[Array, "1 b _"]]]:
     """Returns the encoded inputs that depend on the query: those of the attenuation network, and the frequency for the radiance
-    network (nothing if it is switched off)."""
+    network (an empty list if this input is switched off)."""
     scaled_tx = (query.tx_position - frame.centre) / frame.half_extent
     both = [positional_encoding(scaled_tx, config.tx_octaves)[None, :, :]]
     if config.relative:
@@ -158,8 +173,13 @@ def _query_inputs(
 
 
 def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) -> Float[Array, "n b 3"]:
-    """Returns what spectra say in the directions of Gaussians (linear between pixels; below the lowest row, as on it): the
-    value, its logarithm, and 1. A spectrum that is dark all over says nothing: all three are 0."""
+    """Returns conditioning spectra sampled in the directions of Gaussians: the value, its logarithm, and 1. All three are 0 for
+    a spectrum that is zero everywhere, which means no conditioning.
+
+    Args:
+        given: B conditioning spectra.
+        pixel: column and row of N Gaussians; values are linear between pixels, and constant below the lowest row.
+    """
     rows, columns = given.shape[-2:]
     row = jnp.clip(pixel[:, 1], 0, rows - 1)
     above, left = jnp.minimum(jnp.floor(row), rows - 2), jnp.floor(pixel[:, 0])
@@ -169,13 +189,13 @@ def given_features(given: Float[Array, "b 90 360"], pixel: Float[Array, "n 2"]) 
         return given[:, above.astype(jnp.int32) + i, (left.astype(jnp.int32) + j) % columns]
 
     upper, lower = ((1 - right) * at(i, 0) + right * at(i, 1) for i in (0, 1))
-    said = ((1 - down) * upper + down * lower).T
-    told = jnp.any(given > 0, (-2, -1))[:, None]
-    return jnp.where(told, jnp.stack([said, jnp.log(said + DARK), jnp.ones_like(said)], -1), 0)
+    value = ((1 - down) * upper + down * lower).T
+    conditioned = jnp.any(given > 0, (-2, -1))[:, None]
+    return jnp.where(conditioned, jnp.stack([value, jnp.log(value + DARK), jnp.ones_like(value)], -1), 0)
 
 
 def encoded_frequency(frequency_hz: Float[Array, " b"], config: WidebandConfig) -> Float[Array, "b d"]:
-    """Returns what the networks see of the frequency."""
+    """Returns the network inputs that encode the frequency."""
     encoded = frequency_encoding(frequency_hz, config.frequency_octaves, config.frequency_scale)
     return jnp.concatenate([encoded, legendre(scale_frequency(frequency_hz), config.frequency_degree)[:, 1:]], -1)
 
@@ -183,10 +203,9 @@ def encoded_frequency(frequency_hz: Float[Array, " b"], config: WidebandConfig) 
 def _relative_features(
     means: Float[Array, "n 3"], features: GaussianFeatures, receiver: Receiver, query: Query, size: Float[Array, ""]
 ) -> Float[Array, "n b 7"]:
-    """Returns functions of (P(G), P(TX)) and the receiver array that spare the network learning trigonometry.
-
-    The angle between Gaussian and TX as the receiver sees it, the array's response to the TX in the Gaussian's direction (the
-    line of sight's PAS), the cosine of the bounce at the Gaussian, and distance and direction from Gaussian to TX.
+    """Returns geometric functions of (P(G), P(TX)) and the receiver array, which the network then need not learn: the cosine of
+    the angle between Gaussian and TX at the receiver, the array's response to the TX in the Gaussian's direction (the PAS of
+    the line of sight), the cosine of the angle of reflection at the Gaussian, and distance and direction from Gaussian to TX.
     """
     to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
     to_tx = to_tx / smooth_length(to_tx)

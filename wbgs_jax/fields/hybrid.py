@@ -1,11 +1,12 @@
-"""The hybrid field: the coherent field and the paper's splatting field side by side, and how far each is to be trusted.
+"""The hybrid field: a mixture of the coherent field and the paper's splatting field, with weights for every query.
 
-The coherent field is right to the phase where mesh and physics are, and can be far off where they are not; the splatting field
-needs neither and blurs. Its networks may see what the coherent field says, and so learn where that is wrong: behind furniture
-that the mesh lacks, say. In training they see it for half of the queries, so that the field has two opinions: one of its own,
-which errs in other places than the coherent field, and an informed one. Both fields are trained on the same batches; what the
-three opinions count for, query by query, is what explains validation transmitters best (mixture.py).
-Without a mesh it is the splatting field by itself.
+The coherent field is accurate to the phase where mesh and physics are, and can be far off where they are not; the splatting
+field needs neither, but its spectra are blurred. Its networks can be conditioned on the spectrum of the coherent field and so
+learn where that is wrong, for example behind furniture that is missing from the mesh. In training they are conditioned for half
+of the queries, so that this field provides two experts: an unconditioned one, which errs in other places than the coherent
+field, and a conditioned one. Both fields are trained on the same batches; the mixture weights of the three experts for each
+query are those that fit validation transmitters best (mixture.py).
+Without a mesh it is the splatting field alone.
 """
 
 import dataclasses
@@ -40,46 +41,47 @@ from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
 
 @dataclass(frozen=True)
 class HybridConfig:
-    """Settings of the two fields."""
+    """Settings of both fields."""
 
     wave: WaveConfig = field(default_factory=WaveConfig)
     wideband: WidebandConfig = field(default_factory=WidebandConfig)
 
     def check(self, name: str) -> None:
-        """Raises a `UserError` for settings that cannot work; options are those of the two fields."""
+        """Raises a `UserError` for invalid settings; the message names the option of the field concerned."""
         self.wave.check("wave")
         self.wideband.check("wideband")
         if not self.wave.coherent:
-            raise UserError("--wave.no-coherent leaves nothing to mix; train --field wideband")
+            raise UserError("--wave.no-coherent leaves no coherent field to mix; train --field wideband")
 
 
 @pytree
 class Trust:
-    """How much each of three opinions counts."""
+    """Mixture weights of the three experts, and the noise floor."""
 
     spectra: Shares
+    """Weights for spectra."""
     power: Shares
-    """Of the received power in decibels."""
+    """Weights for received power in decibels."""
     floor: Float[Array, ""]
-    """What noise has put under the spectra that the splatting field learned; its answers are without it."""
+    """Noise floor in the spectra that the splatting field was trained on (`mixture.with_floor`); predictions are without it."""
 
 
 @pytree
 class HybridParams:
-    """What is trained."""
+    """Parameters of both fields, and of their mixture."""
 
     wave: Any
-    """`WaveParams`, or None without a coherent field."""
+    """Parameters of the coherent field (`WaveParams`), or None without one."""
     wideband: WidebandParams
     trust: Trust
 
 
 @pytree
 class HybridPlan:
-    """What is independent of the query."""
+    """Everything that is independent of the query."""
 
     wave: Any
-    """`WavePlan`, or None without a coherent field."""
+    """Plan of the coherent field (`WavePlan`), or None without one."""
     wideband: WidebandPlan
 
 
@@ -91,10 +93,10 @@ def _preset(name: str) -> Settings:
 @register
 @pytree
 class HybridField(Field):
-    """Both fields of a scene."""
+    """The coherent field and the splatting field of a scene."""
 
     wave: Any
-    """`WaveField`, or None where it could know nothing."""
+    """Coherent field (`WaveField`), or None if the scene does not support one."""
     wideband: WidebandField
     config: HybridConfig = static()
 
@@ -112,7 +114,7 @@ class HybridField(Field):
         return cls(_coherent(config.wave, scene, seed), WidebandField.build(config.wideband, scene, seed), config)
 
     def init(self, key: Key[Array, ""]) -> HybridParams:
-        """Returns initial parameters, both fields trusted alike."""
+        """Returns initial parameters, with equal weights of both fields."""
         wave = None if self.wave is None else self.wave.init(key)
         wideband = self.wideband.init(key, given=wave is not None)
         return HybridParams(wave, wideband, Trust(at_first(), at_first(), jnp.zeros(())))
@@ -124,52 +126,54 @@ class HybridField(Field):
         prepared: PreparedPaths | None = None,
         capacity: TileLimits | None = None,
     ) -> HybridPlan:
-        """Returns a receiver's mirror images (host, unless they are prepared) and the projected Gaussians."""
+        """Returns the plans of both fields: a receiver's mirror images (host; not needed if paths are prepared) and the
+        projected Gaussians."""
         wave = None if self.wave is None else self.wave.plan(params.wave, receiver, prepared)
         return HybridPlan(wave, self.wideband.plan(params.wideband, receiver, None, capacity))
 
     def render(self, params: HybridParams, plan: HybridPlan, links: Query | Links) -> Observation:
-        """Returns spectra and received power of B links, and the coherent field's snapshots and paths."""
+        """Returns the mixed spectra and received powers of B links, and the snapshots and paths of the coherent field."""
         if self.wave is None:
             return self.wideband.render(params.wideband, plan.wideband, links)
         coherent = self.wave.render(params.wave, plan.wave, links)
-        pas, power_db, told = self._said(params, plan, links.query, coherent)
-        spectra, power = mixed(params.trust.spectra, told, pas), mixed(params.trust.power, told, power_db)
-        return coherent._replace(pas=spectra, power_db=power, covariance=None)  # which is that of the coherent field alone
+        pas, power_db, inputs = self._said(params, plan, links.query, coherent)
+        spectra, power = mixed(params.trust.spectra, inputs, pas), mixed(params.trust.power, inputs, power_db)
+        return coherent._replace(pas=spectra, power_db=power, covariance=None)  # the covariance is of the coherent field only
 
     def opinions(
         self, params: HybridParams, plan: HybridPlan, links: Query | Links
     ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
-        """Returns what spectra and powers of B links are said to be, and what tells whom to trust; of a scene with a mesh."""
+        """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on; the
+        scene must have a mesh."""
         return self._said(params, plan, links.query, self.wave.render(params.wave, plan.wave, links))
 
     def with_shares(
         self, params: HybridParams, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0
     ) -> HybridParams:
-        """Returns parameters with other shares of the opinions, where they are given, and another floor under spectra."""
+        """Returns parameters with other mixture weights, where given, and another noise floor of spectra."""
         trust = Trust(spectra or params.trust.spectra, power or params.trust.power, jnp.asarray(floor, jnp.float32))
         return dataclasses.replace(params, trust=trust)
 
     def _said(
         self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
     ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
-        """Returns what spectra and powers of B queries are said to be, and what tells whom to trust."""
-        assert coherent.pas is not None and coherent.power_db is not None, "it knows both"
+        """Returns the experts' spectra and received powers (dB) of B queries, and the features that their weights depend on."""
+        assert coherent.pas is not None and coherent.power_db is not None, "the coherent field predicts both"
         nothing = jnp.zeros_like(coherent.pas)
         own, informed = (
             self.wideband.render(params.wideband, plan.wideband, query, given) for given in (nothing, coherent.pas)
         )
-        told = features(query, plan.wave.receiver.position, coherent, own)
-        assert own.power_db is not None, "as the coherent field does"
-        met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field has no opinion
+        inputs = features(query, plan.wave.receiver.position, coherent, own)
+        assert own.power_db is not None, "the splatting field predicts received power"
+        met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field predicts nothing
         powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
-        floor = jax.lax.stop_gradient(params.trust.floor)  # found, not trained
-        clean, as_told = (without_floor(seen.pas, floor) for seen in (own, informed))
-        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, clean), clean, as_told)
-        return spectra, powers, told
+        floor = jax.lax.stop_gradient(params.trust.floor)  # estimated, not trained
+        clean, clean_informed = (without_floor(seen.pas, floor) for seen in (own, informed))
+        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, clean), clean, clean_informed)
+        return spectra, powers, inputs
 
     def as_observed(self, params: HybridParams, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:
-        """Returns spectra with what noise adds to them."""
+        """Returns spectra with the noise floor of the training data."""
         floor = jax.lax.stop_gradient(params.trust.floor)
         return jnp.where(floor > 0, with_floor(pas, floor), pas)
 
@@ -181,7 +185,8 @@ class HybridField(Field):
         capacity: TileLimits | None = None,
         probe: Any = None,
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the sum of both losses. What the splatting field makes of the coherent one is no reason to change that."""
+        """Returns the sum of both losses. The conditioning spectra are constants to the gradient: the loss of the splatting
+        field does not change the coherent field."""
         if self.wave is None:
             return self.wideband.loss(params.wideband, None, batch, capacity, probe)
         seen = self.wave.render(params.wave, self.wave.plan(params.wave, batch.receiver, prepared), batch.links)
@@ -193,13 +198,13 @@ class HybridField(Field):
 
     @classmethod
     def param_groups(cls, config: HybridConfig, params: HybridParams | None = None) -> tuple[dict[str, Group], Any]:
-        """Returns the groups of both fields under their names; trust is not trained, but found afterwards."""
+        """Returns the groups of both fields under their names; mixture weights are not trained, but fitted afterwards."""
         groups, labels = super().param_groups(config, params)
         trust = None if params is None else jax.tree.map(lambda _: "trust", params.trust)
         return groups | {"trust": Group(0.0)}, None if params is None else replaced(labels, trust=trust)
 
     def inspect(self, params: HybridParams, plan: HybridPlan | None = None, links: Query | Links | None = None) -> Inspection:
-        """Returns what is in both fields, the Gaussians informed of the coherent one."""
+        """Returns the contents of both fields, with the state of the Gaussians conditioned on the coherent field."""
         found = super().inspect(params)
         if plan is None or links is None:
             return found
@@ -208,18 +213,19 @@ class HybridField(Field):
 
 
 def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
-    """Returns the coherent field of a scene; None, and a warning, where there is no mesh that it could use."""
+    """Returns the coherent field of a scene, or None with a warning if the scene has no mesh that it could use."""
     try:
         return WaveField.build(config, scene, seed)
     except UserError as why:
-        reason = str(why).split(";")[0]  # what to do about it is for those who asked for a coherent field
-        warnings.warn(f"the hybrid field is its wideband half alone: {reason}", stacklevel=1)  # of this line: it is said once
+        reason = str(why).split(";")[0]  # without the advice, which is meant for `--field wave`
+        # The stack level is that of this line, so that the warning appears once.
+        warnings.warn(f"the hybrid field uses its wideband component only: {reason}", stacklevel=1)
         return None
 
 
 def _informed(batch: Batch) -> Bool[Array, "b 1 1"]:
-    """Returns for which links the splatting field is to see what the coherent one says: half of them, drawn anew in each step,
-    and the same ones however many devices divide the batch."""
+    """Returns the links for which the splatting field is conditioned on the coherent one: half of them, drawn anew in each
+    step, and independent of the number of devices that share the batch."""
 
     def drawn(tx: Any, frequency_hz: Any) -> Any:
         key = jax.random.fold_in(batch.key, tx)

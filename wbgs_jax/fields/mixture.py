@@ -1,29 +1,29 @@
-"""How far three opinions are to be trusted, query by query, learned from links that nothing was trained on: the coherent
-field's, the splatting field's own, and the splatting field's that has seen the first.
+"""Mixture of three experts with weights for every query, fitted to links that were not used for training: the coherent field
+("coherent"), the unconditioned splatting field ("own"), and the splatting field conditioned on the coherent one ("informed").
 
     first = a coherent + (1 - a) own        all = b first + (1 - b) informed
 
-The coherent and the own opinion err in different places; the informed one knows what the mesh lacks, but errs where the
-coherent one does. Each share is
+The coherent and the unconditioned expert err in different places; the conditioned expert has learned what the mesh lacks, but
+errs where the coherent one does. Each weight is
 
     share = sigmoid(bias + weights . z)
 
-with z what is known beforehand and tells where phases fail: the frequency, how much the two fields disagree, how far below free
-space the transmitter is received (deep in the shadow many weak paths add up, and some are missing), how bright either spectrum
-is. The weights are those by which validation links are explained best; they are zero unless, on transmitters left out a fifth
-at a time, they do better than one common share by more than a standard error.
+with features z that are available without observations and indicate where phases fail: the frequency, the disagreement of the
+two fields, the received power relative to free space (in deep shadow many weak paths add up, some of which are missing), and
+the brightness of both spectra. The coefficients are those that fit validation links best; they are zero unless, in five-fold
+cross-validation over transmitters, they improve on a common weight by more than a standard error.
 
-Noise of observations: what it does to their spectra, and how much of it fields have learned.
+This module also estimates the noise floor of observed spectra, and how much of it fields have learned.
 
 White noise n of an array of N elements makes the spectrum of y = h + n brighter than that of the channel h where that is dark:
 
     E |a^H y|^2 = |a^H h|^2 + N sigma^2
 
-A field that is trained on such spectra learns this floor, one that adds up paths cannot. The floor is taken out of what the
-one says, since the channel is asked for, and added where either is compared with observations to learn from that
-(`as_observed`). How high it is nobody says, but both tell: spectra of paths are most like the observed ones if the right floor
-is added, or a higher one if paths are missing; learned spectra are hardly anywhere darker than the floor, and less like them if
-they are raised to a higher one.
+A field that is trained on such spectra learns this floor; one that sums over paths cannot. The floor is removed from the
+predictions of the former, since queries are for the channel, and added wherever predictions are compared with observations
+(`as_observed`). Its level is unknown, but can be estimated from both: spectra of paths are most similar to the observed ones if
+the right floor is added, or a higher one if paths are missing; learned spectra are hardly anywhere darker than the floor, and
+become less similar if they are raised to a higher one.
 """
 
 from collections.abc import Callable
@@ -44,43 +44,45 @@ from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
 from wbgs_jax.types import Links, Query
 
 SHARES = np.linspace(0, 1, 21)
-"""Shares of the first of two opinions that links are scored at."""
+"""Weights of the first of two experts at which links are scored."""
 FEATURES = 7
+"""Number of features z of a query."""
 FOLDS = 5
+"""Folds of the cross-validation over transmitters."""
 RIDGE = 5e-3
-"""Penalty on the squared weights, in the unit of the scores' spread over shares."""
+"""Penalty on the squared coefficients, relative to the range of the scores over the weights."""
 STEPS, RATE = 400, 0.03
-"""Of Adam, which finds the weights."""
+"""Steps and learning rate of Adam, which fits the coefficients."""
 BLOCK = 48
-"""Spectra that are compared at once."""
+"""Number of spectra that are compared at once."""
 FAINTEST_DB = 60.0
-"""Received powers are told apart down to so many decibels below free space."""
+"""Received powers are clipped at this number of decibels below free space."""
 
 
 @pytree
 class Share:
-    """The logit of a share: linear in the features."""
+    """A mixture weight whose logit is linear in the features."""
 
     bias: Float[Array, ""]
     weights: Float[Array, " features"]
     mean: Float[Array, " features"]
-    """Of the features over the links that it was learned from ..."""
+    """Mean of the features over the links that it was fitted to."""
     scale: Float[Array, " features"]
-    """... and their standard deviation."""
+    """Standard deviation of the features over these links."""
 
 
 @pytree
 class Shares:
-    """Of three opinions."""
+    """Mixture weights of three experts."""
 
     coherent: Share
-    """Of the coherent field, the rest is the splatting field's own opinion ..."""
+    """Weight of the coherent field; the remainder is that of the unconditioned splatting field."""
     uninformed: Share
-    """... and of these two together, the rest is its informed one."""
+    """Weight of these two together; the remainder is that of the conditioned splatting field."""
 
 
 class Opinions(NamedTuple):
-    """What B links are said to be: spectra, or powers in decibels."""
+    """Predictions of three experts for B links: spectra, or received powers in decibels."""
 
     coherent: Any
     own: Any
@@ -89,50 +91,49 @@ class Opinions(NamedTuple):
 
 @runtime_checkable
 class Mixing(Protocol):
-    """A field that mixes three opinions by shares that are found after its training."""
+    """A field that mixes three experts with weights that are fitted after its training."""
 
     def opinions(
         self, params: Params, plan: Any, links: Query | Links
     ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
-        """Returns what spectra and powers of B links are said to be, and what tells whom to trust."""
+        """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on."""
         ...
 
     def with_shares(
         self, params: Params, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0
     ) -> Any:
-        """Returns parameters with other shares, where they are given, and another floor that noise has put under spectra."""
+        """Returns parameters with other mixture weights, where given, and another noise floor of spectra."""
         ...
 
 
 class Scored(NamedTuple):
-    """What some links say."""
+    """Links with the scores of mixtures, to which weights are fitted."""
 
     features: Float[np.ndarray, "n features"]
     scores: Float[np.ndarray, "n shares"]
-    """What every share of `SHARES` is worth on each link: the larger, the better."""
+    """Score of every weight of `SHARES` on each link; larger is better."""
     tx_index: Int[np.ndarray, " n"]
 
 
 def constant(share: float) -> Share:
-    """Returns the same share for all queries."""
+    """Returns a weight that is the same for all queries, clipped to 0.001..0.999."""
     share = min(max(share, 1e-3), 1 - 1e-3)
-    weights, mean = jnp.zeros(FEATURES), jnp.zeros(FEATURES)  # two arrays: training gives every one away once
+    weights, mean = jnp.zeros(FEATURES), jnp.zeros(FEATURES)  # two arrays: training donates each of them once
     return Share(jnp.asarray(np.log(share / (1 - share)), jnp.float32), weights, mean, jnp.ones(FEATURES))
 
 
 def at_first() -> Shares:
-    """Returns the shares by which the coherent field counts half, and each opinion of the splatting one a quarter."""
+    """Returns the initial weights: 1/2 for the coherent field, 1/4 for each of the other experts."""
     return Shares(constant(2 / 3), constant(3 / 4))
 
 
 def coherent_alone() -> Shares:
-    """Returns the shares by which the coherent field alone counts, within a few thousandths."""
+    """Returns weights of the coherent field alone, within a few thousandths."""
     return Shares(constant(1.0), constant(1.0))
 
 
 def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[str, Any]:
-    """Returns, for reports, how much each opinion counts on average over N links, and whether that differs from query to
-    query."""
+    """Returns, for reports, the mean weight of each expert over N links, and whether weights differ between queries."""
     first, both = (np.asarray(share_of(share, jnp.asarray(features))) for share in (shares.coherent, shares.uninformed))
     means = {"coherent": first * both, "own": (1 - first) * both, "informed": 1 - both}
     by_query = bool(np.any(shares.coherent.weights) or np.any(shares.uninformed.weights))
@@ -140,13 +141,13 @@ def reported(shares: Shares, features: Float[np.ndarray, "n features"]) -> dict[
 
 
 def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array, " b"]:
-    """Returns the share, 0 to 1, that the first of two opinions has in B queries."""
+    """Returns the weight, 0 to 1, of the first of two experts for B queries."""
     scaled = (features - share.mean) / share.scale
     return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
 
 
 def mixed(shares: Shares, features: Float[Array, "b features"], said: Opinions) -> Any:
-    """Returns what three opinions come to for B queries."""
+    """Returns the mixture of three experts for B queries."""
     first = _mix(share_of(shares.coherent, features), said.coherent, said.own)
     return _mix(share_of(shares.uninformed, features), first, said.informed)
 
@@ -159,7 +160,14 @@ def _mix(share: Float[Array, " b"], one: Any, other: Any) -> Any:
 def features(
     query: Query, rx_position: Float[Array, "3"], coherent: Observation, own: Observation
 ) -> Float[Array, "b features"]:
-    """Returns what tells how far the coherent field is right for B queries, beside the splatting field's own opinion."""
+    """Returns the features z of B queries, which indicate the accuracy of the coherent field relative to the unconditioned
+    splatting field.
+
+    Args:
+        query: B queries.
+        rx_position: world frame, metres.
+        coherent, own: predictions of the two fields.
+    """
     octave = jnp.log2(query.frequency_hz / 1e10)
     link = query.tx_position, rx_position, query.frequency_hz
     beyond = [
@@ -176,20 +184,22 @@ def features(
 def learn_shares(
     told: Float[np.ndarray, "n features"], tx_index: Int[np.ndarray, " n"], said: Opinions, worth: Callable[[Any, Any], Any]
 ) -> Shares:
-    """Returns the shares that explain N links best (host), one after the other; `worth(one, other)` returns the score on each
-    link of every mixture of two opinions, by the share (`SHARES`) of the first: (n, shares)."""
+    """Returns the weights that fit N links best (host), fitted one after the other. `told` are the features of the links, and
+    `said` the predictions of the experts; `worth(one, other)` returns the scores (n, shares) of the mixtures of two experts on
+    each link, for all weights (`SHARES`) of the first."""
     coherent = learn_share(Scored(told, worth(said.coherent, said.own), tx_index))
     first = np.asarray(_mix(share_of(coherent, jnp.asarray(told)), jnp.asarray(said.coherent), jnp.asarray(said.own)))
     return Shares(coherent, learn_share(Scored(told, worth(first, said.informed), tx_index)))
 
 
 def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
-    """Returns the SSIM of every mixture of two spectra."""
+    """Returns the SSIM of the mixtures of two spectra with all weights of `SHARES`."""
     return in_blocks(_ssim_of_mixtures, one, other, truth)
 
 
 def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
-    """Returns what a function says of N spectra, or of several beside each other; few are on the device at once."""
+    """Returns the values of a function of N spectra, evaluated in blocks to limit device memory; several arrays of spectra are
+    passed together."""
     blocks = [slice(start, start + BLOCK) for start in range(0, len(spectra[0]), BLOCK)]
     return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
 
@@ -200,13 +210,15 @@ def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> 
 
 
 def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
-    """Returns the negative error (dB) of every mixture of two powers; 0 where nothing was heard."""
-    said = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
-    return np.where((heard_db > NOT_HEARD_DB)[:, None], -np.abs(said - heard_db[:, None]), 0)
+    """Returns the negative absolute error (dB) of the mixtures of two received powers with all weights of `SHARES`; 0 for links
+    on which nothing was received."""
+    mixtures = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
+    return np.where((heard_db > NOT_HEARD_DB)[:, None], -np.abs(mixtures - heard_db[:, None]), 0)
 
 
 def learn_share(known: Scored) -> Share:
-    """Returns the share that explains links best (host): one for all, unless the features surely improve on it."""
+    """Returns the weight that fits links best (host): the same for all, unless the features improve on it by more than a
+    standard error in cross-validation."""
     common = constant(_best(known.scores))
     folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
     if len(np.unique(known.tx_index)) < 2 * FOLDS:
@@ -229,7 +241,7 @@ def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
 
 
 def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the score at a share between those that were tried."""
+    """Returns the score at a weight, interpolated linearly between those of `SHARES`."""
     place = share * (len(SHARES) - 1)
     low = jnp.clip(place.astype(jnp.int32), 0, len(SHARES) - 2)
     left, right = (jnp.take_along_axis(scores, (low + step)[:, None], 1)[:, 0] for step in (0, 1))
@@ -237,7 +249,7 @@ def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Flo
 
 
 def _fit(known: Scored) -> Share:
-    """Returns the weights that make the mean score largest, standardised and shrunk towards none."""
+    """Returns the coefficients with the largest mean score, for standardised features and with a ridge penalty."""
     start = constant(min(max(_best(known.scores), 0.05), 0.95))
     mean, scale = known.features.mean(0), known.features.std(0)
     used = scale > 1e-6
@@ -251,7 +263,7 @@ def _fit(known: Scored) -> Share:
 def _ascend(
     start: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"], used: Bool[Array, " features"]
 ) -> Share:
-    """Maximises the mean score by Adam: a smooth function of eight numbers."""
+    """Maximises the mean score, a smooth function of eight numbers, by Adam."""
 
     def with_learned(learned: tuple[Array, Array]) -> Share:
         return Share(learned[0], learned[1] * used, start.mean, start.scale)
@@ -275,44 +287,45 @@ def _ascend(
 
 
 LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
-"""Floors that are tried, as shares of the largest square of a spectrum: of less, spectra show hardly anything."""
+"""Floors that are tried, relative to the largest square of a spectrum; lower ones are hardly visible in spectra."""
 SURE = 2.0
-"""Standard errors over transmitters that spectra have to be more alike with a floor ..."""
+"""Improvement of the similarity by a floor that is significant, in standard errors over transmitters."""
 HARMLESS = 1.0
-"""... and that they may be less so where learned ones are raised to it."""
+"""Loss of similarity that is accepted when learned spectra are raised to the floor, in standard errors over transmitters."""
 DARKEST = 0.05
-"""Share of the pixels of learned spectra that may be darker than the floor."""
+"""Fraction of the pixels of learned spectra that may be darker than the floor."""
 FEWEST_TX = 10
-"""Transmitters of which less is no evidence."""
+"""Minimum number of transmitters for an estimate."""
 COMPARED = 240
-"""Spectra that are looked at."""
+"""Maximum number of spectra that are compared."""
 
 
 def with_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
-    """Returns spectra as noise lets them appear; `floor` is N sigma^2 / max |a^H h|^2."""
+    """Returns spectra with a noise floor; `floor` is N sigma^2 / max |a^H h|^2."""
     return jnp.sqrt((pas**2 + floor) / (1 + floor))
 
 
 def without_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
-    """Returns spectra without what noise has added; of what is darker than the floor nothing remains."""
+    """Returns spectra without their noise floor; pixels darker than the floor become 0."""
     square = (1 + floor) * pas**2 - floor
     dark = square <= 0  # the root has no gradient at 0
     return jnp.where(dark, 0, jnp.sqrt(jnp.where(dark, 1, square)))
 
 
 def at_least_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | float) -> Float[Array, "b 90 360"]:
-    """Returns spectra that are nowhere darker than the floor: what taking it out and adding it again comes to."""
+    """Returns spectra that are raised to the floor wherever they are darker, which is the result of removing the floor and
+    adding it again."""
     return jnp.maximum(pas, jnp.sqrt(floor / (1 + floor)))
 
 
 def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: Int[np.ndarray, " n"]) -> float:
-    """Returns the floor that noise puts under N observed spectra (host): the lowest of three accounts; 0 unless the coherent
-    field's spectra, which know no noise, are surely more like the observed ones with it.
+    """Returns the noise floor of N observed spectra (host): the lowest of three estimates; 0 unless the spectra of the coherent
+    field, which are free of noise, are significantly more similar to the observed ones with it.
 
     Args:
-        said: of the links, with the floor in what has been learned.
-        observed: spectra.
-        tx_index: their transmitters, which are what was drawn.
+        said: predictions of the experts; those of the splatting field include the floor.
+        observed: observed spectra.
+        tx_index: their transmitters, which are the independent samples.
     """
     looked = np.random.default_rng(0).permutation(np.flatnonzero(_met(said)))[:COMPARED]
     unaware, learned, observed, tx_index = said.coherent[looked], said.informed[looked], observed[looked], tx_index[looked]
@@ -330,21 +343,22 @@ def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: 
 
 
 def observed_opinions(said: Opinions, floor: float) -> Opinions:
-    """Returns opinions as they would be observed, had those that have learned the floor been without it (host)."""
+    """Returns spectra of the experts as they would be observed if the floor were first removed from those that have learned it
+    and then added to all (host)."""
     own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in said[1:])
     coherent = jnp.where(_met(said)[:, None, None], with_floor(jnp.asarray(said.coherent), floor), own)
     return Opinions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
 
 
 def _met(said: Opinions) -> Bool[np.ndarray, " n"]:
-    """Returns on which links the coherent field has an opinion of its own."""
+    """Returns the links for which the coherent field has a prediction of its own."""
     return np.asarray((said.coherent != said.own).any((-2, -1)))
 
 
 def _alike(
     change: Callable[..., Array], said: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
 ) -> Float[Array, "b levels"]:
-    """Returns how like the observed spectra others are when every floor has changed them."""
+    """Returns the similarity (SSIM) to the observed spectra of others that are changed by each floor of `LEVELS`."""
     return jax.lax.map(lambda floor: ssim(change(said, floor), observed), jnp.asarray(LEVELS, said.dtype)).T
 
 

@@ -1,11 +1,12 @@
-"""A NeRF2-style volume (Zhao et al., MobiCom 2023) as a baseline: ray marching from the receiver, frequency as another input.
+"""A NeRF2-style volume (Zhao et al., MobiCom 2023) as a baseline: ray marching from the receiver, with the frequency as an
+additional input.
 
     h, sigma = F(P(x), f)                  the attenuation network, at samples x of the ray in direction w
-    Sig      = G(h, w, P(TX), f)           the radiance network: what x, as a new source, sends to the receiver
+    Sig      = G(h, w, P(TX), f)           the radiance network: emission of x, as a new source, towards the receiver
     PAS(w)   = sum_s T_s alpha_s Sig_s     alpha_s = 1 - exp(-sigma_s d),  T_s = prod_{j<s} (1 - alpha_j)
 
-That is their equation of tracing rays with the phase left out, as everything here is trained on powers. It trains on sampled
-directions, the same ones for all spectra of a batch: whatever does not depend on the query is then evaluated once.
+That is their ray tracing equation without the phase, since all fields here are trained on powers. It is trained on sampled
+directions, which are the same for all spectra of a batch: parts that do not depend on the query are then evaluated once.
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from wbgs_jax.types import Batch, Links, Query, Receiver, Scene, check_query, ch
 
 PIXELS = PAS_HEIGHT * PAS_WIDTH
 MIN_LENGTH = 1e-3
-"""Metres: shorter rays are taken to be this long."""
+"""Minimum length of a ray, metres."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +43,17 @@ class Nerf2Config:
     """Settings of the NeRF2-style volume."""
 
     samples: int = 24
-    """Samples of a ray between the receiver and the end of the scene's box."""
+    """Number of samples of a ray between the receiver and the end of the scene's box."""
     directions: int = 192
-    """Directions (pixels) of every spectrum that a training step looks at."""
+    """Number of directions (pixels) of every spectrum that a training step uses."""
     width: int = 64
-    """Units of the attenuation network's layers (authors: 256)."""
+    """Units per layer of the attenuation network (authors: 256)."""
     depth: int = 4
-    """Layers of the attenuation network (authors: 8); the frequency enters the last one."""
+    """Number of layers of the attenuation network (authors: 8); the frequency enters the last one."""
     skip: int = 2
-    """The layer at which the place enters again (authors: 4)."""
+    """Layer at which the position enters again (authors: 4)."""
     radiance_widths: tuple[int, ...] = (64, 32)
-    """Units of the radiance network's layers."""
+    """Units of each layer of the radiance network."""
     point_octaves: int = 6
     """Octaves of P(x) (authors: 10)."""
     direction_octaves: int = 2
@@ -60,20 +61,20 @@ class Nerf2Config:
     tx_octaves: int = 4
     """Octaves of P(TX) (authors: 10)."""
     frequency_octaves: int = 0
-    """Octaves of the frequency encoding, beyond its logarithm itself."""
+    """Octaves of the frequency encoding, in addition to the logarithm itself."""
     relative: bool = True
-    """Also encode the TX relative to the place, the direction and the receiver array, as the wideband field does."""
+    """Also encode the TX relative to the position, the direction and the receiver array, as the wideband field does."""
     pixel_loss: Literal["l1", "l2"] = "l1"
-    """Mean absolute or squared error of the sampled pixels, which make no image and have no SSIM."""
+    """Mean absolute ("l1") or squared ("l2") error of the sampled pixels, which do not form an image and have no SSIM."""
     network_optimizer: Optimizer = "muon"
-    """What moves the networks' matrices (`base.Group`; authors: Adam)."""
+    """Optimiser of the networks' matrices (`base.Group`; authors: Adam)."""
     network_lr: float = 1e-2
     """Learning rate of the networks (authors: 5e-4)."""
     network_weight_decay: float = 0.0
     """Decoupled weight decay of the networks."""
 
     def check(self, name: str) -> None:
-        """Raises a `UserError` for settings that cannot work, of the field of this name."""
+        """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
         counts = {option: getattr(self, option) for option in ("samples", "directions", "width", "depth")}
         check_positive({f"{name}.{option}": n for option, n in counts.items()})
         check_positive({f"{name}.radiance-widths": min(self.radiance_widths, default=0)})
@@ -88,24 +89,24 @@ CONFIGS = {
     "gpu": Nerf2Config(samples=64, directions=1024, width=256, depth=8, skip=4, radiance_widths=(256, 128)),
 }
 Weights = dict[str, Any]
-"""What is trained: the two networks."""
+"""Trained weights of the two networks."""
 
 
 @pytree
 class Rays:
-    """Straight lines from the receiver to the end of the box."""
+    """Straight lines from the receiver to the boundary of the box."""
 
     local: Float[Array, "r 3"]
-    """Unit directions in the receiver's frame ..."""
+    """Unit directions in the receiver's frame."""
     world: Float[Array, "r 3"]
-    """... and in the world's."""
+    """Unit directions in the world frame."""
     length: Float[Array, " r"]
-    """Metres."""
+    """Lengths, metres."""
 
 
 @pytree
 class Nerf2Plan:
-    """What is independent of the query: the rays of all pixels, row by row. No parameter is frozen in it."""
+    """Everything that is independent of the query: the rays of all pixels, row by row. It contains no parameters."""
 
     rays: Rays
     receiver: Receiver
@@ -116,10 +117,10 @@ class Nerf2Plan:
 @register
 @pytree
 class Nerf2Field(Field):
-    """The volume that is filled by the networks."""
+    """A volume represented by the networks."""
 
     box: Float[Array, "2 3"]
-    """Smallest and largest coordinates of the scene, metres: rays end there."""
+    """Smallest and largest coordinates of the scene, metres; rays end at this box."""
     config: Nerf2Config = static()
 
     name: ClassVar[str] = "nerf2"
@@ -127,11 +128,11 @@ class Nerf2Field(Field):
 
     @classmethod
     def build(cls, config: Nerf2Config, scene: Scene, seed: int) -> "Nerf2Field":
-        """Returns the field that fills the box of a scene."""
+        """Returns the field over the box of a scene."""
         return cls(jnp.asarray(scene.box, jnp.float32), config)
 
     def init(self, key: Key[Array, ""]) -> Weights:
-        """Returns networks of random weights."""
+        """Returns random weights of the networks."""
         return _init(self, key)
 
     def plan(self, params: Weights, receiver: Receiver, prepared: None = None, capacity: None = None) -> Nerf2Plan:
@@ -151,8 +152,8 @@ class Nerf2Field(Field):
     def loss(
         self, params: Weights, prepared: None, batch: Batch, capacity: None = None, probe: None = None
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the loss of some pixels of a batch, drawn with the step's key, the same ones in all of its spectra."""
-        assert batch.pas is not None, "spectra are what it is trained on"
+        """Returns the loss of random pixels of a batch, drawn with the step's key and the same for all of its spectra."""
+        assert batch.pas is not None, "this field is trained on spectra only"
         pixels = choose_pixels(batch.key, self.config.directions)
         local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)[pixels]
         truth = batch.pas.reshape(batch.pas.shape[0], -1)[:, pixels]
@@ -162,14 +163,14 @@ class Nerf2Field(Field):
 
     @classmethod
     def param_groups(cls, config: Nerf2Config, params: Weights | None = None) -> tuple[dict[str, Group], Any]:
-        """Returns one group, the networks."""
+        """Returns a single group, that of the networks."""
         group = Group(config.network_lr, config.network_optimizer, config.network_weight_decay, eps=1e-8)
         return {"all": group}, super().param_groups(config, params)[1]
 
 
 @jax.jit
 def _init(field: Nerf2Field, key: Key[Array, ""]) -> Weights:
-    """Returns initial weights; the inputs matter by their shapes only."""
+    """Returns initial weights; only the shapes of the inputs matter."""
     box = field.box
     receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), jnp.zeros(2))
     rays = make_rays(box, receiver, jnp.array([[0.0, 0.0, 1.0]]))
@@ -184,7 +185,13 @@ def _init(field: Nerf2Field, key: Key[Array, ""]) -> Weights:
 
 
 def make_rays(box: Float[Array, "2 3"], receiver: Receiver, local: Float[Array, "r 3"]) -> Rays:
-    """Returns rays in unit directions of the receiver's frame, as long as they stay in the box (metres)."""
+    """Returns rays from the receiver to the boundary of a box.
+
+    Args:
+        box: smallest and largest coordinates, metres.
+        receiver: receiver.
+        local: unit directions in the receiver's frame.
+    """
     world = jnp.matmul(local, rotation_matrix(receiver.orientation).T, precision=EXACT)
     ahead = jnp.where(world > 0, box[1], box[0]) - receiver.position
     parallel = jnp.abs(world) < 1e-9
@@ -193,7 +200,7 @@ def make_rays(box: Float[Array, "2 3"], receiver: Receiver, local: Float[Array, 
 
 
 def render(params: Weights, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90 360"]:
-    """Returns the power angular spectra of B queries, a row of the image at a time: in a gradient, too, one row is held in
+    """Returns the power angular spectra of B queries, one image row at a time, so that also a gradient holds only one row in
     memory."""
     check_query(query)
     rows = jax.tree.map(lambda a: a.reshape(PAS_HEIGHT, PAS_WIDTH, *a.shape[1:]), plan.rays)
@@ -202,15 +209,15 @@ def render(params: Weights, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90
 
 
 def choose_pixels(key: Key[Array, ""], count: int) -> Int[Array, " r"]:
-    """Returns flat indices of random pixels, one out of each of `count` equal stretches of the image, row by row."""
+    """Returns flat indices of random pixels, one from each of `count` equal segments of the image, row by row."""
     places = (jnp.arange(count) + jax.random.uniform(key, (count,))) * (PIXELS / count)
     return jnp.minimum(places.astype(jnp.int32), PIXELS - 1)
 
 
 def march(params: Weights, plan: Nerf2Plan, rays: Rays, query: Query) -> Float[Array, "r b"]:
-    """Returns what arrives along every ray for every query."""
+    """Returns the accumulated signal along every ray for every query."""
     attenuation, radiance = _networks(plan.config)
-    with jax.default_matmul_precision("highest"):  # along a ray TF32 adds up: on an H100 its gradient is off by 17 %
+    with jax.default_matmul_precision("highest"):  # errors of TF32 add up along a ray: 17 % of the gradient on an H100
         outputs: Any = attenuation.apply(params["attenuation"], *_place_inputs(plan, rays, query))
         hidden, sigma = outputs
         logits: Any = radiance.apply(params["radiance"], [hidden, *_source_inputs(plan, rays, query)])
@@ -220,31 +227,31 @@ def march(params: Weights, plan: Nerf2Plan, rays: Rays, query: Query) -> Float[A
 
 
 def accumulate(depth: Float[Array, "r s b"], signal: Float[Array, "r s b"]) -> Float[Array, "r b"]:
-    """Returns sum_s T_s alpha_s Sig_s, front to back, with optical depths sigma_s d of the samples."""
+    """Returns sum_s T_s alpha_s Sig_s, front to back, from the optical depths sigma_s d of the samples."""
     behind = jnp.cumsum(depth, 1)
     weight = jnp.exp(depth - behind) * -jnp.expm1(-depth)
     return jnp.sum(weight * signal, 1)
 
 
 def _networks(config: Nerf2Config) -> tuple[AttenuationNetwork, RadianceNetwork]:
-    """Returns both networks. The frequency enters the last layer of the attenuation network: those before it are evaluated once
-    for all queries."""
+    """Returns both networks. The frequency enters the last layer of the attenuation network; the layers before it are evaluated
+    once for all queries."""
     attenuation = AttenuationNetwork(config.width, config.depth, config.skip, fusion=config.depth - 1)
     return attenuation, RadianceNetwork(config.radiance_widths)
 
 
 def _half_extent(box: Float[Array, "2 3"]) -> Float[Array, ""]:
-    """Returns the length (metres) that the networks' inputs count in."""
+    """Returns the unit of length of the networks' inputs, metres."""
     return jnp.max(box[1] - box[0]) / 2
 
 
 def _scaled(plan: Nerf2Plan, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns world positions as network inputs of about -1..1."""
+    """Returns world positions scaled to about -1..1 for the networks."""
     return (points - plan.box.mean(0)) / _half_extent(plan.box)
 
 
 def _points(plan: Nerf2Plan, rays: Rays) -> Float[Array, "r s 3"]:
-    """Returns the middles of equal stretches of every ray, world frame, metres."""
+    """Returns the midpoints of equal segments of every ray, world frame, metres."""
     samples = plan.config.samples
     distances = (jnp.arange(samples) + 0.5) / samples * rays.length[:, None]
     return plan.receiver.position + rays.world[:, None] * distances[..., None]
@@ -257,14 +264,14 @@ def _frequency(plan: Nerf2Plan, query: Query) -> Float[Array, "1 1 b _"]:
 def _place_inputs(
     plan: Nerf2Plan, rays: Rays, query: Query
 ) -> tuple[list[Float[Array, "r s 1 _"]], list[Float[Array, "1 1 b _"]]]:
-    """Returns the inputs of the attenuation network: those of the place, and the frequency."""
+    """Returns the inputs of the attenuation network: the encoded position, and the frequency."""
     encoded = positional_encoding(_scaled(plan, _points(plan, rays)), plan.config.point_octaves)
     return [encoded[:, :, None]], [_frequency(plan, query)]
 
 
 def _source_inputs(plan: Nerf2Plan, rays: Rays, query: Query) -> list[Float[Array, "_ _ b_or_1 _"]]:
-    """Returns the inputs of the radiance network besides h: direction, transmitter, frequency and, if asked for, how they
-    lie."""
+    """Returns the inputs of the radiance network in addition to h: direction, transmitter, frequency and, with
+    `Nerf2Config.relative`, relative positions."""
     config = plan.config
     direction = positional_encoding(rays.world, config.direction_octaves)[:, None, None]
     tx = positional_encoding(_scaled(plan, query.tx_position), config.tx_octaves)[None, None]
@@ -273,11 +280,9 @@ def _source_inputs(plan: Nerf2Plan, rays: Rays, query: Query) -> list[Float[Arra
 
 
 def _relative_inputs(plan: Nerf2Plan, rays: Rays, query: Query) -> list[Float[Array, "_ _ b _"]]:
-    """Returns what the wideband field knows of transmitter, place and receiver too (`WidebandConfig.relative`).
-
-    Of a direction: its angle to the TX and the array's response to the TX there. Of a place: the cosine of the bounce, and
-    distance and direction to the TX.
-    """
+    """Returns the relative inputs that the wideband field has as well (`WidebandConfig.relative`): for every direction the
+    cosine of its angle to the TX and the array's response to the TX there; for every position the cosine of the angle of
+    reflection, and distance and direction to the TX."""
     receiver = plan.receiver
     to_tx = to_local(query.tx_position - receiver.position, receiver.orientation)
     to_tx = to_tx / smooth_length(to_tx)

@@ -4,11 +4,11 @@
     radiance network     (h, f)           -> Sig
     power network        (mean of h, P(TX), f) -> received power relative to free space
 
-A layer whose input is a concatenation of parts that depend on the Gaussian only, on the query only, or on both is evaluated
-part by part and added: the same function as a dense layer on the concatenation, without forming it N x B times. What depends
-on the Gaussian only can be evaluated once for all queries (`AttenuationNetwork.gaussian_sums`).
+If the input of a layer is a concatenation of parts that depend on the Gaussian only, on the query only, or on both, the layer
+is evaluated part by part and the results are added: the same function as a dense layer on the concatenation, without forming it
+N x B times. Parts that depend on the Gaussian only can be evaluated once for all queries (`AttenuationNetwork.gaussian_sums`).
 
-Positional and frequency encodings of the EM feature networks (paper, section 4.2).
+The module also contains the positional and frequency encodings of these networks (paper, section 4.2).
 """
 
 import math
@@ -25,19 +25,19 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.types import MAX_FREQUENCY_HZ, MIN_FREQUENCY_HZ
 
 Parts = Sequence[Float[Array, "... _"]]
-"""Inputs of broadcastable shapes, (N or 1, B or 1, features), or of more axes."""
+"""Inputs of broadcastable shapes, (N or 1, B or 1, features), possibly with more axes."""
 GaussianSums = tuple[Float[Array, "... width"], Float[Array, "... width"] | None]
-"""What layers `fusion` and `skip` (None if it is no later one) add up before the query enters."""
+"""Sums of layers `fusion` and `skip` before the query enters; the second is None unless `skip` is after `fusion`."""
 Precision = Literal["device", "float32", "tf32", "bfloat16"]
-"""Of the numbers that layers multiply; sums are of float32. "device": TF32 on GPUs that have it, else float32."""
+"""Precision of the factors in products; sums are float32. "device" means TF32 on GPUs that support it, else float32."""
 TF32_BITS = 8, 10
-"""Of exponent and mantissa."""
+"""Bits of exponent and mantissa."""
 
 
 def product(a: Any, b: Any, dimension_numbers: Any, precision: Precision = "device") -> Any:
-    """Returns `lax.dot_general` of float32 arrays, which are rounded to a precision, and so are gradients on their way back.
+    """Returns `lax.dot_general` of float32 arrays rounded to a precision; gradients are rounded in the same way.
 
-    On a device with no such products they are computed of rounded numbers: as exact as there, and no faster.
+    A device without such products computes float32 products of the rounded numbers: the same accuracy without gain in speed.
     """
     if precision == "bfloat16":
         a, b = a.astype(jnp.bfloat16), b.astype(jnp.bfloat16)
@@ -65,15 +65,19 @@ class PartwiseDense(nn.Module):
     ) -> Float[Array, "... features"]:
         """Returns the bias plus the products of all parts with their kernels.
 
-        A layer whose weights are known can be summed in several calls: `parts` are then its inputs number `first`, `first` + 1,
-        ..., and `total` the sum so far, bias included.
+        An initialised layer can be summed in several calls.
+
+        Args:
+            parts: inputs number `first`, `first` + 1, ... of the layer.
+            first: number of the first input.
+            total: sum of previous calls, including the bias; None to begin with the bias.
         """
         init = nn.initializers.normal(stddev=(2.0 / sum(part.shape[-1] for part in parts)) ** 0.5)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
         summed: Any = bias if total is None else jnp.asarray(total)
         for i, part in enumerate(parts, first):
             kernel = self.param(f"kernel_{i}", init, (part.shape[-1], self.features), jnp.float32)
-            # On two axes: XLA's CPU backend takes the kernel's gradient three times faster than on three.
+            # Two axes: XLA's CPU backend computes the kernel's gradient three times faster than with three.
             flat = part.reshape(-1, part.shape[-1])
             added = product(flat, kernel.astype(part.dtype), (((1,), (0,)), ((), ())), self.precision)
             summed = summed + added.reshape(*part.shape[:-1], self.features)
@@ -81,11 +85,12 @@ class PartwiseDense(nn.Module):
 
 
 class AttenuationNetwork(nn.Module):
-    """(P(G), P(TX), f) -> (h, delta_f). Inputs re-enter before layer `skip`, as in the authors' code and NeRF.
+    """The network (P(G), P(TX), f) -> (h, delta_f). Inputs re-enter before layer `skip`, as in the authors' code and NeRF.
 
-    The query enters at layer `fusion`: layers before it see the Gaussian alone and cost N instead of N x B evaluations. At 0
-    it is the paper's network. Calling it evaluates it layer by layer, which makes its weights and is the reference;
-    `gaussian_sums` and `of_queries` are the same in two steps, the first of which does not depend on the query.
+    The query enters at layer `fusion`: the layers before it depend on the Gaussian only and need N instead of N x B
+    evaluations. With `fusion` 0 it is the paper's network. `__call__` evaluates it layer by layer, which initialises the
+    weights and serves as the reference; `gaussian_sums` and `of_queries` compute the same in two steps, the first of which does
+    not depend on the query.
     """
 
     width: int
@@ -93,12 +98,12 @@ class AttenuationNetwork(nn.Module):
     skip: int
     fusion: int = 0
     heads: int = 1
-    """Values instead of delta_f alone, along a further axis if there are several."""
+    """Number of outputs; more than one are returned along an additional last axis."""
     precision: Precision = "device"
 
     def setup(self) -> None:
         self.layers = [PartwiseDense(self.width, self.precision, name=f"PartwiseDense_{i}") for i in range(self.depth)]
-        # Zero at the start: the final attenuation begins as delta_o, and delta_f learns a correction (paper, section 4.5).
+        # Initially zero: the final attenuation starts as delta_o, and delta_f learns a correction (paper, section 4.5).
         zeros, multiply = nn.initializers.zeros_init(), _dense(self.precision)
         self.head = nn.Dense(self.heads, kernel_init=zeros, dot_general=multiply, name="Dense_0")
 
@@ -113,7 +118,7 @@ class AttenuationNetwork(nn.Module):
         return hidden[0], _values(self.head(hidden[0]))
 
     def gaussian_sums(self, gaussian: Parts) -> GaussianSums:
-        """Returns what the Gaussians alone decide: P(G) of shape (N, 1, features) gives sums of shape (N, 1, width)."""
+        """Returns the sums that depend on the Gaussians only, of shape (N, 1, width), from P(G) of shape (N, 1, features)."""
         hidden: list[Float[Array, "... _"]] = []
         for layer in range(self.fusion):
             hidden = [nn.relu(self.layers[layer](hidden + self._gaussian_inputs(layer, gaussian)))]
@@ -125,7 +130,13 @@ class AttenuationNetwork(nn.Module):
     def of_queries(
         self, sums: GaussianSums, query: Parts, gaussian_parts: int = 1
     ) -> tuple[Float[Array, "... width"], Float[Array, "..."]]:
-        """Returns (h, delta_f) from `gaussian_sums` of so many Gaussian inputs, and the inputs of the queries."""
+        """Returns (h, delta_f), both of shape (N, B, ...).
+
+        Args:
+            sums: result of `gaussian_sums`.
+            query: inputs that depend on the query.
+            gaussian_parts: number of inputs of `gaussian_sums`.
+        """
         at_fusion, at_skip = sums
         first = bool(self.fusion) + gaussian_parts * (self.fusion in (0, self.skip))
         hidden = nn.relu(self.layers[self.fusion](query, first=first, total=at_fusion))
@@ -141,7 +152,7 @@ class AttenuationNetwork(nn.Module):
 
 
 class RadianceNetwork(nn.Module):
-    """(h, f) -> Sig before its activation."""
+    """The network (h, f) -> Sig before its activation."""
 
     widths: tuple[int, ...]
     heads: int = 1
@@ -149,7 +160,7 @@ class RadianceNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, parts: Parts) -> Float[Array, "..."]:
-        """Returns the logits of Sig, along a further axis if there are several heads."""
+        """Returns the logits of Sig, along an additional last axis if there are several heads."""
         hidden = nn.relu(PartwiseDense(self.widths[0], self.precision)(parts))
         for width in self.widths[1:]:
             hidden = nn.relu(PartwiseDense(width, self.precision)([hidden]))
@@ -158,13 +169,13 @@ class RadianceNetwork(nn.Module):
 
 
 class PowerNetwork(nn.Module):
-    """(mean of h over the Gaussians, P(TX), f) -> received power relative to free space, in units of 10 dB."""
+    """The network (mean of h over the Gaussians, P(TX), f) -> received power relative to free space, in units of 10 dB."""
 
     width: int
 
     @nn.compact
     def __call__(self, parts: Parts) -> Float[Array, "..."]:
-        """Returns a value for every query; free space at the start."""
+        """Returns a value for every query; initially 0, which is free space."""
         hidden = nn.relu(PartwiseDense(self.width)(parts))
         hidden = nn.relu(PartwiseDense(self.width)([hidden]))
         return nn.Dense(1, kernel_init=nn.initializers.zeros_init())(hidden)[..., 0]
@@ -175,29 +186,30 @@ def _values(heads: Float[Array, "... heads"]) -> Float[Array, "..."]:
 
 
 def signal_activation(logits: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns Sig > 0; the bias makes a zero logit a mid-grey image of the normalised spectra."""
+    """Returns Sig > 0; the bias is chosen so that a zero logit gives a mid-grey image of the normalised spectra."""
     return jax.nn.softplus(logits - 1.0)
 
 
 def attenuation_activation(delta_o: Float[Array, " n"], delta_f: Float[Array, "n b"], maximum: float) -> Float[Array, "n b"]:
-    """Returns delta = delta_o + delta_f, the sum taken before the squash so that it lies in (0, maximum) for any network
+    """Returns delta = delta_o + delta_f; both are added before the sigmoid, so that delta lies in (0, maximum) for any network
     output."""
     return maximum * jax.nn.sigmoid(delta_o[:, None] + delta_f)
 
 
 FrequencyScale = Literal["log", "ghz"]
-"""The logarithm maps the band of the paper to -1..1 and extrapolates smoothly beyond."""
+"""Scale of the frequency as an input: "log" maps the band of the paper to -1..1 and extrapolates smoothly, "ghz" is linear."""
 
 
 def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "*n d_out"]:
-    """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), input included: d_out = d (1 + 2 octaves)  (NeRF, equation 4)."""
+    """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), which includes the input: d_out = d (1 + 2 octaves)  (NeRF,
+    equation 4)."""
     scaled = x[..., None, :] * (2.0 ** jnp.arange(octaves, dtype=x.dtype))[:, None]
     waves = jnp.concatenate([jnp.sin(scaled), jnp.cos(scaled)], -2)
     return jnp.concatenate([x, waves.reshape((*x.shape[:-1], -1))], -1)
 
 
 def scale_frequency(frequency_hz: Float[Array, "*n"], scale: FrequencyScale = "log") -> Float[Array, "*n"]:
-    """Returns a frequency as a network input: "log" maps 1..100 GHz to -1..1 by its logarithm, "ghz" gives raw gigahertz."""
+    """Returns a frequency as a network input: "log" maps 1..100 GHz to -1..1 by its logarithm, "ghz" returns gigahertz."""
     if scale == "ghz":
         return frequency_hz / 1e9
     middle = 0.5 * (math.log(MIN_FREQUENCY_HZ) + math.log(MAX_FREQUENCY_HZ))
@@ -219,7 +231,13 @@ def legendre(x: Float[Array, "*n"], degree: int) -> Float[Array, "*n d"]:
 
 
 def check_octaves(name: str, config: Any, inputs: tuple[str, ...]) -> None:
-    """Raises a `UserError` for settings with an encoding of fewer than no octaves; `name` is that of the field."""
+    """Raises a `UserError` if the number of octaves of an encoding is negative.
+
+    Args:
+        name: name of the field, for the message.
+        config: settings.
+        inputs: encoded inputs; their settings are called `<input>_octaves`.
+    """
     for part in inputs:
         if getattr(config, f"{part}_octaves") < 0:
             raise UserError(f"--{name}.{part}-octaves is negative; give 0 or more")

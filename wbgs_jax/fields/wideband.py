@@ -1,9 +1,9 @@
 """The paper's model: frequency-embedded 3D Gaussians splatted onto the receiver's hemisphere (paper, section 4).
 
-    delta, Sig = F(P(G), P(TX), f)      the EM feature networks (em_features.py), one pair a Gaussian and query
+    delta, Sig = F(P(G), P(TX), f)      the EM feature networks (em_features.py), one pair per Gaussian and query
     PAS(p)     = sum_i T_i delta_i G_i(p) Sig_i    the splatting of splat/
 
-Neither the geometry nor what the networks make of a Gaussian alone depends on the query: both are planned once.
+The geometry, and the parts of the networks that depend on the Gaussian only, are independent of the query; the plan holds both.
 """
 
 import dataclasses
@@ -60,15 +60,16 @@ from wbgs_jax.types import (
 )
 
 FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM = 500, 16
-"""How many start, at most, where spectra are few."""
+"""The initial number of Gaussians is at most 16 per training spectrum, but this limit is never below 500."""
 INITIAL_ATTENUATION = 0.3
+"""Initial attenuation of every Gaussian."""
 TILE_SLACK = 1.4
-"""Room in the tile lists for footprints that grow during training."""
+"""Capacity of the tile lists relative to what is needed, because footprints grow during training."""
 
 
 @pytree
 class WidebandParams:
-    """What is trained."""
+    """Parameters of the splatting field: the Gaussians, and the weights of the networks by name."""
 
     gaussians: Gaussians
     networks: dict[str, Any]
@@ -76,24 +77,25 @@ class WidebandParams:
 
 @pytree
 class WidebandPlan:
-    """What is independent of the query: gradients reach parameters through it only where it is made under `jax.grad`."""
+    """Everything that is independent of the query. Gradients reach parameters through it only if it is made inside the
+    differentiated function."""
 
     geometry: GeometryPlan
     features: GaussianFeatures | None
-    """None in a file: computed in every call."""
+    """Network inputs of every Gaussian; None in a file, in which case every call computes them."""
     frame: Frame
     receiver: Receiver
     config: WidebandConfig = static()
 
     def portable(self) -> "WidebandPlan":
-        """Returns the plan without what the networks make of the Gaussians, which takes ten times the parameters' room."""
+        """Returns the plan without the network inputs of the Gaussians, which are ten times as large as the parameters."""
         return dataclasses.replace(self, features=None)
 
 
 @register
 @pytree
 class WidebandField(Field):
-    """Where the Gaussians start, and the frame of the networks' inputs."""
+    """Initial positions of the Gaussians, and the frame of the networks' inputs."""
 
     surface: Surface
     frame: Frame
@@ -112,18 +114,22 @@ class WidebandField(Field):
         return make_field(scene.surface(count, seed, config.sampling), config, cls)
 
     def init(self, key: Key[Array, ""], given: bool = False) -> WidebandParams:
-        """Returns isotropic Gaussians on the surface points, their standard deviation the mean distance to the 3 nearest
-        neighbours, in slots that leave density control some room, and random networks, which see what another field gives if
-        they are to."""
+        """Returns isotropic Gaussians on the surface points, with the mean distance to the 3 nearest neighbours as standard
+        deviation and with unused slots for density control, and networks with random weights.
+
+        Args:
+            key: random key.
+            given: whether the networks have inputs for a conditioning spectrum.
+        """
         return _init(self, key, given)
 
     def plan(
         self, params: WidebandParams, receiver: Receiver, prepared: None = None, capacity: TileLimits | None = None
     ) -> WidebandPlan:
-        """Returns the projected and sorted Gaussians, and what the networks make of them alone.
+        """Returns the projected and sorted Gaussians, and the network inputs that depend on them only.
 
-        Gradients that are to reach the Gaussians through the plan need it made inside the differentiated function. A `capacity`
-        is needed under jit (`splat.geometry_plan`).
+        Gradients reach the Gaussians through the plan only if it is made inside the differentiated function. A `capacity` is
+        needed under jit (`splat.geometry_plan`).
         """
         return self._plan(params, receiver, capacity, None)
 
@@ -143,8 +149,8 @@ class WidebandField(Field):
     def render(
         self, params: WidebandParams, plan: WidebandPlan, links: Query | Links, given: Float[Array, "b 90 360"] | None = None
     ) -> Observation:
-        """Returns the spectra of B links, and their received power; networks that were made for it see the spectra that
-        another field gives."""
+        """Returns the spectra and received powers of B links; `given` are conditioning spectra, for networks that have inputs
+        for them."""
         return self._render(params, plan, links.query, given)
 
     def _render(
@@ -155,7 +161,8 @@ class WidebandField(Field):
         given: Float[Array, "b 90 360"] | None = None,
         detached: bool = False,
     ) -> Observation:
-        """Detached power has no gradient with respect to what the spectra are made of."""
+        """Returns spectra and received powers of B queries; `detached` powers have no gradient with respect to the parameters
+        of the spectra."""
         check_query(query)
         features = _features(params, plan, query, given)
         spectra = render_splats(plan.geometry, features.attenuation, features.signal)
@@ -172,8 +179,8 @@ class WidebandField(Field):
         probe: Float[Array, "n 2"] | None = None,
         given: Float[Array, "b 90 360"] | None = None,
     ) -> tuple[Float[Array, ""], Aux]:
-        """Returns the image loss of a batch (paper, equation 5), and the error of received power where the data know it. The
-        probe is an offset of the projected centres, pixels."""
+        """Returns the image loss of a batch (paper, equation 5), plus the error of received power if the data contain it.
+        `probe` is an offset of the projected centres, pixels; `given` are conditioning spectra."""
         planned = self._plan(params, batch.receiver, capacity, probe)
         seen = self._render(params, planned, batch.links.query, given, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
@@ -184,8 +191,8 @@ class WidebandField(Field):
         return loss, aux._replace(required=required, overflow=jobs.overflow)
 
     def capacity(self, params: WidebandParams, receivers: Receiver, required: Int[np.ndarray, "2"] | None = None) -> TileLimits:
-        """Returns tile limits that all of the receivers' plans keep, or that hold the required entries and jobs, with room for
-        footprints that grow."""
+        """Returns tile limits that suffice for the plans of all receivers, or for the required numbers of entries and jobs,
+        with a margin for footprints that grow."""
         if required is None:
             required = np.zeros(2, int)
             for i in range(receivers.position.shape[0]):
@@ -197,13 +204,14 @@ class WidebandField(Field):
     def inspect(
         self, params: WidebandParams, plan: WidebandPlan | None = None, links: Query | Links | None = None
     ) -> Inspection:
-        """Returns the number of Gaussians, and what they are for B links."""
+        """Returns the number of Gaussians, and their state for B links."""
         state = None if plan is None or links is None else gaussian_state(params, plan, links.query)
         return Inspection({"gaussians": int(np.asarray(params.gaussians.alive).sum())}, gaussians=state)
 
     @classmethod
     def param_groups(cls, config: WidebandConfig, params: WidebandParams | None = None) -> tuple[dict[str, Group], Any]:
-        """Returns a group for the networks and one for every kind of parameter of the Gaussians, and which is whose."""
+        """Returns a group for the networks and one for every kind of parameter of the Gaussians, and the group of every
+        parameter."""
         groups = {
             "means": Group(config.means_lr),
             "log_scales": Group(config.log_scales_lr),
@@ -221,7 +229,7 @@ class WidebandField(Field):
 def make_field(
     surface: Surface, config: WidebandConfig | None = None, cls: type[WidebandField] = WidebandField
 ) -> WidebandField:
-    """Returns the field whose Gaussians start on surface points; raises for points of another shape."""
+    """Returns the field whose Gaussians start on surface points; raises an error for points of an invalid shape."""
     check_surface(surface)
     low, high = surface.points.min(0), surface.points.max(0)
     frame = Frame(centre=(low + high) / 2, half_extent=jnp.max(high - low) / 2)
@@ -250,7 +258,7 @@ def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
 
 
 def _initial_networks(key: Key[Array, ""], field: WidebandField, given: bool) -> dict[str, Any]:
-    """Returns initial weights; the inputs matter by their shapes only."""
+    """Returns initial weights; only the shapes of the inputs matter."""
     config, points = field.config, field.surface.points
     attenuation, radiance, power = make_networks(config)
     encoded = positional_encoding(points, config.gaussian_octaves)
@@ -276,8 +284,8 @@ def _initial_networks(key: Key[Array, ""], field: WidebandField, given: bool) ->
 def render(params: WidebandParams, plan: WidebandPlan, query: Query) -> Float[Array, "b 90 360"]:
     """Returns the power angular spectra of B queries.
 
-    What the plan holds is a constant to gradients of this function: with `jax.grad` over parameters use `fields.pas`, which
-    plans inside.
+    The plan is a constant to gradients of this function: for `jax.grad` over parameters use `fields.pas`, which makes the plan
+    inside.
     """
     check_query(query)
     return render_splats(plan.geometry, *em_features(params, plan, query))
@@ -287,7 +295,14 @@ def em_features(
     params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
 ) -> tuple[Float[Array, "n b"], Float[Array, "n b"]]:
     """Returns the final attenuation delta and the signal Sig of every Gaussian and query (paper, equations 1-3 and section
-    4.5)."""
+    4.5).
+
+    Args:
+        params: parameters.
+        plan: plan of one receiver.
+        query: B queries.
+        given: conditioning spectra, for networks that have inputs for them.
+    """
     features = _features(params, plan, query, given)
     return features.attenuation, features.signal
 
@@ -295,7 +310,7 @@ def em_features(
 def gaussian_state(
     params: WidebandParams, plan: WidebandPlan, query: Query, given: Float[Array, "b 90 360"] | None = None
 ) -> GaussianState:
-    """Returns the Gaussians with their attenuation and signal for B queries."""
+    """Returns the Gaussians with their attenuation and signal for B queries; the arguments are those of `em_features`."""
     return GaussianState(params.gaussians, *em_features(params, plan, query, given))
 
 

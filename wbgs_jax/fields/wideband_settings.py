@@ -1,4 +1,4 @@
-"""Settings of the paper's field, and its presets."""
+"""Settings and presets of the paper's field."""
 
 from dataclasses import dataclass
 
@@ -15,39 +15,39 @@ class WidebandConfig:
     """Settings of the paper's field."""
 
     gaussians: int = 2000
-    """How many Gaussians start on the scene's surface, at most 16 for every training spectrum (but 500); 0: one for every
-    vertex of the mesh."""
+    """Initial number of Gaussians on the scene's surface, limited to 16 per training spectrum (but not below 500); 0 for one
+    per vertex of the mesh."""
     sampling: SurfaceSampling = "solid_angle"
-    """Spread them evenly over the receiver's directions, or over the area of the surface."""
+    """Distribute them evenly over the receiver's directions, or over the area of the surface."""
     features: int = 16
-    """Trained numbers of every Gaussian that its networks see beside its place (authors: 0)."""
+    """Trained features of every Gaussian that enter the networks in addition to its position (authors: 0)."""
     width: int = 64
-    """Units of the attenuation network's layers (authors: 128)."""
+    """Units per layer of the attenuation network (authors: 128)."""
     depth: int = 4
-    """Layers of the attenuation network (authors: 8)."""
+    """Number of layers of the attenuation network (authors: 8)."""
     skip: int = 2
-    """The layer at which the inputs enter again (authors: 4)."""
+    """Layer at which the inputs enter again (authors: 4)."""
     fusion: int = 1
-    """The layer of the attenuation network at which transmitter and frequency enter; those before it are evaluated once for
-    all queries. 0: the paper's form."""
+    """Layer of the attenuation network at which transmitter and frequency enter; the layers before it are evaluated once for
+    all queries. 0 is the paper's form."""
     radiance_widths: tuple[int, ...] = (32,)
-    """Units of the radiance network's layers (authors: 128, 64)."""
+    """Units of each layer of the radiance network (authors: 128, 64)."""
     gaussian_octaves: int = 6
     """Octaves of P(G) (authors: 10)."""
     tx_octaves: int = 4
     """Octaves of P(TX) (authors: 10)."""
     frequency_octaves: int = 0
-    """Octaves of the frequency encoding, beyond the scaled frequency itself (authors: 10; more than none fail between the
-    frequencies that were trained)."""
+    """Octaves of the frequency encoding, in addition to the scaled frequency itself (authors: 10; any number above 0 fails
+    between the trained frequencies)."""
     frequency_scale: FrequencyScale = "log"
-    """"log" maps 1..100 GHz to -1..1; "ghz" feeds raw gigahertz, as the authors do."""
+    """"log" maps 1..100 GHz to -1..1; "ghz" uses raw gigahertz, as the authors do."""
     frequency_degree: int = 1
-    """Degree of the Legendre polynomials of the scaled frequency that enter the networks; 1: the frequency itself."""
+    """Highest degree of the Legendre polynomials of the scaled frequency that enter the networks; 1 for the frequency alone."""
     frequency_heads: int = 0
-    """Degree of the polynomial in the scaled frequency that delta_f and the logit of Sig are, the networks' outputs being its
-    coefficients; 0: no dependence but through the inputs."""
+    """Degree of delta_f and of the logit of Sig as polynomials in the scaled frequency, whose coefficients are the outputs of
+    the networks; 0 for dependence through the inputs only."""
     relative: bool = True
-    """Also encode TX and Gaussian relative to each other and to the receiver array; False: the paper's inputs alone."""
+    """Also encode TX and Gaussian relative to each other and to the receiver array; False for the paper's inputs only."""
     attenuation_frequency: bool = True
     """Frequency embedding of the attenuation network (paper, Table 3)."""
     radiance_frequency: bool = True
@@ -57,22 +57,24 @@ class WidebandConfig:
     ssim_weight: float = 0.2
     """lambda of the paper's equation 5."""
     ssim_stride: int = 2
-    """The loss looks at every so many-th window of the SSIM along both axes (paper: 1)."""
+    """Stride of the SSIM windows in the loss, along both axes (paper: 1)."""
     power_weight: float = 0.01
-    """Weight of the mean absolute error (dB) of the received power, where the data say what it was. It moves nothing that the
-    spectra are made of. Not in the paper."""
+    """Weight of the mean absolute error (dB) of the received power, if the data contain it. It has no gradient with respect to
+    the parameters of the spectra. Not in the paper."""
     precision: Precision = setting("device", before="device")
-    """What the networks multiply: "device" (TF32 on GPUs that have it, else float32), "float32", "tf32" or "bfloat16"."""
+    """Precision of products in the networks: "device" (TF32 on GPUs that support it, else float32), "float32", "tf32" or
+    "bfloat16"."""
     features_lr: float = 1e-2
     """Learning rate of the Gaussians' features."""
     network_optimizer: Optimizer = "muon"
-    """What moves the networks' matrices (`base.Group`; authors: Adam)."""
+    """Optimiser of the networks' matrices (`base.Group`; authors: Adam)."""
     network_lr: float = 1e-2
     """Learning rate of the networks (authors: 8e-4)."""
     network_weight_decay: float = 0.0
     """Decoupled weight decay of the networks."""
     means_lr: float = 1e-3
-    """Learning rate of the centres: metres a step, about. (Authors: 0 in effect; their spatial scale multiplies it away.)"""
+    """Learning rate of the centres, about metres per step (authors: effectively 0, after multiplication by their spatial
+    scale)."""
     log_scales_lr: float = 5e-3
     """Learning rate of the logarithms of the standard deviations."""
     quats_lr: float = 1e-3
@@ -81,7 +83,7 @@ class WidebandConfig:
     """Learning rate of delta_o."""
 
     def check(self, name: str) -> None:
-        """Raises a `UserError` for settings that cannot work, of the field of this name."""
+        """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
         widths = min(self.radiance_widths, default=0)
         sizes = {"width": self.width, "depth": self.depth, "radiance-widths": widths, "ssim-stride": self.ssim_stride}
         check_positive({f"{name}.{option}": size for option, size in sizes.items()})
@@ -96,14 +98,14 @@ class WidebandConfig:
 
     @property
     def sees_frequency(self) -> bool:
-        """Whether anything but the array's response depends on the frequency."""
+        """Whether anything other than the array's response depends on the frequency."""
         return self.attenuation_frequency or self.radiance_frequency or self.frequency_heads > 0
 
 
 CONFIGS = {
     "smoke": WidebandConfig(gaussians=500, width=32, depth=3, radiance_widths=(32,)),
     "cpu": WidebandConfig(),
-    # A Gaussian for every vertex of the mesh and the authors' networks, with the inputs, schedule and batches of the others.
+    # A Gaussian per vertex of the mesh and the authors' networks, with the inputs, schedule and batches of the other presets.
     "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64)),
 }
 DENSITY = {
@@ -149,6 +151,6 @@ PAPER = Settings(
     ),
     loop=LoopConfig(epoch_steps=100, evaluate_every=10_000, checkpoint_every=10_000),
 )
-"""The paper's own form, without what this project changed. Inputs of the networks, hemisphere and loss are those of the paper's
-text; sizes, octaves, raw gigahertz, rates, thresholds, batch and steps, of which it says nothing, those of the authors' code.
-docs/baselines.md says where the two differ, and what of the code is left out."""
+"""The paper's own form, without the changes of this project. Inputs of the networks, hemisphere and loss are those of the
+paper's text; sizes, octaves, raw gigahertz, rates, thresholds, batch and steps, which the text does not give, are those of the
+authors' code. docs/baselines.md describes where the two differ and which parts of the code are left out."""

@@ -2,8 +2,9 @@
 
     delta, Sig = F(P(G), P(TX))
 
-It answers every frequency alike, so one model is trained a frequency. Everything else is the wideband field, so that a
-comparison is about the frequency and nothing else; docs/baselines.md says where that departs from the authors' system.
+Its prediction is the same at every frequency, so one model is trained per frequency. Everything else is as in the wideband
+field, so that a comparison shows the effect of the frequency input only; docs/baselines.md describes where this departs from
+the authors' system.
 """
 
 import dataclasses
@@ -22,24 +23,24 @@ C = TypeVar("C", bound=WidebandConfig)
 
 @dataclass(frozen=True)
 class WrfgsConfig(WidebandConfig):
-    """Settings of the wideband field, without a frequency."""
+    """Settings of the wideband field without frequency inputs."""
 
     def check(self, name: str) -> None:
-        """Raises a `UserError` for settings that cannot work."""
+        """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
         super().check(name)
         if self != without_frequency(self):
             raise UserError("WRF-GS has no frequency input to switch on; train --field wideband")
 
 
 def without_frequency(config: C) -> C:
-    """Returns the same settings with both frequency embeddings switched off."""
+    """Returns the same settings without frequency embeddings and frequency heads."""
     return dataclasses.replace(config, attenuation_frequency=False, radiance_frequency=False, frequency_heads=0)
 
 
 @register
 @pytree
 class WrfgsField(WidebandField):
-    """The wideband field without a frequency."""
+    """The wideband field without frequency inputs."""
 
     name: ClassVar[str] = "wrfgs"
     presets: ClassVar = with_field(
@@ -51,5 +52,5 @@ class WrfgsField(WidebandField):
 
     @classmethod
     def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
-        """Returns the field of a scene; its networks never see a frequency."""
+        """Returns the field of a scene; its networks have no frequency input."""
         return super().build(without_frequency(config), scene, seed)

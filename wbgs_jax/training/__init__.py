@@ -1,1 +1,1 @@
-"""The host loop, the jitted step, the hooks between epochs, checkpoints and run folders."""
+"""Training: the host loop, the jitted step, hooks between epochs, checkpoints and run folders."""

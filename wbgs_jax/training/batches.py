@@ -1,12 +1,10 @@
-"""A dataset on the device, if a field can be trained on it: snapshots or 8-bit pixels of all links, of which a step makes the
-spectra of its batch.
+"""A dataset on the device: snapshots or 8-bit pixels of all links, from which every training step computes the spectra of its
+batch; and the check that a field can be trained on it.
 
-Transmitters that nobody measured, with spectra that kriging gives them: what keeps a field that knows no paths from learning
-a few spectra by heart (host).
-
-Between few transmitters such a field makes up what it likes. Half of every batch are therefore links of transmitters somewhere
-between and around the known ones, whose spectra are ordinary kriging's (`inference.mixture`): the field starts from the kriged
-spectra, and varies over transmitters as smoothly as they do.
+Virtual links keep a field without paths from overfitting a few spectra (host). Between a small number of transmitters the
+predictions of such a field are arbitrary. Half of every batch are therefore links of virtual transmitters between and around
+the measured ones, with spectra from ordinary kriging (`inference.mixture`): the field starts from the kriged spectra, and
+varies as smoothly with the transmitter's position as they do.
 """
 
 import dataclasses
@@ -28,34 +26,36 @@ from wbgs_jax.radio.array import pas_directions, steering_vector
 from wbgs_jax.types import Batch, Links, Query, Receiver
 
 FAR_M = 500.0
-"""From the origin: there single precision rounds positions to 30 micrometres, a hundredth of a wavelength at 100 GHz."""
+"""Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a wavelength
+at 100 GHz."""
 
 
 @pytree
 class TrainingData(Observed):
-    """All links, and what was observed on them."""
+    """All links with their observations."""
 
     receivers: Receiver
-    """With a leading axis."""
+    """All receivers, with a leading axis."""
     links: Links
     observations: Observations
-    """By kind; beside virtual links the spectra of all links, too."""
+    """Observations by kind; with virtual links also the spectra of all links."""
     steering: Complex[Array, "90 360 elements"] | None
-    """Of the only receiver, if its array scales with the frequency and spectra depend on it: made once."""
+    """Steering vectors of a single receiver whose element positions are in wavelengths, if spectra are computed from snapshots;
+    None otherwise."""
 
     def receiver_of(self, index: Int[Array, " b"]) -> Receiver:
-        """Returns the receiver of some links, all of which have the same."""
+        """Returns the receiver of links, which all have the same one."""
         if self.receivers.position.shape[0] == 1:
             return jax.tree.map(lambda leaf: leaf[0], self.receivers)
         number = self.links.receiver_index[index[0]]
         return jax.tree.map(lambda leaf: leaf[number], self.receivers)
 
     def pas(self, index: Int[Array, " b"]) -> Float[Array, "b 90 360"] | None:
-        """Returns the observed spectra of some links of one receiver; None where there are none."""
+        """Returns the observed spectra of links of one receiver; None for data without spectra."""
         return self._spectra(self._rows(index), index)
 
     def batch(self, index: Int[Array, " b"], key: Key[Array, ""]) -> Batch:
-        """Returns some links of one receiver with everything that was observed on them."""
+        """Returns links of one receiver with all of their observations."""
         observed = self._rows(index)
         if (spectra := self._spectra(observed, index)) is not None:
             observed["pas"] = spectra
@@ -72,15 +72,22 @@ class TrainingData(Observed):
 def batches_of_one_receiver(
     data: TrainingData, pool: Int[np.ndarray, " n"], count: int, size: int, rng: np.random.Generator
 ) -> Int[Array, "count b"]:
-    """Returns so many batches of links of a pool, drawn with replacement, each of one receiver and of `size` links, or of as
-    many as the pool has (host)."""
+    """Returns random batches of links, drawn with replacement, each of a single receiver (host).
+
+    Args:
+        data: training data.
+        pool: indices of the links to draw from.
+        count: number of batches.
+        size: links per batch, at most the size of the pool.
+        rng: random numbers.
+    """
     receiver = np.asarray(data.links.receiver_index)[pool]
     owns = [pool[receiver == number] for number in rng.choice(receiver, count)]
     return jnp.asarray([rng.choice(own, min(size, len(pool))) for own in owns], jnp.int32)
 
 
 def training_data(dataset: Dataset) -> TrainingData:
-    """Returns a dataset on the device."""
+    """Returns a dataset as arrays on the device."""
     receivers, steering = dataset.receivers, None
     if dataset.observed.needs_array and receivers.position.shape[0] == 1 and receivers.unit == "wavelengths":
         steering = steering_vector(receivers.element_positions[0], jnp.asarray(pas_directions(), jnp.float32))
@@ -93,18 +100,21 @@ def training_data(dataset: Dataset) -> TrainingData:
 
 
 def knows_no_paths(dataset: Dataset, field: type[Field]) -> bool:
-    """Returns whether all that a field can know of data are their observations: it follows no paths, or there is no mesh."""
+    """Returns whether a field must learn from the observations alone, since it predicts no paths or the data have no mesh."""
     return "paths" not in field.outputs or not len(dataset.faces)
 
 
 def limited(settings: Settings, dataset: Dataset, field: type[Field]) -> Settings:
-    """Returns settings with the steps that a field gets on a data set (`config.limit_steps`)."""
+    """Returns settings with the number of steps for a field and a dataset (`config.limit_steps`)."""
     return limit_steps(settings, len(dataset.train), knows_no_paths(dataset, field))
 
 
 def check_data(dataset: Dataset, field: type[Field]) -> None:
-    """Raises a `UserError` for data that a field cannot be trained on, before any work is done, and warns of coordinates that
-    are too large."""
+    """Checks data before any work is done, and warns if coordinates are too large for single precision.
+
+    Raises:
+        UserError: there are no training spectra, or the field cannot be trained on this kind of observation.
+    """
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
     far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
@@ -112,37 +122,38 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
         warnings.warn(
             f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
             "mesh, transmitters and receivers",
-            stacklevel=1,  # of this line, whoever checks: it is said once
+            stacklevel=1,  # that of this line, so that the warning appears once
         )
     if not dataset.has_spectra and "power" not in field.outputs:
         able, words = ", ".join(name for name in field_names() if "power" in get_field(name).outputs), dataset.observed.words
-        raise UserError(f"{dataset.name} holds {words}, of which the {field.name} field knows nothing; choose one of: {able}")
+        raise UserError(f"{dataset.name} holds {words}, which the {field.name} field does not predict; choose one of: {able}")
 
 
 FEW = 128
-"""Training spectra from which on there are no virtual ones."""
+"""Number of training spectra from which on virtual links are not used."""
 COUNT = 4, 256
-"""Virtual links for every training link, and at most."""
+"""Virtual links per training link, and their maximum number."""
 BEYOND, BESIDE = 0.3, 0.1
-"""How far they lie beyond two known transmitters, in their distance, and beside the line between them, in the extent of all."""
+"""Range of virtual transmitters beyond two measured ones, relative to the distance between these, and r.m.s. displacement from
+the line through them, relative to the extent of all transmitters."""
 LENGTH, NUGGET = 0.5, 0.01
-"""Of the kriging: length in the extent of all transmitters, and nugget."""
+"""Correlation length of the kriging, relative to the extent of all transmitters, and its nugget."""
 
 
 class VirtualLinks(NamedTuple):
-    """Links that nobody measured."""
+    """Links with kriged instead of measured spectra."""
 
     tx_position: Float[np.ndarray, "v 3"]
-    """World frame, metres."""
+    """Positions of the virtual transmitters, world frame, metres."""
     frequency_hz: Float[np.ndarray, " v"]
     receiver_index: Int[np.ndarray, " v"]
     images: UInt8[np.ndarray, "v 90 360"]
-    """255 times the spectra."""
+    """Kriged spectra, multiplied by 255."""
 
 
 def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
-    """Returns virtual links around the training links of a data set; None where these are many, or of a single transmitter or
-    without spectra."""
+    """Returns virtual links around the training links of a dataset; None if there are `FEW` training links or more, if all have
+    the same transmitter, or if the data have no spectra."""
     train = dataset.train
     positions = dataset.tx_positions[train]
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
@@ -166,8 +177,8 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
 def data_with_virtual(
     dataset: Dataset, field: type[Field], seed: int | None
 ) -> tuple[TrainingData, list[Int[np.ndarray, " v"]]]:
-    """Returns data on the device and, of every receiver, the numbers of its virtual links: none without a seed, or where the
-    field knows paths."""
+    """Returns data on the device, and the indices of the virtual links of every receiver. No virtual links exist without a
+    seed, or if the field predicts paths."""
     data, count = training_data(dataset), len(dataset)
     virtual = virtual_links(dataset, seed) if seed is not None and knows_no_paths(dataset, field) else None
     if virtual is None:
@@ -179,7 +190,7 @@ def data_with_virtual(
 def with_virtual_drawn(
     drawn: Int[np.ndarray, " b"], virtual: Int[np.ndarray, " v"], share: float, rng: np.random.Generator
 ) -> Int[np.ndarray, " b"]:
-    """Returns a batch of links of one receiver, a share of which gives way to virtual ones of it, where it has any."""
+    """Returns a batch of links of one receiver, with a share of them replaced by virtual links of that receiver (if any)."""
     count = round(share * len(drawn)) if len(virtual) else 0
     return np.concatenate([drawn[count:], rng.choice(virtual, count)]) if count else drawn
 
@@ -187,7 +198,8 @@ def with_virtual_drawn(
 def kriging_weights(
     positions: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "3"], length: float, nugget: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns the weights of ordinary kriging with the kernel exp(-distance / length), which sum to 1."""
+    """Returns the weights of ordinary kriging at a place, with the kernel exp(-distance / length); they sum to 1. Positions and
+    `length` are in metres, `nugget` is relative to the kernel at distance 0."""
     kernel = np.exp(-np.linalg.norm(positions[:, None] - positions[None], axis=-1) / length) + nugget * np.eye(len(positions))
     right = np.column_stack([np.exp(-np.linalg.norm(positions - place, axis=-1) / length), np.ones(len(positions))])
     simple, ones = np.linalg.solve(kernel, right).T
@@ -196,8 +208,14 @@ def kriging_weights(
 
 
 def with_virtual(data: TrainingData, virtual: VirtualLinks, observed: UInt8[np.ndarray, "n 90 360"]) -> TrainingData:
-    """Returns training data with virtual links behind the others, each of a transmitter of its own. `observed` are the spectra
-    of the others; nothing but a spectrum is known of a virtual link."""
+    """Returns training data with virtual links appended, each with its own transmitter. The only observation of a virtual link
+    is its spectrum.
+
+    Args:
+        data: training data.
+        virtual: virtual links.
+        observed: observed spectra of the links of `data`, multiplied by 255.
+    """
     count = len(virtual.frequency_hz)
     more = Links(
         Query(jnp.asarray(virtual.tx_position, jnp.float32), jnp.asarray(virtual.frequency_hz, jnp.float32)),

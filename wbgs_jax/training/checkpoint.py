@@ -1,7 +1,8 @@
-"""Checkpoints with Orbax: the training state, the field it belongs to, and metadata.
+"""Checkpoints, written with Orbax: the training state, its field, and metadata.
 
-A tree is saved as a flat dictionary of arrays named by their place in it; those of the field begin with "field". Orbax writes
-to a temporary folder and renames it, so a checkpoint is whole or absent (one that is written again is absent for a moment).
+A tree is saved as a flat dictionary of arrays, named by their path in the tree; names of the field begin with "field". Orbax
+writes to a temporary folder and renames it, so that a checkpoint is either complete or absent (one that is written again is
+absent for a moment).
 """
 
 import contextlib
@@ -26,13 +27,13 @@ from wbgs_jax._util.errors import UserError
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16
-"""Bytes that a checkpoint takes beside its arrays."""
+"""Bytes of a checkpoint in addition to its arrays."""
 FILE_BYTES = 8 * 2**20
-"""Of a checkpoint's files, about: they can be sent where large ones cannot."""
+"""Approximate size of a checkpoint's files, small enough for uploads that are limited in size."""
 STATE = "state"
 """Folder of the arrays in a checkpoint."""
 REMOVED = ".removed"
-"""Ending of a checkpoint that is being removed."""
+"""Suffix of a checkpoint that is being removed."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,9 @@ class Saved:
 
     path: Path
     state: dict[str, np.ndarray]
-    """Arrays of the state by their place, such as ".params.gaussians.means"."""
+    """Arrays of the state by their path, such as ".params.gaussians.means"."""
     field: dict[str, np.ndarray]
-    """Arrays of the field by their place, such as ".frame.centre"."""
+    """Arrays of the field by their path, such as ".frame.centre"."""
     metadata: dict[str, Any]
 
 
@@ -52,7 +53,7 @@ def _flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def digest(arrays: dict[str, np.ndarray], metadata: dict[str, Any]) -> str:
-    """Returns a checksum of everything that a checkpoint holds: a flipped bit would be other parameters, and nothing more."""
+    """Returns a checksum of the content of a checkpoint; a flipped bit would otherwise change parameters without any error."""
     found = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for key in sorted(arrays):
         array = np.ascontiguousarray(arrays[key])
@@ -69,11 +70,23 @@ def checkpoint_steps(folder: Path) -> list[int]:
 
 
 def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, Any], keep: int) -> None:
-    """Writes a checkpoint (replacing one of the same step) and removes the oldest beyond `keep`. Of several processes all call
-    it with the same state; the first one writes."""
+    """Writes a checkpoint, replacing one of the same step, and removes all but the newest `keep`. All processes call this with
+    the same state; the first process writes.
+
+    Args:
+        folder: folder of the checkpoints.
+        step: number of the step.
+        state: training state.
+        field: field.
+        metadata: values that can be stored as JSON.
+        keep: number of checkpoints to keep.
+
+    Raises:
+        UserError: the checkpoint cannot be written.
+    """
     from orbax.checkpoint import v1 as ocp
 
-    # Host arrays load on any device; Orbax refuses empty ones, which the metadata stand for.
+    # Host arrays can be loaded on any device. Orbax refuses empty arrays; the metadata describe them.
     host = {key: np.asarray(leaf) for key, leaf in (_flatten(state) | _flatten(field, FIELD)).items()}
     empty = {key: [list(leaf.shape), leaf.dtype.name] for key, leaf in host.items() if not leaf.size}
     try:
@@ -85,23 +98,23 @@ def save(folder: Path, step: int, state: Any, field: Any, metadata: dict[str, An
             _demand_room(folder, full)
             with _small_files(), _plain(folder) as place:
                 ocp.save(place / str(step), full, custom_metadata=metadata, overwrite=True)
-    except (OSError, ValueError) as error:  # ValueError: what TensorStore makes of a full disk
+    except (OSError, ValueError) as error:  # TensorStore raises a ValueError for a full disk
         for unfinished in folder.glob(f"{step}.*tmp*"):
             shutil.rmtree(unfinished, ignore_errors=True)
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0][:200]
         kept = [old for old in checkpoint_steps(folder) if old != step]
-        left = f"the checkpoint of step {kept[-1]} is whole" if kept else "there is no checkpoint yet"
+        left = f"the checkpoint of step {kept[-1]} is intact" if kept else "there is no checkpoint yet"
         where = f"cannot write checkpoint {folder.absolute() / str(step)}"
-        raise UserError(f"{where}: {reason}; {left}. Free some space and go on with --resume") from error
+        raise UserError(f"{where}: {reason}; {left}. Free some space and continue with --resume") from error
     if is_first():
         tidy(folder, keep)
 
 
 def tidy(folder: Path, keep: int) -> None:
-    """Removes the oldest checkpoints beyond `keep`, and what a process that was killed meanwhile left of one.
+    """Removes all but the newest `keep` checkpoints, and the remains of one whose removal was interrupted.
 
-    A checkpoint is renamed before it is removed: what a number names is whole. Errors are nobody's: the newest one is there,
-    and that is what counts.
+    A checkpoint is renamed before it is removed, so that a folder named by a number is always complete. Errors are ignored,
+    since only the newest checkpoint matters and it exists.
     """
     for old in checkpoint_steps(folder)[:-keep]:
         shutil.rmtree(folder / f"{old}{REMOVED}", ignore_errors=True)
@@ -112,14 +125,18 @@ def tidy(folder: Path, keep: int) -> None:
 
 
 def _demand_room(folder: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raises an `OSError` for a disk that is too full, before Orbax begins: of its writes, which all run at once, one would
-    fail, and the others go on to complain on stderr, in threads of their own."""
+    """Raises an `OSError` for lack of disk space before Orbax begins: its writes run concurrently, and after the first failure
+    the threads of the others would print errors on stderr."""
     if shutil.disk_usage(folder).free < sum(array.nbytes for array in arrays.values()) + MARGIN:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def read(folder: Path, step: int) -> Saved:
-    """Returns the content of a checkpoint; a damaged one is a `UserError`."""
+    """Returns the content of a checkpoint.
+
+    Raises:
+        UserError: the checkpoint is damaged or incomplete.
+    """
     from orbax.checkpoint import v1 as ocp
 
     path = folder / str(step)
@@ -127,21 +144,31 @@ def read(folder: Path, step: int) -> Saved:
         with _alone(), _plain(path) as place:
             _read_every_value(place / STATE)
             metadata = ocp.metadata(place).custom_metadata
-            if not metadata:  # Orbax gives None for a file that it cannot read
+            if not metadata:  # Orbax returns None for a file that it cannot read
                 raise ValueError("no metadata")
             found = {key: np.asarray(value) for key, value in ocp.load(place).items()}
         metadata = dict(metadata)
         expected = metadata.pop(DIGEST, None)  # older checkpoints have none
         found |= {key: np.zeros(shape, dtype) for key, (shape, dtype) in metadata.get(EMPTY, {}).items()}
         if expected not in (None, digest(found, metadata)):
-            raise ValueError("its checksum is another one")
+            raise ValueError("its checksum does not match")
         metadata.pop(EMPTY, None)
     field = {key.removeprefix(FIELD): value for key, value in found.items() if key.startswith(FIELD)}
     return Saved(path, {key: value for key, value in found.items() if not key.startswith(FIELD)}, field, metadata)
 
 
 def fill(saved: Saved, init: Callable[[Any], Any], key: Key[Array, ""], prefix: str) -> Any:
-    """Returns saved parameters in the structure that `init(key)` gives; numbers of rows are those that were saved."""
+    """Returns saved parameters in the structure of `init(key)`; the sizes of leading axes are those that were saved.
+
+    Args:
+        saved: content of a checkpoint.
+        init: returns initial parameters; only their structure and shapes are evaluated.
+        key: random key.
+        prefix: path of the parameters in the saved state, such as ".params".
+
+    Raises:
+        UserError: the checkpoint belongs to another configuration.
+    """
     like = jax.eval_shape(init, key)
 
     def shaped(path: Any, leaf: Any) -> Any:
@@ -156,7 +183,7 @@ def fill(saved: Saved, init: Callable[[Any], Any], key: Key[Array, ""], prefix: 
 def fill_like(saved: Saved, like: Any, prefix: str = "") -> Any:
     """Returns the saved state in the structure, shapes and dtypes of `like` (arrays or ShapeDtypeStructs).
 
-    `prefix` names the part of the saved state that `like` stands for, such as ".params".
+    `prefix` is the path of this part of the saved state, such as ".params".
     """
     wanted = _flatten(like, prefix)
     _demand(all(key in saved.state and saved.state[key].shape == leaf.shape for key, leaf in wanted.items()), saved)
@@ -170,7 +197,7 @@ def _demand(fits: bool, saved: Saved) -> None:
 
 
 def _small_files() -> contextlib.AbstractContextManager[Any]:
-    """Lets Orbax write files of no more than about `FILE_BYTES`, in the format of arrays that allows it."""
+    """Makes Orbax write files of at most about `FILE_BYTES`, in the array format that allows this."""
     from orbax.checkpoint import v1 as ocp
 
     saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=FILE_BYTES)
@@ -179,7 +206,7 @@ def _small_files() -> contextlib.AbstractContextManager[Any]:
 
 
 def _alone() -> contextlib.AbstractContextManager[Any]:
-    """Lets Orbax read without waiting for other processes: one may be the only one to do so."""
+    """Makes Orbax read without waiting for other processes, since only this process may be reading."""
     from orbax.checkpoint import v1 as ocp
 
     if jax.process_count() == 1:
@@ -192,7 +219,7 @@ def _alone() -> contextlib.AbstractContextManager[Any]:
 
 @contextlib.contextmanager
 def _plain(folder: Path) -> Iterator[Path]:
-    """Gives an absolute path that leads to a folder and is UTF-8, which TensorStore demands of paths."""
+    """Yields an absolute path to a folder that is valid UTF-8, as TensorStore requires."""
     path = folder.absolute()
     if os.fsencode(path).decode(errors="ignore") == str(path):
         yield path
@@ -205,7 +232,7 @@ def _plain(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silences Orbax, which reports every file that it writes; what fails is explained by a `UserError` here."""
+    """Silences Orbax, which logs every file that it writes; failures are reported by a `UserError` here."""
     loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -218,9 +245,9 @@ def _quiet() -> Iterator[None]:
 
 
 def _read_every_value(folder: Path) -> None:
-    """Raises an error for a value that cannot be read, one after another: Orbax reads all at once and stops at the first that
-    fails, and the others go on to complain on stderr, in threads of their own."""
-    import tensorstore  # of Orbax
+    """Reads all values one after another and raises an error for the first unreadable one. Orbax reads them concurrently, and
+    after the first failure the threads of the others would print errors on stderr."""
+    import tensorstore  # a dependency of Orbax
 
     values = tensorstore.KvStore.open({"driver": "ocdbt", "base": folder.absolute().as_uri() + "/"}).result()
     for key in values.list().result():

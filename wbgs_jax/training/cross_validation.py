@@ -1,14 +1,13 @@
-"""What goes with a trained field where few transmitters were measured: simple methods, the field's share, and intervals, all
-from cross-validation (host).
+"""Corrections of a trained field if few transmitters were measured: simple methods, the weight of the field, and prediction
+intervals, all from cross-validation (host).
 
-A validation part of three transmitters decides nothing. Where there are fewer than `ENOUGH`, simple methods are members of the
-answer from the start (training/fit_mixture.py). A field that knows no paths is cross-validated over all of the transmitters, in
-blocks (`held_out_blocks`). One that knows paths takes too long for that; what it does with its validation part has to do.
+A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than `ENOUGH`, simple methods
+are part of the mixture from the start (training/fit_mixture.py). A field without paths is cross-validated over all
+transmitters, in blocks (`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A
+field with paths takes too long for that; only its predictions for the validation part are used.
 
-What a field answers to links that it was not trained on: short trainings, each without a block of transmitters (host).
-
-A block lies together in space, so that its middle is as far from the data as queries are that come from elsewhere. Random
-transmitters would lie between those that are trained.
+The transmitters of a block are adjacent in space, so that its centre is as far from the data as queries from elsewhere are.
+Random transmitters would lie between those that are trained.
 """
 
 import dataclasses
@@ -38,17 +37,17 @@ from wbgs_jax.training.hooks import Say
 from wbgs_jax.training.loop import train
 
 FOLDS = 4
-"""Blocks; fewer transmitters than that are left out one at a time."""
+"""Number of blocks; if there are fewer transmitters, each is a block."""
 SHARE = 0.25
-"""Of the steps of a training that each of these has: a field that is trained for longer is no worse."""
+"""Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse."""
 ANSWERED = 60
-"""Links of a block that are answered, at most."""
+"""Maximum number of links per block for which predictions are made."""
 FOLDER = "folds"
 
 
 def blocks(positions: Float[np.ndarray, "n 3"], tx_index: Int[np.ndarray, " n"], count: int = FOLDS) -> Int[np.ndarray, " n"]:
-    """Returns the block (0, 1, ...) of every link: transmitters are halved along the axis of their largest extent, and the
-    larger part again, until there are so many."""
+    """Returns the block (0, 1, ...) of every link: the largest part of the transmitters is halved along the axis of its largest
+    extent until there are `count` parts. `positions` are those of the transmitters, metres."""
     transmitters, first = np.unique(tx_index, return_index=True)
     places = positions[first]
     parts = [np.arange(len(transmitters))]
@@ -66,18 +65,19 @@ def blocks(positions: Float[np.ndarray, "n 3"], tx_index: Int[np.ndarray, " n"],
 def held_out_blocks(
     dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, devices: int, say: Callable[[str], None]
 ) -> HeldOut:
-    """Returns what a field answers to blocks of known links that short trainings did without; none of a single transmitter.
+    """Returns the predictions of a field for blocks of measured links that were left out of short trainings; there are none for
+    a single transmitter.
 
-    What is done is kept in `folder` until all of it is.
+    Finished blocks are stored in `folder` until all are finished.
 
     Args:
-        dataset: of one receiver.
-        field: its name.
-        settings: of the training whose field is to be judged.
-        seed: of that training.
-        folder: of its run.
-        devices: that share every batch.
-        say: is called with what goes on.
+        dataset: data of one receiver.
+        field: name of the field.
+        settings: settings of the short trainings (`shortened`).
+        seed: seed of the training.
+        folder: folder of the run.
+        devices: number of devices that share every batch.
+        say: called with a description of each stage.
     """
     known, place = training_links(dataset), folder / FOLDER
     block = blocks(dataset.tx_positions[known], dataset.tx_index[known])
@@ -104,11 +104,11 @@ def _answers(
     place: Path,
     devices: int,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 90 360"]]:
-    """Returns links of a block and what a field answers that was trained without it."""
+    """Returns links of a block, and their spectra predicted by a field that was trained without this block."""
     index = np.sort(np.random.default_rng(4).permutation(known[left_out])[:ANSWERED])
     done = place.with_suffix(".npz")
     if done.exists():
-        return index, read_arrays(done, "cross-validation", "remove it, and --resume makes it again")["pas"].astype(np.float32)
+        return index, read_arrays(done, "cross-validation", "remove it; --resume creates it again")["pas"].astype(np.float32)
     part = dataclasses.replace(dataset, train=known[~left_out], validation=known[left_out])
     place.mkdir(parents=True, exist_ok=True)
     trained = train(part, field, settings, seed, place, resume=True, devices=devices, shown=False)
@@ -120,7 +120,8 @@ def _answers(
 
 
 def shortened(settings: Settings, steps: int) -> Settings:
-    """Returns settings with a share of so many steps, a multiple of the epoch; there is nothing to watch and little to save."""
+    """Returns settings with the fraction `SHARE` of a number of steps, rounded to whole epochs, without evaluation and with few
+    checkpoints."""
     block = settings.loop.epoch_steps
     steps = max(round(SHARE * steps / block), 1) * block
     optim = dataclasses.replace(settings.optim, steps=steps, min_steps=0, max_epochs=1e9)
@@ -129,44 +130,44 @@ def shortened(settings: Settings, steps: int) -> Settings:
 
 
 ENOUGH = 20
-"""Validation transmitters from which on they decide alone."""
+"""Number of validation transmitters from which on the validation part alone is sufficient."""
 
 
 class Training(NamedTuple):
-    """What a field was trained with."""
+    """The arguments of the training of a field."""
 
     field: str
     settings: Settings
     steps: int
-    """That it took."""
+    """Number of steps that were done."""
     seed: int
     folder: Path
     devices: int = 0
 
 
 class Few(NamedTuple):
-    """What was found."""
+    """Result of the cross-validation."""
 
     mixture: Mixture | None
-    """None: the field stands alone."""
+    """Mixture with simple methods; None to use the field alone."""
     confidence: Confidence | None
-    """How sure its answers are; None where what was held out is too little, or is left to the validation part."""
+    """Prediction intervals; None if too few links were held out, or if they are to be fitted on the validation part."""
     line: str
-    """In words."""
+    """Summary for the terminal."""
 
 
 def is_few(dataset: Dataset) -> bool:
-    """Returns whether a data set's spectra are so few that simple methods are members of the answer."""
+    """Returns whether a dataset has so few spectra that simple methods are part of the mixture."""
     validation = np.unique(dataset.tx_index[dataset.validation])
     return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < ENOUGH
 
 
 def learn_few(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> Few:
-    """Returns what goes with a trained field."""
+    """Returns the mixture and the prediction intervals of a trained field, from cross-validation."""
     no_paths = knows_no_paths(dataset, type(field))
     known, held = cross_validated(field, params, dataset, training, say)
     if not len(held.links) and not no_paths:
-        return Few(None, None, "nothing was held out: the field, which knows paths, answers alone")
+        return Few(None, None, "no links were held out: the field, which predicts paths, is used alone")
     found = learn_mixture(dataset, known, held, ERRORS if no_paths else ERRORS_WITH_PATHS)
     if found.alone:
         return Few(None, None, found.line)
@@ -174,7 +175,7 @@ def learn_few(field: Field, params: Params, dataset: Dataset, training: Training
 
 
 def cross_validated(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> tuple[Known, HeldOut]:
-    """Returns all known spectra, and what fields answer that were not trained on some of them."""
+    """Returns all measured spectra, and held-out predictions of fields that were not trained on some of them."""
     index = training_links(dataset)
     held = _validation(field, params, dataset, index)
     if knows_no_paths(dataset, type(field)) and jax.process_count() == 1:
@@ -185,7 +186,7 @@ def cross_validated(field: Field, params: Params, dataset: Dataset, training: Tr
 
 
 def _validation(field: Field, params: Params, dataset: Dataset, known: Int[np.ndarray, " m"]) -> HeldOut:
-    """Returns what a field answers to its validation part, every transmitter a group of its own."""
+    """Returns the predictions of a field for its validation part; every transmitter is a group."""
     index = dataset.validation
     pas = as_observed(field, params, predict_spectra(field, params, dataset, index)) if len(index) else np.zeros((0, 90, 360))
     trained = np.isin(known, dataset.train)
@@ -193,18 +194,18 @@ def _validation(field: Field, params: Params, dataset: Dataset, known: Int[np.nd
 
 
 def _together(blocks: HeldOut, validation: HeldOut) -> HeldOut:
-    """Returns both, the groups told apart."""
+    """Returns the predictions of both, with distinct groups."""
     group = validation.group + 1 + blocks.group.max(initial=0)
     return HeldOut(*map(np.concatenate, zip(blocks, validation._replace(group=group), strict=True)))
 
 
 def _confidence(dataset: Dataset, held: HeldOut, found: Found) -> Confidence | None:
-    """Returns how sure the mixture's answers are, from what it answers to what was held out."""
+    """Returns prediction intervals of the mixture, from its predictions for held-out links."""
     if len(np.unique(dataset.tx_index[held.links])) < 2:
         return None
     query, receiver = dataset.query(held.links), dataset.receiver()
     trained = jnp.asarray(np.unique(dataset.tx_positions[training_links(dataset)], axis=0), jnp.float32)
-    asked = features(jnp.asarray(found.answers, jnp.float32), query, receiver.position, trained)
-    known = np.array(asked, np.float64)
-    known[:, 0] = 0.5 * np.log(found.distance**2 + 1e-4)  # from those that were left
+    inputs = features(jnp.asarray(found.answers, jnp.float32), query, receiver.position, trained)
+    known = np.array(inputs, np.float64)
+    known[:, 0] = 0.5 * np.log(found.distance**2 + 1e-4)  # distances to the transmitters that were not left out
     return confidence_of(known, found.scores, dataset.tx_index[held.links], receiver.position, trained)

@@ -1,4 +1,4 @@
-"""The curves of a run: metrics.jsonl, a JSON object a line, each with the step it was written at."""
+"""Training curves of a run: metrics.jsonl has one JSON object per line, each with the step at which it was written."""
 
 import contextlib
 import json
@@ -10,7 +10,11 @@ from wbgs_jax._util.files import atomic_write
 
 
 def append(path: Path, entry: dict[str, Any]) -> None:
-    """Appends a line; a file that cannot be written is a `UserError`."""
+    """Appends an entry.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as stream:
@@ -20,12 +24,13 @@ def append(path: Path, entry: dict[str, Any]) -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """Returns all entries; of a file that is not there, none. Lines that are none are left out."""
+    """Returns all entries; an empty list if the file does not exist. Invalid lines are skipped."""
     return [entry for _, entry in _entries(path)]
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drops entries after the checkpoint that a run resumes from (those steps are done again), and a line cut short."""
+    """Removes entries after the step of the checkpoint that a run resumes from (these steps are repeated), and truncated
+    lines."""
     if path.exists():
         kept = [line for line, entry in _entries(path) if entry["step"] <= step]
         with atomic_write(path) as stream:
@@ -33,7 +38,7 @@ def forget_after(path: Path, step: int) -> None:
 
 
 def _entries(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Returns lines and what they hold. A curve is there to be looked at: a damaged line is no reason to stop."""
+    """Returns lines with their entries. Curves are only displayed, so that damaged lines are skipped without an error."""
     found = []
     for line in path.read_bytes().decode(errors="replace").splitlines() if path.is_file() else ():
         with contextlib.suppress(ValueError, RecursionError):

@@ -1,9 +1,9 @@
 """Adaptive density control on the host, between jitted epochs (paper, section 4.5; Kerbl et al. 2023).
 
-A Gaussian whose positional gradient on the image is large is not well reconstructed: a small one is cloned, the clone moved
-along the descent direction of its mean; a large one is split in two. Gaussians that hardly attenuate are removed, and now and
-then delta_o is reset close to zero so that the useless ones can be told. Optimiser moments travel with their Gaussian;
-new ones start from zero moments.
+A region is not well reconstructed if the positional gradient of its Gaussian on the image is large: a small Gaussian is cloned,
+with the clone displaced along the descent direction of its mean; a large one is split in two. Gaussians with negligible
+attenuation are removed, and delta_o can be reset close to zero at intervals so that unnecessary Gaussians become apparent.
+Optimiser moments stay with their Gaussian; those of new Gaussians start at zero.
 """
 
 import dataclasses
@@ -29,26 +29,26 @@ from wbgs_jax.types import Gaussians
 SPLIT_SHRINK = 1.6
 """Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting)."""
 CLONE_STEP = 0.5
-"""How far a clone moves, in its smallest standard deviations."""
+"""Displacement of a clone, relative to its smallest standard deviation."""
 NEARLY_FULL = 0.7
-"""Share of the slots from which on the next size is made ready."""
+"""Fraction of used slots from which on the program for the next size is compiled."""
 
 
 @pytree
 class DensityStatistics:
-    """What density control needs to know about every Gaussian, summed since the last control."""
+    """Statistics of every Gaussian for density control, summed since the last control."""
 
     gradient_norm: Float[Array, " n"]
     """Norm of the positional gradient on the image, in normalised coordinates (-1..1 across the image)."""
     mean_gradient: Float[Array, "n 3"]
     """Gradient of the loss with respect to the mean (per metre)."""
     visible: Float[Array, " n"]
-    """Steps in which the Gaussian touched the image."""
+    """Number of steps in which the Gaussian was visible on the image."""
 
 
 @dataclass(frozen=True)
 class DensityReport:
-    """What one control did."""
+    """Numbers of Gaussians that a control has cloned, split and removed, and of those that are in use afterwards."""
 
     cloned: int
     split: int
@@ -58,8 +58,8 @@ class DensityReport:
 
 @dataclass(frozen=True)
 class DensityControl(Hook):
-    """The hook of fields whose parameters hold `gaussians`. The probe is the offset (n, 2), in pixels, of their projected
-    centres, whose gradient it watches."""
+    """The hook of fields whose parameters have an attribute `gaussians`. The probe is the offset (n, 2), in pixels, of their
+    projected centres; the hook accumulates its gradient."""
 
     config: DensityConfig
     stream: int = 3
@@ -81,7 +81,7 @@ class DensityControl(Hook):
         return DensityStatistics(statistics.gradient_norm + norm, mean_gradient, statistics.visible + (norm > 0))
 
     def due(self, step: int, steps: int) -> bool:
-        """Returns whether the schedule asks for a control or a reset after this step."""
+        """Returns whether a control or a reset is scheduled after this step."""
         config = self.config
         if not config.every or step < max(config.start, 1) or step > config.stop_fraction * steps:
             return False
@@ -99,7 +99,7 @@ class DensityControl(Hook):
         step: int,
         rng: np.random.Generator,
     ) -> Edit:
-        """Returns the parameters after clones, splits, prunes and, where it is time, a reset of delta_o."""
+        """Returns the parameters after cloning, splitting and pruning and, if scheduled, a reset of delta_o."""
         edit = Edit(params, statistics, lambda tree: tree, {})
         if step % self.config.every == 0:
             edit = control_density(params, statistics, self.config, rng)
@@ -107,7 +107,7 @@ class DensityControl(Hook):
         return reset_attenuation(edit, self.config) if self._resets(step) else edit
 
     def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns the shapes of the parameters with more slots, where few are left and Gaussians may still be added."""
+        """Returns the shapes of the parameters with more slots if few are free and Gaussians may still be added, else None."""
         slots, most = len(params.gaussians.means), self.config.max_gaussians
         alive = int(np.asarray(params.gaussians.alive).sum())
         every, last = max(self.config.every, 1), self.config.stop_fraction * steps
@@ -147,7 +147,7 @@ def control_density(params: Params, statistics: DensityStatistics, config: Densi
 
 
 def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:
-    """Returns an edit in which delta_o is lowered to at most `reset_attenuation`, its moments forgotten."""
+    """Returns an edit in which delta_o is lowered to at most `reset_attenuation` and its moments are set to zero."""
     gaussians = edit.params.gaussians
     ceiling = math.log(config.reset_attenuation / (1 - config.reset_attenuation))
     lowered = dataclasses.replace(gaussians, opacity_logits=jnp.minimum(gaussians.opacity_logits, ceiling))
@@ -163,10 +163,8 @@ def reset_attenuation(edit: Edit, config: DensityConfig) -> Edit:
 def choose(
     gaussians: Gaussians, statistics: DensityStatistics, config: DensityConfig
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Returns masks (keep, clone, split) of the Gaussians: a split one is not kept, a cloned one is.
-
-    There are never more than the maximum.
-    """
+    """Returns masks (keep, clone, split) of the Gaussians. A Gaussian that is split is not kept, one that is cloned is kept.
+    The resulting number never exceeds the maximum."""
     alive = np.asarray(gaussians.alive)
     attenuation = 1 / (1 + np.exp(-np.asarray(gaussians.opacity_logits)))
     useful = alive & (attenuation >= config.prune_attenuation)
@@ -175,7 +173,7 @@ def choose(
     gradient = np.asarray(statistics.gradient_norm) / np.maximum(np.asarray(statistics.visible), 1)
     wanting = useful & (gradient > config.gradient_threshold)
     room = max(config.max_gaussians - int(useful.sum()), 0)
-    if wanting.sum() > room:  # the neediest first; stable, so that equal runs stay equal
+    if wanting.sum() > room:  # the largest gradients first, in a stable order for reproducible runs
         chosen = np.argsort(-np.where(wanting, gradient, -1), kind="stable")[:room]
         wanting = np.zeros_like(wanting)
         wanting[chosen] = True
@@ -185,7 +183,7 @@ def choose(
 
 
 def _sources(keep, clone, split) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Returns for every new slot the Gaussian it comes from, and whether it is new: kept ones, clones, then pairs of halves."""
+    """Returns the source of every resulting Gaussian, and whether it is new: kept Gaussians, clones, then pairs of halves."""
     kept, cloned, halves = (np.flatnonzero(mask) for mask in (keep, clone, split))
     source = np.concatenate([kept, cloned, np.repeat(halves, 2)])
     return source, np.arange(len(source)) >= len(kept)
@@ -194,7 +192,8 @@ def _sources(keep, clone, split) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray
 def _edit(
     gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator
 ) -> Gaussians:
-    """Returns the new Gaussians, without empty slots: clones stepped downhill, halves drawn from the Gaussian they replace."""
+    """Returns the resulting Gaussians, without empty slots: clones are displaced downhill, and the halves of a split are drawn
+    from the Gaussian that they replace."""
     means, log_scales, quats, logits = (
         np.asarray(a)[source].copy() for a in (gaussians.means, gaussians.log_scales, gaussians.quats, gaussians.opacity_logits)
     )

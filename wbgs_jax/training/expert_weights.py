@@ -1,4 +1,4 @@
-"""How much each opinion of a field that mixes several counts: found on validation links after the last step, on the host."""
+"""Mixture weights of the experts of a field, fitted to validation links after the last step (host)."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -27,20 +27,20 @@ from wbgs_jax.types import Batch
 
 
 class Seen(NamedTuple):
-    """What is said of B links, and what was observed."""
+    """Predictions of the experts for B links, with observations."""
 
     spectra: Opinions
     power: Opinions
     told: Float[Array, "b features"]
-    """What tells whom to trust."""
+    """Features that the mixture weights depend on."""
     pas: Float[Array, "b 90 360"] | None
     power_db: Float[Array, " b"] | None
 
 
 @dataclass(frozen=True)
 class ExpertWeights(Hook):
-    """Gives a field that is `Mixing` the shares that explain best what none of its components was trained on; of what was not
-    observed, spectra or powers, the coherent one's are taken. With them, the floor under noisy spectra is found
+    """The hook of a `Mixing` field: fits the mixture weights to validation links, which none of its components was trained on.
+    For spectra or powers without observations the coherent field is used alone. The noise floor of spectra is estimated as well
     (`fields.mixture`)."""
 
     stream: int = 4
@@ -52,7 +52,7 @@ class ExpertWeights(Hook):
     def apply(
         self, field: Field, params: Params, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the parameters with these shares; as they are where a component is missing, or nothing is held out."""
+        """Returns the parameters with fitted weights, or unchanged if a component or the validation links are missing."""
         batches, mixing = context.validation(), field.ability(Mixing)
         same = Edit(params, (), lambda tree: tree, {})
         if mixing is None or not batches or len(components_of(field)) < len(field.components):
@@ -82,6 +82,6 @@ def _receiver_of(batch: Batch) -> int:
 
 @jax.jit
 def opinions_on(field: Mixing, params: Params, plan: Any, batch: Batch) -> Seen:
-    """Returns what is said of spectra and powers of links, what tells whom to trust, and what was observed."""
+    """Returns the experts' spectra and received powers of links, the features of their weights, and the observations."""
     spectra, power, told = field.opinions(params, plan, batch.links)
     return Seen(spectra, power, told, batch.pas, batch.received_db)

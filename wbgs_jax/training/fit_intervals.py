@@ -1,8 +1,8 @@
-"""What the validation part says about how sure a trained field's answers are, on the host.
+"""Fit of prediction intervals to the validation part of a trained field (host).
 
-Every transmitter is left out in turn, so that what is left of the scores is that of transmitters that were not looked at. Of a
-few sets of features, each with the ones before, the largest is taken that lowers the mean squared rest by more than chance;
-small validation parts can tell of few features only.
+Every transmitter is left out in turn, so that residuals of the scores are those of transmitters that were not used in the
+regression. Of several nested sets of features, the largest is chosen that lowers the mean squared residual by more than a
+standard error; small validation parts support only few features.
 """
 
 import jax
@@ -31,27 +31,32 @@ from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 FEWEST, MOST = 8, 1000
-"""Validation spectra below which nothing is said; those that are looked at, at most."""
+"""Minimum number of validation spectra for prediction intervals, and maximum number that is used."""
 DRAWS = 400
-"""Of one link of every transmitter."""
+"""Number of draws of one link per transmitter."""
 SETS = (0, 1, 3, 5, FEATURES)
-"""Numbers of features that are tried: none, the distance, and how bright the answer is, and the frequency, and the power."""
+"""Numbers of features that are tried: none; the distance; also the brightness of the prediction; also the frequency; also the
+power."""
 POWER_SETS = (0, 1, 2, POWER_FEATURES)
-"""The same of received powers: none, the distance, and the power itself, and the frequency."""
+"""Numbers of features that are tried for received powers: none; the distance; also the power itself; also the frequency."""
 ENOUGH = 5
-"""Transmitters for every feature, at least: of fewer a regression learns their own errors by heart."""
+"""Minimum number of transmitters per feature; with fewer the regression overfits."""
 RIDGE = 1.0
-"""Of the scaled features: that of one spectrum."""
+"""Ridge penalty on the coefficients of scaled features, in units of the weight of one spectrum."""
 _features, _power_features = jax.jit(features), jax.jit(power_features)
 
 
 def learn_confidence(
     field: Field, params: Params, dataset: Dataset, neighbours: Neighbours | None
 ) -> tuple[Confidence | None, PowerConfidence | None]:
-    """Returns how sure spectra and received powers are; None where field or data know nothing of them, or for too few
-    validation links.
+    """Returns the prediction intervals of spectra and of received powers; None if the field or the data do not contain them, or
+    for too few validation links.
 
-    `neighbours` are those of the training part alone, if neighbours are asked.
+    Args:
+        field: trained field.
+        params: its parameters.
+        dataset: data that it was trained on.
+        neighbours: residual kriging from the training part alone, if it is used.
     """
     if len(dataset.validation) < FEWEST or len(np.unique(dataset.tx_index[dataset.validation])) < 2:
         return None, None
@@ -87,14 +92,14 @@ def confidence_of(
     rx_position: Float[Array, "*r 3"],
     tx_position: Float[Array, "m 3"],
 ) -> Confidence:
-    """Returns how sure answers are, from the features and scores (SSIM) of some of them.
+    """Returns prediction intervals of the SSIM, fitted to the features and scores of N predictions.
 
     Args:
-        known: features of the answers (`inference.intervals.features`).
-        scores: what they scored.
+        known: features of the predictions (`inference.intervals.features`).
+        scores: their SSIM.
         tx_index: their transmitters.
-        rx_position: of the receivers, metres.
-        tx_position: of the transmitters that are known, metres.
+        rx_position: positions of the receivers, metres.
+        tx_position: positions of the trained transmitters, metres.
     """
     *learned, rest = fit(known, np.log(1 + MARGIN - np.minimum(scores, 1)), tx_index, SETS)
     quantiles, level = interval(rest, tx_index)
@@ -106,14 +111,14 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     truth = dataset.received_db(index)
     if truth is None or seen.power_db is None:
         return None
-    heard = np.flatnonzero(truth > NOT_HEARD_DB)
-    if len(heard) < FEWEST or len(np.unique(dataset.tx_index[index[heard]])) < 2:
+    received = np.flatnonzero(truth > NOT_HEARD_DB)
+    if len(received) < FEWEST or len(np.unique(dataset.tx_index[index[received]])) < 2:
         return None
-    index, said = index[heard], np.asarray(seen.power_db)[heard]
+    index, predicted = index[received], np.asarray(seen.power_db)[received]
     receivers = jnp.asarray(dataset.rx_positions(index), jnp.float32)
     trained = _trained(dataset)
-    known = np.asarray(_power_features(jnp.asarray(said), dataset.query(index), receivers, trained), np.float64)
-    error = np.log(POWER_MARGIN_DB + np.abs(said.astype(np.float64) - truth[heard]))
+    known = np.asarray(_power_features(jnp.asarray(predicted), dataset.query(index), receivers, trained), np.float64)
+    error = np.log(POWER_MARGIN_DB + np.abs(predicted.astype(np.float64) - truth[received]))
     *learned, rest = fit(known, error, dataset.tx_index[index], POWER_SETS)
     level = exact_level(dataset.tx_index[index])
     arrays = *learned, upper_end(rest, dataset.tx_index[index], 1 - level), np.exp(rest).mean(), level
@@ -121,15 +126,21 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
 
 
 def _trained(dataset: Dataset) -> Float[Array, "m 3"]:
-    """Returns where transmitters stood that were trained."""
+    """Returns the positions of the trained transmitters, metres."""
     return jnp.asarray(np.unique(dataset.tx_positions[dataset.train], axis=0), jnp.float32)
 
 
 def fit(
     known: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], sets: tuple[int, ...]
 ) -> tuple[np.ndarray, ...]:
-    """Returns mean and scale of the features, and the weights, of a `Confidence`, from features and log errors of some answers,
-    and what is left of these errors; `sets` are the numbers of features that are tried."""
+    """Returns mean and scale of the features, the weights of a `Confidence`, and the residuals of left-out transmitters.
+
+    Args:
+        known: features of N predictions.
+        error: logarithms of their errors.
+        tx_index: their transmitters.
+        sets: numbers of features that are tried.
+    """
     mean, scale = known.mean(0), known.std(0) + 1e-6
     scaled = (known - mean) / scale
     sets = tuple(size for size in sets if ENOUGH * size <= len(np.unique(tx_index)))
@@ -145,7 +156,7 @@ def fit(
 
 
 def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k+1"]:
-    """Returns the weights of the features and of 1 (ridge regression; 1 is not held back)."""
+    """Returns the coefficients of the features and of the constant 1 (ridge regression; the constant is not penalised)."""
     columns = np.column_stack([scaled, np.ones(len(scaled))])
     penalty = np.diag([RIDGE] * scaled.shape[1] + [0.0])
     weights: np.ndarray = np.linalg.solve(columns.T @ columns + penalty, columns.T @ error)
@@ -155,7 +166,7 @@ def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"]) ->
 def left_out(
     scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns what a regression on all other transmitters leaves of every error."""
+    """Returns the residual of every error from a regression on all other transmitters."""
     rest = np.zeros(len(error))
     for tx in np.unique(tx_index):
         own = tx_index == tx
@@ -165,9 +176,9 @@ def left_out(
 
 
 def interval(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "2"], float]:
-    """Returns the ends between which further rests lie, and how surely: with the chance `LEVEL`, where there are transmitters
-    enough for two tails; with fewer there is no lower end (scores as high as they may be), and with fewer still the level is
-    the highest that exists."""
+    """Returns the ends of the interval of further residuals, and its level: `LEVEL` if there are enough transmitters for two
+    tails. With fewer transmitters the interval has no lower end (no upper bound of the score), and with still fewer the level
+    is the highest that exists."""
     tail = (1 - LEVEL) / 2
     if tail * (len(np.unique(tx_index)) + 1) >= 1 - 1e-9:
         return np.array([-upper_end(-rest, tx_index, tail), upper_end(rest, tx_index, tail)]), LEVEL
@@ -176,21 +187,21 @@ def interval(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> 
 
 
 def exact_level(tx_index: Int[np.ndarray, " n"]) -> float:
-    """Returns the level of one-sided intervals: `LEVEL`, or what n transmitters allow, n / (n + 1)."""
+    """Returns the level of one-sided intervals: `LEVEL`, or the highest that n transmitters allow, n / (n + 1)."""
     count = len(np.unique(tx_index))
     return min(LEVEL, count / (count + 1))
 
 
 def upper_end(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], tail: float = 1 - LEVEL) -> float:
-    """Returns what all but a share `tail` of further rests lie below.
+    """Returns the bound that further residuals exceed with probability `tail`; infinite for too few transmitters.
 
-    A new transmitter is exchangeable with those that were seen, its links are not with each other. Of one link of each of n
-    transmitters the rank (1 - tail) (n + 1) is exact (split conformal prediction, Lei et al. 2018), whatever the distribution;
-    between ranks it is interpolated, and it is the mean over many draws of these links (Dunn, Wasserman and Ramdas 2023). Of
-    too few transmitters it is infinite.
+    A new transmitter is exchangeable with the observed ones, but its links are not exchangeable with each other. For one link
+    of each of n transmitters, the rank (1 - tail) (n + 1) is exact for any distribution (split conformal prediction, Lei et al.
+    2018). The bound is interpolated between ranks, and averaged over many draws of these links (Dunn, Wasserman and Ramdas
+    2023).
     """
     owns = [rest[tx_index == tx] for tx in np.unique(tx_index)]
-    rank = round((1 - tail) * (len(owns) + 1), 9)  # binary fractions would lose a place
+    rank = round((1 - tail) * (len(owns) + 1), 9)  # rounded, since binary fractions could lose a rank
     if rank > len(owns):
         return np.inf
     rng = np.random.default_rng(5)

@@ -1,9 +1,9 @@
-"""Whether known spectra nearby are to be asked beside a trained field, and how: found on the validation part, on the host.
+"""Selection of residual kriging, which corrects a trained field by measured spectra nearby, on the validation part (host).
 
-The training part is what is asked, at transmitters of the validation part, which the field has not seen. If the best way
-surely gains something that is worth it, the smoothest one is kept that gains no less by more than a standard error (Breiman
-et al. 1984): validation transmitters often lie closer to their neighbours than those that are asked for later. Afterwards both
-parts are asked.
+Spectra of the training part are used to predict those of the validation part, which the field was not trained on. If the best
+choice improves significantly and by a relevant amount, the smoothest choice is kept that gains no less by more than a standard
+error (Breiman et al. 1984), because validation transmitters often lie closer to their neighbours than later queries do. The
+result then uses the spectra of both parts.
 """
 
 import itertools
@@ -26,54 +26,57 @@ from wbgs_jax.metrics import ssim
 
 Kind = Literal["residuals", "spectra"]
 FEWEST, MOST = 4, 20_000
-"""Validation spectra below which nothing is decided; known spectra above which nothing is kept (32 kB each)."""
+"""Minimum number of validation spectra for a decision, and maximum number of measured spectra that are stored (32 kB each)."""
 MOST_RESIDUALS = 1000
-"""Known spectra above which residuals are not tried: they are those of spectra that the field was trained on, and of many of
-them it leaves none."""
+"""Number of measured spectra above which residuals are not tried: the field was trained on these spectra, and many of them are
+fitted almost without residual."""
 SCORED = 60
-"""Validation spectra that are looked at."""
+"""Maximum number of validation spectra that are scored."""
 SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
-"""Lengths that are tried, in median distances of a training transmitter to the next one."""
+"""Correlation lengths that are tried, relative to the median distance between a training transmitter and the nearest other."""
 WEIGHTS = (0.5, 1.0)
+"""Weights of the kriged spectra that are tried."""
 SURE, WORTH = 2.0, 0.005
-"""Standard errors, and SSIM, that the best of them has to gain."""
+"""Minimum gain of the best choice, in standard errors and in SSIM."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """How neighbours are asked."""
+    """Settings of residual kriging."""
 
     kind: Kind
+    """Whether residuals of the field or the spectra themselves are interpolated."""
     length: float
-    """Metres."""
+    """Correlation length, metres."""
     weight: float
+    """Factor of the interpolated values."""
 
 
 class Learned(NamedTuple):
-    """What was found."""
+    """Result of the selection."""
 
     neighbours: Neighbours | None = None
-    """None: the field is better by itself."""
+    """Residual kriging from the training and validation parts; None to use the field alone."""
     line: str = ""
-    """What was found, in words."""
+    """Summary for the terminal."""
     of_training: Neighbours | None = None
-    """The same of the training part alone, for whoever looks at the validation part."""
+    """The same from the training part only, for evaluations on the validation part."""
 
 
 def learn_neighbours(field: Field, params: Params, dataset: Dataset) -> Learned:
-    """Returns the neighbours that improve a trained field.
+    """Returns the residual kriging that improves a trained field, if any.
 
-    Data of several receivers, of received powers, with fewer than `FEWEST` validation or more than `MOST` known spectra have
-    none.
+    It is not used for data of several receivers or of received powers, with fewer than `FEWEST` validation spectra, or with
+    more than `MOST` measured spectra.
     """
     links = training_links(dataset)
     if not dataset.has_spectra:
         return Learned()
     if why := _why_not(dataset, len(links)):
-        return Learned(line=f"neighbours are not asked: {why}")
-    asked = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
-    truth, tx = np.asarray(dataset.pas(asked)), dataset.tx_index[asked]
-    own = predict_spectra(field, params, dataset, asked)
+        return Learned(line=f"no residual kriging: {why}")
+    queried = np.random.default_rng(0).permutation(dataset.validation)[:SCORED]
+    truth, tx = np.asarray(dataset.pas(queried)), dataset.tx_index[queried]
+    own = predict_spectra(field, params, dataset, queried)
 
     def alike(pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
         return ssim(as_observed(field, params, pas), truth)
@@ -81,33 +84,33 @@ def learn_neighbours(field: Field, params: Params, dataset: Dataset) -> Learned:
     alone, of_training = alike(own), _Known(field, params, dataset, dataset.train)
 
     def gains(choice: Choice) -> Float[np.ndarray, " n"]:
-        return alike(corrected(of_training.neighbours(choice), own, dataset, asked)) - alone
+        return alike(corrected(of_training.neighbours(choice), own, dataset, queried)) - alone
 
     chosen, gain = choose({choice: gains(choice) for choice in choices(dataset, dataset.train)}, tx)
     if chosen is None:
-        return Learned(line=f"neighbours gain nothing sure on validation ({gain:+.3f} SSIM): the field answers alone")
-    line = f"{chosen.kind} of neighbours within about {chosen.length:.2g} m, asked too, gain {gain:+.3f} SSIM on validation"
+        return Learned(line=f"residual kriging gains nothing significant on validation ({gain:+.3f} SSIM): not used")
+    line = f"kriging of {chosen.kind} within about {chosen.length:.2g} m gains {gain:+.3f} SSIM on validation: used"
     return Learned(_Known(field, params, dataset, links).neighbours(chosen), line, of_training.neighbours(chosen))
 
 
 def _why_not(dataset: Dataset, known: int) -> str:
-    """Returns why a data set can have no neighbours; nothing, where it can."""
+    """Returns the reason why residual kriging cannot be used for a dataset; empty if it can."""
     if dataset.n_receivers > 1:
         return "the data have several receivers"
     if len(dataset.validation) < FEWEST:
-        return f"of {len(dataset.validation)} validation spectra there is nothing to learn whether that gains"
-    return f"{known:,} known spectra are more than {MOST:,}" if known > MOST else ""
+        return f"{len(dataset.validation)} validation spectra are too few to measure its gain"
+    return f"{known:,} measured spectra are more than {MOST:,}" if known > MOST else ""
 
 
 class _Known:
-    """Known links, whose images are made once for all choices."""
+    """Measured links, whose images are computed once for all choices."""
 
     def __init__(self, field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " m"]):
         self._made: dict[Kind, Num[Array, "m 90 360"]] = {}
         self._asked, self.dataset, self.index = (field, params), dataset, index
 
     def neighbours(self, choice: Choice) -> Neighbours:
-        """Returns them as neighbours."""
+        """Returns the residual kriging from these links with the settings of a choice."""
         if choice.kind not in self._made:
             spectra = self.dataset.eight_bit(self.index)
             self._made[choice.kind] = images_of(choice.kind, spectra, self._predicted() if choice.kind == "residuals" else None)
@@ -120,15 +123,15 @@ class _Known:
 def images_of(
     kind: Kind, spectra: UInt8[np.ndarray, "m 90 360"], predicted: Float[np.ndarray, "m 90 360"] | None
 ) -> Num[Array, "m 90 360"]:
-    """Returns what is kept of known spectra: themselves in bytes, or what a field leaves of them in half precision."""
+    """Returns the stored form of measured spectra: the spectra in bytes, or the residuals of a field in half precision."""
     if kind == "spectra":
         return jnp.asarray(spectra)
-    assert predicted is not None, "residuals are what predictions leave"
+    assert predicted is not None, "residuals need predictions"
     return jnp.asarray(spectra / 255 - predicted, jnp.float16)
 
 
 def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
-    """Returns what is tried."""
+    """Returns the choices that are tried for measured links, given by their indices; none for a single transmitter position."""
     positions = np.unique(dataset.tx_positions[known], axis=0)
     if len(positions) < 2:
         return []
@@ -138,14 +141,18 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
 
 
 def spacing(places: Float[np.ndarray, "n 3"]) -> float:
-    """Returns the median distance (metres) of a place to the next one, of two or more different ones."""
+    """Returns the median distance (metres) between a place and the nearest other, of at least two different places."""
     return float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
 
 
 def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarray, " n"]) -> tuple[Choice | None, float]:
-    """Returns the choice by its gains over the field alone (None: nothing sure), and its mean gain.
+    """Returns the best choice and its mean gain; the choice is None if no gain is significant.
 
-    Of two, the one with the full weight is smoother, then the one of spectra, then the longer one.
+    Of two choices the smoother one is that with full weight, then that of spectra, then that with the longer length.
+
+    Args:
+        tried: gains (SSIM) of N links over the field alone, by choice.
+        tx_index: transmitters of the links.
     """
     if not tried:
         return None, 0.0
@@ -161,7 +168,14 @@ def choose(tried: dict[Choice, Float[np.ndarray, " n"]], tx_index: Int[np.ndarra
 def make_neighbours(
     choice: Choice, dataset: Dataset, index: Int[np.ndarray, " m"], images: Num[Array, "m 90 360"]
 ) -> Neighbours:
-    """Returns known links, with `images_of` them, as neighbours."""
+    """Returns the residual kriging from measured links.
+
+    Args:
+        choice: its settings.
+        dataset: data of one receiver.
+        index: indices of the links.
+        images: result of `images_of` for these links.
+    """
     spectra = choice.kind == "spectra"
     return Neighbours(
         rx_position=dataset.receiver().position,

@@ -1,11 +1,10 @@
-"""How simple methods and a trained field share an answer where spectra are few: found by cross-validation, on the host.
+"""Mixture of simple methods with a trained field for small numbers of spectra, fitted by cross-validation (host).
 
-The simple methods are members from the start. Their weights are those by which known spectra are explained best from others
-at all distances: every one is left out, alone and with shares of the other transmitters, the nearest ones. The field gains
-a share as far as spectra that it was not trained on prove that it is better: of all shares the one whose gain over the simple
-methods has the largest lower confidence bound. Without evidence that is none.
-
-Stacking: the weights of a mixture of spectra, functions of one number, by which known spectra are explained best (SSIM).
+The simple methods are part of the mixture from the start. Their weights are those that predict measured spectra best (SSIM)
+from others at all distances: every spectrum is left out, alone and together with fractions of the other transmitters, the
+nearest ones. This is stacking, with weights that are functions of one number. The field receives a weight only if it is better
+on spectra that it was not trained on: of all weights, the one whose gain over the simple methods has the largest lower
+confidence bound. Without evidence its weight is zero.
 """
 
 import dataclasses
@@ -28,22 +27,23 @@ from wbgs_jax.inference.mixture import LOG_METRE, MEMBERS, Mixture, member_spect
 from wbgs_jax.training.fit_kriging import spacing
 
 STRIDE = 8
-"""Pixels between the windows by which mixtures are compared."""
+"""Stride, in pixels, of the SSIM windows with which mixtures are compared."""
 STEPS, RATE = 200, 0.1
-"""Of Adam, which finds the weights."""
+"""Steps and learning rate of Adam, which fits the weights."""
 _C1, _C2 = 0.01**2, 0.03**2
 
 
 class Moments(NamedTuple):
-    """What the SSIM of any mixture of K spectra with their truth follows from, window by window."""
+    """Moments of K spectra and their truth, window by window, from which the SSIM of any mixture follows."""
 
     means: Float[Array, "n windows k+1"]
+    """Means; the truth comes last."""
     products: Float[Array, "n windows k+1 k+1"]
     """Covariances; the truth comes last."""
 
 
 def moments_of(spectra: Float[np.ndarray, "n k 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Moments:
-    """Returns the moments of scikit-image's windows of 7 x 7 pixels, some of them."""
+    """Returns the moments of windows of 7 x 7 pixels, as in scikit-image, at every `STRIDE`-th position along both axes."""
     means, products = [], []
     for own, observed in zip(spectra, truth, strict=True):
         together = np.concatenate([own, observed[None]])
@@ -57,7 +57,7 @@ def moments_of(spectra: Float[np.ndarray, "n k 90 360"], truth: Float[np.ndarray
 
 
 def ssim_of(moments: Moments, weights: Float[Array, "n k"]) -> Float[Array, " n"]:
-    """Returns the SSIM of mixtures."""
+    """Returns the SSIM of mixtures with K weights each."""
     mean, truth = jnp.einsum("nwk,nk->nw", moments.means[..., :-1], weights), moments.means[..., -1]
     cross = moments.products[..., :-1, :]
     own = jnp.einsum("nwkl,nk,nl->nw", cross[..., :-1], weights, weights)
@@ -71,13 +71,13 @@ def ssim_of(moments: Moments, weights: Float[Array, "n k"]) -> Float[Array, " n"
 def fit_weights(
     moments: Moments, u: Float[Array, " n"], prior: Float[Array, "k 2"], ridge: Float[Array, "k 2"]
 ) -> Float[Array, "k 2"]:
-    """Returns the logits of the weights by which spectra are explained best.
+    """Returns the logits of the weights with the largest mean SSIM.
 
     Args:
-        moments: of spectra and truths.
-        u: what the logits are linear in.
-        prior: bias and slope of every logit as long as nothing contradicts.
-        ridge: penalties, in SSIM, on the squared distance of each from it.
+        moments: moments of spectra and truths.
+        u: variable in which the logits are linear.
+        prior: prior bias and slope of every logit.
+        ridge: penalties, in SSIM, on their squared distances from the prior.
     """
     optimizer = optax.adam(RATE)
 
@@ -95,79 +95,82 @@ def fit_weights(
 
 
 LEFT_OUT = 160
-"""Spectra that are left out, each with several numbers of other transmitters, at most."""
+"""Maximum number of cases in which a spectrum is left out, together with different numbers of other transmitters."""
 SHARES_LEFT_OUT = (0.0, 0.12, 0.25, 0.5)
-"""Of the transmitters, the nearest ones, that are left out with a spectrum."""
+"""Fractions of the other transmitters, the nearest ones, that are left out together with a spectrum."""
 LENGTHS, NUGGETS = 7, (1e-2, 0.1, 1.0)
-"""Number of lengths of the kriging that are tried, from the distance of a transmitter to the next one to that of the furthest,
-and nuggets ..."""
+"""Number of correlation lengths of the kriging that are tried, from the spacing of transmitters to their largest distance, and
+nuggets that are tried."""
 TRIED = 48
-"""... by so many of the spectra that are left out."""
+"""Maximum number of these cases that are used to choose length and nugget."""
 PRIOR, RIDGE, RIDGE_SLOPE = (-1.0, 0.0, 0.0, 2.0, 0.0), (0.03, 0.03, 0.03, 0.03, 0.002), 0.05
-"""Logits of the simple methods as long as nothing contradicts (kriging itself comes to a mean far away), and penalties, in SSIM
-of a single transmitter, on the squared distance from these and on squared slopes. Whether there is a line of sight is soon
-plain; the others differ little, and a few transmitters say nothing of which is best."""
+"""Prior logits of the simple methods (kriging itself tends to a mean far from the data), and penalties, in SSIM of a single
+transmitter, on the squared distances from these and on squared slopes. A line of sight becomes apparent from few transmitters;
+the other methods differ little, and a few transmitters do not show which is best."""
 AVERAGED = 512
-"""Known spectra whose mean stands for that of all."""
+"""Maximum number of measured spectra over which the mean is computed."""
 ERRORS, ERRORS_WITH_PATHS = 2.0, 1.0
-"""Standard errors below the mean gain at which the bound lies; fields that follow paths know more than spectra."""
+"""Distance of the bound below the mean gain, in standard errors; smaller for fields with paths, which use more information
+than the spectra."""
 USUAL_SPREAD, USUAL_WEIGHT = 0.1, 2.0
-"""What gains of a field (SSIM) usually spread by over transmitters, and how many of them that counts for."""
+"""Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as."""
 SLOPES = (0.0, -1.0, 1.0)
-"""Of the logit of the field's share that are tried; others than none have to be worth ..."""
+"""Slopes of the logit of the field's weight that are tried."""
 WORTH = 0.005
-"""... so much SSIM, and so has any mixture beside the field alone."""
+"""Minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone."""
 UNUSED = 0.02
-"""Weight of line of sight below which it is left out."""
+"""Largest weight of the line of sight at which it is left out."""
 
 
 class Known(NamedTuple):
-    """Spectra that simple methods may look at."""
+    """Measured spectra that simple methods may use."""
 
     links: Int[np.ndarray, " m"]
+    """Indices of the links."""
     images: UInt8[np.ndarray, "m 90 360"]
+    """Spectra, multiplied by 255."""
 
 
 class HeldOut(NamedTuple):
-    """Answers of fields to links that they were not trained on."""
+    """Predictions of fields for links that they were not trained on."""
 
     links: Int[np.ndarray, " n"]
     pas: Float[np.ndarray, "n 90 360"]
     known: Bool[np.ndarray, "n m"]
-    """Which of the known spectra a field was trained on: simple methods may use the same."""
+    """Which of the measured spectra the field was trained on; simple methods use the same."""
     group: Int[np.ndarray, " n"]
-    """What was left out together, numbered: links of one are alike."""
+    """Number of the group of links that were left out together, whose errors are correlated."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """What was found."""
+    """Result of the fit."""
 
     mixture: Mixture
     scores: Float[np.ndarray, " n"]
-    """SSIM of the mixture's answers to what was held out, ..."""
+    """SSIM of the mixture's predictions for held-out links."""
     answers: Float[np.ndarray, "n 90 360"]
-    """... these answers ..."""
+    """These predictions."""
     distance: Float[np.ndarray, " n"]
-    """... and how far (metres) the nearest known transmitter was."""
+    """Distances to the nearest measured transmitter, metres."""
     alone: bool
-    """Whether the field by itself is as good."""
+    """Whether the field alone is as good."""
     line: str
-    """In words."""
+    """Summary for the terminal."""
 
 
 def learn_mixture(dataset: Dataset, known: Known, held: HeldOut, errors: float = ERRORS) -> Found:
     """Returns the mixture for a field.
 
     Args:
-        dataset: of one receiver.
-        known: its spectra.
-        held: what the field answered to links that it was not trained on; there may be none.
-        errors: standard errors by which the field has to be better.
+        dataset: data of one receiver.
+        known: measured spectra.
+        held: predictions of the field for links that it was not trained on, possibly none.
+        errors: standard errors by which the field must be better.
     """
     mixture = learn_members(dataset, known)
     if not len(held.links):
-        return Found(mixture, np.zeros(0), held.pas, np.zeros(0), False, "simple methods answer: nothing was held out")
+        return Found(mixture, np.zeros(0), held.pas, np.zeros(0), False, "simple methods only: no links were held out")
     simple, distance = simple_answers(mixture, dataset, known, held)
     scores, u = share_scores(mixture, dataset, held, simple, distance)
     field, alone = choose_share(scores, u, held.group, errors)
@@ -175,9 +178,9 @@ def learn_mixture(dataset: Dataset, known: Known, held: HeldOut, errors: float =
     share = expit(field[0] + field[1] * u)
     answers = share[:, None, None] * held.pas + (1 - share[:, None, None]) * simple
     line = (
-        f"on {len(held.links)} spectra that were held out the simple methods score {scores[:, 0].mean():.3f} (mean SSIM), the "
-        f"field {scores[:, -1].mean():.3f}, both {_at(scores, share).mean():.3f}: "
-        + ("the field answers alone" if alone else f"the field's share is {share.mean():.2f}")
+        f"mean SSIM on {len(held.links)} held-out spectra: simple methods {scores[:, 0].mean():.3f}, field "
+        f"{scores[:, -1].mean():.3f}, mixture {_at(scores, share).mean():.3f}: "
+        + ("the field is used alone" if alone else f"the field's weight is {share.mean():.2f}")
     )
     return Found(mixture, _at(scores, share), answers, distance, alone, line)
 
@@ -189,8 +192,8 @@ def share_scores(
     simple: Float[np.ndarray, "n 90 360"],
     distance: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "n shares"], Float[np.ndarray, " n"]]:
-    """Returns the SSIM of what was held out, by the share of the field (`fields.mixture.SHARES`), and the scaled logarithms of
-    its distances to what was known; `simple` and `distance` are `simple_answers`."""
+    """Returns the SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`), and the scaled logarithms of
+    their distances to measured transmitters; `simple` and `distance` are results of `simple_answers`."""
     truth = np.asarray(dataset.pas(held.links))
     return similarity(truth, held.pas, simple), np.asarray(scaled(mixture, jnp.asarray(distance)))
 
@@ -198,7 +201,7 @@ def share_scores(
 def simple_answers(
     mixture: Mixture, dataset: Dataset, known: Known, held: HeldOut
 ) -> tuple[Float[np.ndarray, "n 90 360"], Float[np.ndarray, " n"]]:
-    """Returns what the simple methods answer to what was held out, and the distances (metres) to what was known."""
+    """Returns the predictions of the simple methods for held-out links, and the distances (metres) to measured transmitters."""
     spectra, distance = predict_members(mixture, dataset, known, held.links, held.known)
     weights = np.asarray(member_weights(mixture, jnp.asarray(distance)))
     simple = np.clip(np.einsum("nm,nmij->nij", weights, spectra), 0, 1)
@@ -209,8 +212,8 @@ def simple_answers(
 
 
 def learn_members(dataset: Dataset, known: Known) -> Mixture:
-    """Returns the mixture of simple methods that explains known spectra best from others, near and far; the field has no
-    share."""
+    """Returns the mixture of simple methods that predicts measured spectra best from others, near and far; the weight of the
+    field is zero."""
     positions = dataset.tx_positions[known.links]
     mixture = start_mixture(dataset, known, _reach(positions)[0])
     index, kept = left_out(dataset, known)
@@ -236,10 +239,10 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
 def _kriged(
     mixture: Mixture, dataset: Dataset, known: Known, index: Int[np.ndarray, " n"], kept: Bool[np.ndarray, "n m"]
 ) -> Mixture:
-    """Returns the mixture with the smoothest kriging whose score is no lower than the best one by more than the standard error
-    of that (Breiman et al. 1984): queries lie further away than transmitters of one track do from each other."""
+    """Returns the mixture with the smoothest kriging whose score is lower than the best one by no more than its standard error
+    (Breiman et al. 1984), because queries lie further away than transmitters of one track do from each other."""
     truth, scores = np.asarray(dataset.pas(index)), dict[tuple[float, float], np.ndarray]()
-    local = dataclasses.replace(mixture, elements=mixture.elements[:0])  # line of sight takes longer than all others
+    local = dataclasses.replace(mixture, elements=mixture.elements[:0])  # the line of sight takes longer than all others
     for length in np.geomspace(*_reach(dataset.tx_positions[known.links]), LENGTHS):
         for nugget in NUGGETS:
             tried = dataclasses.replace(local, length=jnp.float32(length), nugget=jnp.float32(nugget))
@@ -253,7 +256,7 @@ def _kriged(
 
 
 def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, "n m"]]:
-    """Returns known links that are left out, and which others may be used for each."""
+    """Returns measured links that are left out, and masks of the other links that may be used for each."""
     rng = np.random.default_rng(2)
     positions, tx = dataset.tx_positions[known.links], dataset.tx_index[known.links]
     places = {number: positions[tx == number][0] for number in np.unique(tx)}
@@ -272,7 +275,7 @@ def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Boo
 
 
 def _in_turn(tx: Int[np.ndarray, " m"], rng: np.random.Generator) -> Int[np.ndarray, " m"]:
-    """Returns all places in a random order in which every transmitter comes once before any comes twice."""
+    """Returns all indices in a random order in which every transmitter occurs once before any occurs twice."""
     order = rng.permutation(len(tx))
     seen: dict[int, int] = {}
     turn = np.empty(len(tx), int)
@@ -282,15 +285,15 @@ def _in_turn(tx: Int[np.ndarray, " m"], rng: np.random.Generator) -> Int[np.ndar
 
 
 def _reach(positions: Float[np.ndarray, "m 3"]) -> tuple[float, float]:
-    """Returns the median distance (metres) of a transmitter to the next one, and the largest between two."""
+    """Returns the median distance (metres) between a transmitter and the nearest other, and the largest between two."""
     places = np.unique(positions, axis=0)
     near = spacing(places) if len(places) > 1 else 1.0
     return max(near, LOG_METRE), float(max(pdist(places).max(initial=0), 2 * LOG_METRE))
 
 
 def start_mixture(dataset: Dataset, known: Known, near: float) -> Mixture:
-    """Returns a mixture that knows of nothing but the prior, in which neither line of sight nor the field has a share;
-    `near` is the distance (metres) of a transmitter to the next one."""
+    """Returns a mixture with the prior weights, in which those of the line of sight and of the field are zero; `near` is the
+    spacing of the transmitters, metres."""
     receiver = dataset.receiver()
     logits = [[bias, 0.0] for bias in PRIOR[:-1]] + [[-30.0, 0.0]]
     return Mixture(
@@ -318,8 +321,16 @@ def predict_members(
     kept: Bool[np.ndarray, "n m"],
     members: tuple[str, ...] = MEMBERS,
 ) -> tuple[Float[np.ndarray, "n k 90 360"], Float[np.ndarray, " n"]]:
-    """Returns what simple methods give for links, each from some known spectra alone, and how far (metres) the nearest known
-    transmitter is."""
+    """Returns the predictions of simple methods for links, and the distances (metres) to the nearest transmitter in use.
+
+    Args:
+        mixture: mixture.
+        dataset: data of one receiver.
+        known: measured spectra.
+        index: indices of N links.
+        kept: masks of the measured spectra that are used for each link.
+        members: names of K simple methods.
+    """
     means = _means(known, kept) if "mean" in members else np.zeros((len(index), *known.images.shape[1:]), np.float32)
     query = dataset.query(index)
     numbers = [MEMBERS.index(name) for name in members]
@@ -335,26 +346,26 @@ _member_spectra = jax.jit(member_spectra)
 
 
 def _means(known: Known, kept: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns the means of N parts of the known spectra, of `AVERAGED` of them at most."""
+    """Returns the means of N subsets of at most `AVERAGED` of the measured spectra."""
     sample = np.random.default_rng(3).permutation(len(known.links))[:AVERAGED]
     pixels = known.images[sample].reshape(len(sample), -1).astype(np.float32) / 255
     means = kept[:, sample] @ pixels / np.maximum(kept[:, sample].sum(1), 1)[:, None].astype(np.float32)
     return means.reshape(len(kept), *known.images.shape[1:])
 
 
-# The field's share
+# The field's weight
 
 
 def choose_share(
     scores: Float[np.ndarray, "n shares"], u: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], errors: float = ERRORS
 ) -> tuple[tuple[float, float], bool]:
-    """Returns bias and slope of the logit of the field's share, and whether the field is as good by itself.
+    """Returns bias and slope of the logit of the field's weight, and whether the field alone is as good.
 
     Args:
-        scores: SSIM of held-out links by the share of the field (`fields.mixture.SHARES`).
-        u: scaled logarithm of the distance to the nearest known transmitter.
-        group: links of one are alike.
-        errors: standard errors below the mean gain at which the bound lies.
+        scores: SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`).
+        u: scaled logarithm of the distance to the nearest measured transmitter.
+        group: groups of links with correlated errors.
+        errors: distance of the bound below the mean gain, in standard errors.
     """
     bound = functools.partial(lower_bound, group=group, errors=errors)
     best, found = 0.0, (-30.0, 0.0)
@@ -374,8 +385,8 @@ def choose_share(
 
 
 def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:
-    """Returns the lower confidence bound of a mean gain over groups: their spread is what was seen and what is usual, which
-    counts for `USUAL_WEIGHT` groups, so that a few groups that happen to agree prove little."""
+    """Returns the lower confidence bound of a mean gain over groups. Their variance combines the observed one with a prior that
+    counts as `USUAL_WEIGHT` groups, so that a few groups that happen to agree are little evidence."""
     by_group = by_transmitter(gains, group)
     n = len(by_group)
     usual = (USUAL_SPREAD * share) ** 2
@@ -384,5 +395,5 @@ def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndar
 
 
 def _at(scores: Float[np.ndarray, "n shares"], share: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the scores at shares between those that were tried."""
+    """Returns the scores at weights, interpolated between those of `fields.mixture.SHARES`."""
     return np.asarray(score_at(jnp.asarray(scores), jnp.asarray(share)), np.float64)

@@ -1,11 +1,9 @@
-"""Hooks: what is done to a field between jitted epochs. All are alike to the loop.
+"""Hooks change a field between jitted epochs; the loop treats all of them in the same way.
 
-A field asks for hooks by name (`Field.hooks`); the settings section of that name, if there is one, switches it on or off. A
-hook may watch every step (`statistics`, `probe` and `accumulate` are pure and run inside the epoch) and change parameters
-between epochs (`apply` runs on the host). It says how whatever is stored beside the parameters, such as optimiser moments,
-follows.
-
-What an optimiser stores beside the parameters, when these change their shapes.
+A field lists its hooks by name (`Field.hooks`); the section of the settings with that name, if there is one, enables or
+disables a hook. A hook can accumulate statistics in every step (`statistics`, `probe` and `accumulate` are pure and run inside
+the epoch) and change parameters between epochs (`apply` runs on the host). Its `Edit` also defines how values that are stored
+for each parameter, such as optimiser moments, are transformed (`map_moments`), since shapes may change.
 """
 
 from abc import ABC, abstractmethod
@@ -24,56 +22,57 @@ from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch
 
 Say = Callable[[str], None]
-"""Told what long work turns to next; raises where it is to stop."""
+"""Called with a description of every stage of long work; it raises an exception to stop the work."""
 
 
 def silent(stage: str) -> None:
-    """Tells nobody."""
+    """Ignores the description of a stage."""
 
 
 class Edit(NamedTuple):
-    """What a hook did."""
+    """Result of a hook."""
 
     params: Params
     statistics: Any
-    """What the hook has watched, from here on."""
+    """The hook's statistics from here on."""
     moments: Callable[[Any], Any] | None
-    """From a tree like the old parameters to one like the new ones; None: whatever was stored starts anew."""
+    """Function from a tree like the old parameters to one like the new parameters; None to initialise the optimiser's state
+    again."""
     report: dict[str, Any]
-    """For metrics.jsonl; nothing is written if it is empty."""
+    """Entry for metrics.jsonl; nothing is written if it is empty."""
     field: Field | None = None
-    """The field where it is another one now, ..."""
+    """The new field, if the hook has changed it."""
     prepared: Any = None
-    """... and what it knows of the links."""
+    """Result of `prepare` of the new field."""
     growth: float = 1.0
-    """How much more room the field needs than before."""
+    """Factor by which the field needs more capacity than before."""
 
 
 class Context(NamedTuple):
-    """What a hook may look at."""
+    """Data that are available to a hook."""
 
     data: TrainingData
     prepared: Any
-    """Of the field's `prepare`."""
+    """Result of the field's `prepare`."""
     train: np.ndarray
     """Indices of the training links."""
     say: Say = silent
     validation: Callable[[], list[Batch]] = list
-    """Returns batches of validation links, each of one receiver."""
+    """Function that returns batches of validation links, each of one receiver."""
 
 
 class Hook(ABC):
-    """A hook: a frozen, hashable object. By default it watches no step."""
+    """A hook: a frozen, hashable object. By default it has no statistics."""
 
     stream: int
     """Number of its stream of random numbers."""
 
     def statistics(self, params: Params) -> Any:
-        """Returns zeros, to be accumulated over steps; () if it watches nothing."""
+        """Returns zeros that are then accumulated over steps; () without statistics."""
         return ()
 
     def probe(self, params: Params) -> Any:
-        """Returns zeros that the field's loss is to add where the hook wants to know the gradient; None: nowhere."""
+        """Returns zeros that the field's loss adds to the quantity whose gradient the hook needs; None if it needs none."""
         return None
 
     def accumulate(self, statistics: Any, gradients: Any, probe: Any) -> Any:
@@ -82,28 +81,37 @@ class Hook(ABC):
 
     @abstractmethod
     def due(self, step: int, steps: int) -> bool:
-        """Returns whether something is to be done after this step of so many."""
+        """Returns whether the hook acts after step number `step` of `steps`."""
 
     @abstractmethod
     def apply(
         self, field: Field, params: Params, statistics: Any, context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns the changed parameters."""
+        """Returns the changed parameters, and how stored values follow (host).
+
+        Args:
+            field: field.
+            params: its parameters.
+            statistics: statistics accumulated since the hook last acted.
+            context: data.
+            step: number of steps done.
+            rng: random numbers.
+        """
 
     def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns parameters of the shapes that the hook may soon change to, as `jax.ShapeDtypeStruct`s, and that growth;
-        None where nothing is near after this step of so many."""
+        """Returns the shapes of parameters that the hook may soon change to (`jax.ShapeDtypeStruct`), and the growth of the
+        capacity; None if no change is near after step number `step` of `steps`."""
         return None
 
 
 def probe_of(hooks: Sequence[Hook], params: Params) -> Any:
-    """Returns the probe of the first hook that has one; None if none has."""
+    """Returns the probe of the first hook that has one, else None."""
     return next((probe for hook in hooks if (probe := hook.probe(params)) is not None), None)
 
 
 @dataclass(frozen=True)
 class OfPart(Hook):
-    """A hook of one component of a field: of its field and parameters of that name."""
+    """A hook that acts on one component of a field: on the field and the parameters of that name."""
 
     part: str
     inner: Hook
@@ -114,12 +122,12 @@ class OfPart(Hook):
         return self.inner.stream
 
     def statistics(self, params: Params) -> Any:
-        """Returns zeros, to be accumulated over steps; () where there is no such component."""
+        """Returns the initial statistics of the component; () if the field lacks it."""
         own = getattr(params, self.part)
         return () if own is None else self.inner.statistics(own)
 
     def probe(self, params: Params) -> Any:
-        """Returns that of the component."""
+        """Returns the probe of the component; None if the field lacks it."""
         own = getattr(params, self.part)
         return None if own is None else self.inner.probe(own)
 
@@ -129,13 +137,13 @@ class OfPart(Hook):
         return () if own is None else self.inner.accumulate(statistics, own, probe)
 
     def due(self, step: int, steps: int) -> bool:
-        """Returns whether something is to be done after this step of so many."""
+        """Returns whether the hook acts after step number `step` of `steps`."""
         return self.inner.due(step, steps)
 
     def apply(
         self, field: Field, params: Params, statistics: Any, context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
-        """Returns all parameters, those of the component changed."""
+        """Returns all parameters, with those of the component changed."""
         own = getattr(params, self.part)
         if own is None:
             return Edit(params, statistics, lambda tree: tree, {})
@@ -150,7 +158,7 @@ class OfPart(Hook):
         return edit._replace(params=put(params, edit.params), moments=moments, field=whole)
 
     def next_size(self, params: Params, step: int, steps: int) -> tuple[Any, float] | None:
-        """Returns the shapes of all parameters that the hook may soon change to, and that growth."""
+        """Returns the shapes of all parameters that the hook may soon change to, and the growth of the capacity, or None."""
         own = getattr(params, self.part)
         found = None if own is None else self.inner.next_size(own, step, steps)
         if found is None:
@@ -159,8 +167,8 @@ class OfPart(Hook):
 
 
 def map_moments(moments: Any, params: Params, function: Callable[[Any], Any]) -> Any:
-    """Returns the optimiser's state with every tree in it that is like the parameters transformed. In the tree of a group the
-    leaves of all others are masked."""
+    """Returns the optimiser's state with a function applied to every tree in it that has the structure of the parameters. In
+    the tree of a group, the leaves of all other groups are masked."""
     leaves, structure = jax.tree.flatten(params)
     known: Any = structure
 

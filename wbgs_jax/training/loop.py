@@ -1,15 +1,11 @@
-"""The host loop: jitted epochs, hooks between them, checkpoints, curves, resume.
+"""The host loop of training: jitted epochs, hooks between them, checkpoints, curves, and resuming a run.
 
-A newcomer can read it top to bottom: `train` builds a `Run`, then repeats `Run.epoch` until the last step.
+`train` builds a `Run` and repeats `Run.epoch` until the last step. A run holds the state and uses a field through its interface
+only (`fields.base.Field`).
 
-The jitted epoch for the next size of a field, compiled while the device trains the present one.
-
-A field grows in steps that are known in advance. A call that runs no step compiles what the next size needs; when it is needed,
-it is there, or waited for.
-
-One training run: its state, its epochs, and what is done to the field between them.
-
-What a field is made of is the field's business; a run knows the interface alone (`fields.base.Field`).
+The epoch for the next size of a field is compiled while the device trains the current size (`Precompilation`): the sizes of a
+growing field are predictable. A call that runs no step compiles the program for the next size; if the program is needed before
+it is ready, the loop waits for it.
 """
 
 import dataclasses
@@ -50,22 +46,22 @@ from wbgs_jax.types import Batch
 
 
 class Precompilation:
-    """Programs that threads of the background compile, each once."""
+    """Programs that background threads compile, each once."""
 
     def __init__(self) -> None:
         self._threads: dict[Hashable, threading.Thread] = {}
         self._ready: set[Hashable] = set()
         self.seconds = 0.0
-        """What compiling took, of what is ready."""
+        """Compilation time of the programs that are ready."""
 
     def begin(self, key: Hashable, call: Callable[[], object]) -> None:
-        """Starts a call whose programs have this key, unless it has been started before."""
+        """Starts a call that compiles the programs with this key, unless it has been started before."""
         if key not in self._threads:
-            self._threads[key] = threading.Thread(target=self._run, args=(key, call))  # a process ends after it: XLA demands it
+            self._threads[key] = threading.Thread(target=self._run, args=(key, call))  # no daemon: XLA must finish before exit
             self._threads[key].start()
 
     def wait(self, key: Hashable) -> bool:
-        """Waits for a call that is under way; returns whether its programs are ready."""
+        """Waits for a running call, and returns whether its programs are ready."""
         if key in self._threads:
             self._threads[key].join()
         return key in self._ready
@@ -82,13 +78,13 @@ HOOKS: dict[str, Callable[[Any], Hook]] = {
     "search": Search,
     "expert_weights": lambda _: ExpertWeights(),
 }
-"""What makes a hook from its section of the settings, by the names that fields and settings give them."""
+"""Constructors of hooks from their section of the settings, by their names in fields and settings."""
 VALIDATION_LINKS, BLOCK = 720, 16
-"""Validation links that hooks are shown, at most, and how many at a time."""
+"""Maximum number of validation links for hooks, and their number per batch."""
 
 
 def make_hook(name: str, settings: Settings) -> Hook | None:
-    """Returns the hook that a field asks for by this name; None where the settings have such a section, and switch it off."""
+    """Returns the hook of a name in `Field.hooks`; None if its section of the settings disables it."""
     part, _, kind = name.rpartition(".")
     config = getattr(settings, kind, True)
     if not config:
@@ -99,22 +95,23 @@ def make_hook(name: str, settings: Settings) -> Hook | None:
 
 @dataclass(frozen=True)
 class Launched:
-    """An epoch that the device has been given."""
+    """An epoch that has been dispatched to the device."""
 
     step: int
-    """At which it begins."""
+    """Step at which it begins."""
     batches: Int[np.ndarray, "k b"]
+    """Indices of the links of every batch."""
     report: EpochReport
-    """Not waited for yet."""
+    """Results, which may still be pending on the device."""
 
 
 class Run:
-    """One training run in a folder; everything that changes hangs here, everything pure is in step.py."""
+    """A training run in a folder. It holds all mutable state; pure functions are in step.py."""
 
     def __init__(self, dataset: Dataset, field: str, settings: Settings, seed: int, folder: Path, devices: int = 0):
-        self.numbers = training_links(dataset)  # of the links, as the data count them
+        self.numbers = training_links(dataset)  # indices of the links in the whole dataset
         self.checksum = checksum(dataset)
-        dataset = without_test(dataset)  # nothing in a training can look at the test
+        dataset = without_test(dataset)  # training has no access to the test part
         self.dataset, self.settings, self.seed, self.folder = dataset, settings, seed, folder
         kind, self.key = get_field(field), jax.random.key(seed)
         self.hooks = tuple(hook for name in kind.hooks if (hook := make_hook(name, settings)))
@@ -137,33 +134,33 @@ class Run:
 
     @cached_property
     def prepared(self) -> Any:
-        """What the field has prepared of all links: when it is first asked for, since a checkpoint may bring another field."""
+        """Result of the field's `prepare` for all links, computed at first use: a checkpoint may contain another field."""
         return self.field.prepare(self.data.links, self.data.receivers)
 
     @property
     def batch(self) -> int:
-        """Links a step."""
+        """Links per step."""
         return min(self.settings.optim.batch, len(self.dataset.train))
 
     @property
     def step(self) -> int:
-        """Steps done, whose figures are known."""
+        """Number of steps whose results have been read."""
         return self.launched[0].step if self.launched else int(self.state.step)
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """How large the field is: hooks alone change that."""
+        """Sizes of the field, which only hooks change."""
         return self.field.inspect(self.state.params).sizes
 
     def batches(self, epoch: int, steps: int) -> Int[np.ndarray, "k b"]:
-        """Returns the batches of an epoch, each of one receiver: a function of seed and epoch alone, so that a resumed run sees
-        the same ones."""
+        """Returns the batches of an epoch of `steps` steps, each of one receiver. They depend on the seed and the epoch only,
+        so that a resumed run uses the same batches."""
         rng = np.random.default_rng([self.seed, 2, epoch])
         pool = self.pool(epoch * steps / self.settings.optim.steps)
         return np.stack([self._draw(rng, pool, self.batch) for _ in range(steps)]).astype(np.int32)
 
     def _draw(self, rng: np.random.Generator, pool: Int[np.ndarray, " n"], batch: int) -> Int[np.ndarray, " b"]:
-        if self.dataset.n_receivers > 1:  # a receiver as often as its share of the links
+        if self.dataset.n_receivers > 1:  # receivers are drawn in proportion to their links
             of_receiver = self.dataset.receiver_index[pool]
             pool = pool[of_receiver == rng.choice(of_receiver)]
         drawn = rng.choice(pool, batch, replace=len(pool) < batch)
@@ -171,8 +168,8 @@ class Run:
         return with_virtual_drawn(drawn, virtual, self.settings.optim.virtual, rng)
 
     def pool(self, progress: float) -> Int[np.ndarray, " n"]:
-        """Returns the training links that batches are drawn from after this share of the steps: low frequencies first, if
-        asked."""
+        """Returns the training links that batches are drawn from after a fraction `progress` of the steps; with a curriculum,
+        low frequencies come first."""
         train, curriculum = self.dataset.train, self.settings.optim.curriculum
         frequencies = self.dataset.frequencies_hz[train]
         if progress >= curriculum:
@@ -181,10 +178,9 @@ class Run:
         return train[frequencies <= low * (high / low) ** (progress / curriculum) * (1 + 1e-6)]
 
     def epoch(self, go_on: bool = False) -> dict[str, float]:
-        """Runs one block of steps and returns means of the loss and of the metrics. Overflowed steps are repeated with larger
-        capacity.
+        """Runs one epoch and returns means of the loss and of the metrics. Overflowed steps are repeated with larger capacity.
 
-        `go_on` gives the device the next block before it waits for the figures of this one: nothing may be due between them.
+        `go_on` dispatches the next epoch to the device before the results of this one are read; nothing may be due in between.
         """
         begin, length = time.perf_counter(), self.settings.loop.epoch_steps
         resized = not self._known
@@ -202,7 +198,7 @@ class Run:
             if report.stopped:
                 given, self.launched, resized = self.launched, [], True
                 self._recover(report, given[0].batches[done])
-                for old in given:  # those after the first have done nothing
+                for old in given:  # epochs after the first have run no steps
                     self._launch(old.step, done if old is given[0] else 0)
         self.launched.pop(0)
         if resized:
@@ -211,7 +207,7 @@ class Run:
         return {name: float(np.mean(values)) for name, values in figures.items()}
 
     def _launch(self, step: int, first: int = 0) -> None:
-        """Gives the device the epoch that begins at a step, from its batch number `first` on."""
+        """Dispatches the epoch that begins at a step to the device, starting with batch number `first`."""
         length, program, prepared = (
             self.settings.loop.epoch_steps,
             self._program(self.state.params, self.capacity),
@@ -223,7 +219,7 @@ class Run:
         self.state, report = self._run_epoch(self.state, prepared, batches, first, self.capacity, stopped)
         self.launched.append(Launched(step, batches, report))
         if not ready and program not in self._known:
-            self.compile_seconds += time.perf_counter() - begin  # the call returns before a step is done
+            self.compile_seconds += time.perf_counter() - begin  # the call returns before the first step has run
         self._known.add(program)
 
     def _run_epoch(
@@ -245,11 +241,11 @@ class Run:
         return self.devices.own(results)
 
     def _program(self, params: Params, capacity: Any) -> Any:
-        """Returns what distinguishes the compiled epochs of a run."""
+        """Returns a key that distinguishes the compiled epochs of a run."""
         return capacity, tuple(_shapes(params)), jax.tree.structure(self.field)
 
     def _compile_next(self) -> None:
-        """Begins to compile the epoch for the next size of the field, where one is near; of one process and device alone."""
+        """Starts compiling the epoch for the next size of the field if a change is near; only with one process and device."""
         if self.devices.mesh is not None or jax.process_count() > 1:
             return
         for hook in self.hooks:
@@ -267,11 +263,16 @@ class Run:
             self.precompilation.begin(self._program(params, capacity), call)
 
     def _grown(self, growth: float) -> Any:
-        """Returns the capacity of the field once it has grown: a function of those that checkpoints keep."""
+        """Returns the capacity of the field after it has grown by a factor. It depends only on the capacity stored in
+        checkpoints."""
         return self.capacity if self.capacity is None or growth == 1 else self.capacity.scaled(growth)
 
     def _recover(self, report: EpochReport, batch: Int[np.ndarray, " b"]) -> None:
-        """Grows the capacity after an overflow; anything else that stops an epoch is a loss or gradient that is not finite."""
+        """Increases the capacity after an overflow.
+
+        Raises:
+            UserError: the epoch has stopped for the only other reason, a loss or gradient that is not finite.
+        """
         if report.overflow:
             needed = self.field.capacity(self.state.params, self.dataset.receivers, np.asarray(report.required))
             self.capacity = self.capacity.grown_to(needed)
@@ -286,7 +287,7 @@ class Run:
         )
 
     def run_hooks(self, say: Say = silent) -> bool:
-        """Lets every hook act that is due, and returns whether any was; `say` is told of long work."""
+        """Runs all hooks that are due, and returns whether there were any; `say` is called with the stages of long work."""
         acted = False
         for number, hook in enumerate(self.hooks):
             if hook.due(self.step, self.settings.optim.steps):
@@ -295,7 +296,7 @@ class Run:
                 context = Context(self.data, self.prepared, self.dataset.train, say, self.validation_batches)
                 edit = hook.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
-                check_alike(self.state, f"what the {type(hook).__name__} made of the parameters")
+                check_alike(self.state, f"the parameters after {type(hook).__name__}")
                 self.seconds += time.perf_counter() - begin
                 if edit.report:
                     self.log({"step": step} | edit.report)
@@ -306,7 +307,7 @@ class Run:
         return acted
 
     def due(self, step: int) -> bool:
-        """Returns whether anything is to be done after a step but to go on: hooks, curves, a checkpoint, the end."""
+        """Returns whether anything is due after a step: hooks, an evaluation, a checkpoint, or the end."""
         loop, total = self.settings.loop, self.settings.optim.steps
         before, shown = step - loop.epoch_steps, len(self.watched) > 0
         return (
@@ -317,13 +318,13 @@ class Run:
         )
 
     def _commit(self, number: int, edit: Edit) -> None:
-        """Puts a hook's edit into the state, moments and all."""
+        """Applies a hook's edit to the state, including the optimiser's moments."""
         old, statistics = self.state, list(self.state.statistics)
         self.__dict__.pop("sizes", None)
         if _shapes(edit.params) != _shapes(old.params):
             self.compilations += 1
             self.capacity = self._grown(edit.growth)
-            statistics = [hook.statistics(edit.params) for hook in self.hooks]  # what others saw is of other shapes
+            statistics = [hook.statistics(edit.params) for hook in self.hooks]  # those of other hooks have the old shapes
         follow = edit.moments
         moments = map_moments(old.optimizer, old.params, follow) if follow else self.optimizer.init(edit.params)
         statistics[number] = edit.statistics
@@ -332,7 +333,7 @@ class Run:
             self.field, self.prepared = edit.field, edit.prepared
 
     def validation_batches(self) -> list[Batch]:
-        """Returns batches of links of the validation part, each of one receiver."""
+        """Returns batches of validation links, each of one receiver."""
         chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:VALIDATION_LINKS]
         receiver = self.dataset.receiver_index[chosen]
         blocks = [
@@ -344,7 +345,7 @@ class Run:
         return [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
 
     def evaluate(self) -> dict[str, float]:
-        """Returns figures of the watched validation spectra."""
+        """Returns the metrics of the validation spectra that are evaluated during training."""
         return watch(self.field, self.state.params, self.dataset, self.watched)
 
     def log(self, entry: dict[str, Any]) -> None:
@@ -353,7 +354,7 @@ class Run:
             curves.append(self.folder / "metrics.jsonl", entry)
 
     def save(self) -> None:
-        """Writes a checkpoint of the present step."""
+        """Writes a checkpoint of the current step."""
         capacity = dataclasses.asdict(self.capacity) if self.capacity else None
         compiled = {"compilations": self.compilations, "compile_seconds": self.compile_seconds + self.precompilation.seconds}
         metadata = {"limits": capacity, "seconds": self.seconds, "data": self.checksum} | compiled
@@ -362,7 +363,11 @@ class Run:
         checkpoint.save(self.checkpoints, self.step, self.state, self.field, metadata, keep)
 
     def restore(self) -> bool:
-        """Loads the newest checkpoint, if there is one, and returns whether there was."""
+        """Loads the newest checkpoint, and returns whether there was one.
+
+        Raises:
+            UserError: the checkpoint is damaged, or belongs to other data or another configuration.
+        """
         by_first(lambda: checkpoint.tidy(self.checkpoints, self.settings.loop.keep_checkpoints))
         steps = checkpoint.checkpoint_steps(self.checkpoints)
         by_first(lambda: curves.forget_after(self.folder / "metrics.jsonl", steps[-1] if steps else -1))
@@ -370,7 +375,7 @@ class Run:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
         if saved.metadata.get("data", self.checksum) != self.checksum:
-            raise UserError(f"the data of {self.folder} are not those that it was trained on; put them back, or train again")
+            raise UserError(f"the data of {self.folder} have changed since it was trained; restore them, or train again")
         self.field = field_from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
@@ -388,7 +393,7 @@ def _shapes(tree: Any) -> list[tuple[int, ...]]:
 
 
 def crosses(before: int, after: int, interval: int) -> bool:
-    """Returns whether a multiple of the interval lies between two steps, the second one included."""
+    """Returns whether a multiple of the interval lies between two steps, including the second one."""
     return before // interval != after // interval
 
 
@@ -397,7 +402,7 @@ __all__ = ["HOOKS", "Interrupted", "Run", "TrainResult", "train"]
 
 @dataclass(frozen=True)
 class TrainResult:
-    """What a training run leaves."""
+    """Result of a training run."""
 
     field: Field
     params: Params
@@ -405,13 +410,14 @@ class TrainResult:
     seconds: float
     """Wall-clock training time, summed over resumed parts."""
     compilations: int
-    """Times the jitted epoch changed its shapes in this process: at the start and whenever a limit or size changed."""
+    """Number of compilations of the jitted epoch for new shapes in this process: at the start, and after every change of a
+    capacity or size."""
     compile_seconds: float = 0.0
-    """What compiling it took, in the background too."""
+    """Time of these compilations, including those in the background."""
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How large the trained field is."""
+        """Sizes of the trained field."""
         return self.field.inspect(self.params).sizes
 
 
@@ -425,23 +431,31 @@ def train(
     devices: int = 0,
     shown: bool = True,
 ) -> TrainResult:
-    """Trains a field, by its name, and leaves checkpoints and curves in `folder`.
+    """Trains a field and writes checkpoints and curves to a folder. With several processes (`jax.distributed`) all of them call
+    this function, and the first one writes.
 
-    `shown` lets a person see how it goes. Every batch is shared by so many devices of every process, evenly; by default by all
-    that can. Where there are several processes (`jax.distributed`), all of them call this, and the first one writes.
+    Args:
+        dataset: data.
+        field: name of the field.
+        settings: settings.
+        seed: seed of all random numbers.
+        folder: folder of the run.
+        resume: whether to continue from the newest checkpoint.
+        devices: number of devices of each process that share every batch evenly; 0 for as many as possible.
+        shown: whether progress is printed.
 
     Raises:
-        UserError: a loss or gradient that is not finite (step, batch and last good checkpoint named), an unwritable folder,
-            no training spectra.
+        UserError: the loss or its gradient is not finite (the message names step, spectra and last good checkpoint), the folder
+            is not writable, or there are no training spectra.
         Interrupted: Ctrl-C; the state is saved.
-        KeyboardInterrupt: Ctrl-C in the last epoch; the state is saved, and nothing is left to train.
+        KeyboardInterrupt: Ctrl-C in the last epoch; the state is saved, and training is complete.
     """
     kind = get_field(field)
     check_data(dataset, kind)
     settings = limited(settings, dataset, kind)
     run = Run(dataset, field, settings, seed, folder, devices)
     resumed = resume and run.restore()
-    check_alike((run.state, run.field), "what training begins with")
+    check_alike((run.state, run.field), "the initial state of training")
     total = settings.optim.steps
     with deferred_interrupt() as interrupt, TrainingProgress(total, run.step, shown and is_first()) as progress:
         if not resumed:
@@ -453,7 +467,7 @@ def train(
 
 
 def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:
-    """Does what is due before the first step, and saves what that took."""
+    """Runs hooks that are due before the first step, and saves their result."""
 
     def say(stage: str) -> None:
         give_back()
@@ -466,7 +480,7 @@ def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> 
 
 
 def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:
-    """Runs an epoch and all that is due after it; where nothing is, the device has the next one before this one ends."""
+    """Runs an epoch and all that is due after it; if nothing is due, the next epoch is dispatched before this one ends."""
     before, loop = run.step, run.settings.loop
     after = before + loop.epoch_steps
     stopping = any_process(interrupt["set"])
@@ -483,5 +497,5 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
         run.save()
     if interrupted and after < total:
         raise Interrupted(
-            f"stopped at step {after} of {total}; the state is saved: run the same command with --resume to go on"
+            f"stopped at step {after} of {total}; the state is saved: run the same command with --resume to continue"
         )

@@ -1,4 +1,4 @@
-"""`manifest.json` of a run folder: everything that somebody else needs to know of a run, in one file."""
+"""`manifest.json` of a run folder: a summary of data, model, training, versions, device and scores in one file."""
 
 import contextlib
 import platform
@@ -16,19 +16,19 @@ PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax")
 
 
 def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] | None = None) -> None:
-    """Writes or brings up to date the manifest of a run folder.
+    """Writes or updates the manifest of a run folder.
 
     Args:
-        folder: of the run.
+        folder: run folder.
         trained: its field.
-        report: of an evaluation (`evaluation.score.evaluate`), whose scores it is to say; those of earlier ones stay, as long
-            as the run has not gone on.
+        report: result of an evaluation (`evaluation.score.evaluate`) whose scores are added; earlier scores are kept unless the
+            run has been trained further since.
     """
     path = folder / MANIFEST
     known: dict[str, Any] = {}
     if path.exists():
         before = read_json(path)
-        with contextlib.suppress(AttributeError, TypeError, ValueError):  # what is no manifest has no scores
+        with contextlib.suppress(AttributeError, TypeError, ValueError):  # a file that is not a manifest has no scores
             known = dict(before.get("scores", {})) if before.get("training", {}).get("steps") == trained.step else {}
     config, origin = trained.config, provenance(trained)
     scores = known | ({} if report is None else {report["part"]: _figures(report)})
@@ -54,7 +54,7 @@ def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] |
 
 
 def _figures(report: dict[str, Any]) -> dict[str, Any]:
-    """Returns the numbers of a report that stand alone."""
+    """Returns the scalar entries of a report."""
     return {name: value for name, value in report.items() if isinstance(value, int | float) and not isinstance(value, bool)}
 
 

@@ -1,8 +1,8 @@
-"""The optimiser: Adam, or Muon and Adam, for every group of a field's parameters, each with its own learning rate; all rise and
-decay together.
+"""The optimiser: Adam, or Muon combined with Adam, for every group of a field's parameters, each with its own learning rate and
+a common schedule.
 
-Muon (Jordan et al. 2024) takes the steps of matrices in the direction of steepest descent under the spectral norm: the
-networks learn in 2,400 steps what Adam teaches them in 6,000 (docs/history.md).
+Muon (Jordan et al. 2024) updates matrices in the direction of steepest descent under the spectral norm: the networks need 2,400
+steps instead of 6,000 with Adam (docs/history.md).
 """
 
 import functools
@@ -18,20 +18,21 @@ from wbgs_jax.fields import Field, Group
 from wbgs_jax.fields.base import Params
 
 ADAMS_RMS = 0.2
-"""Root mean square of an entry of Muon's steps, in learning rates: about that of Adam's, so that one rate serves both (Liu et
-al. 2025)."""
+"""Root mean square of the entries of Muon's steps, relative to the learning rate: about that of Adam, so that the same rate is
+suitable for both (Liu et al. 2025)."""
 
 
 @functools.lru_cache
 def make_optimizer(field: type[Field], config: Any, optim: OptimConfig) -> optax.GradientTransformation:
-    """Returns the optimiser of a field with some settings. Equal arguments share one, and with it the compiled epoch."""
+    """Returns the optimiser of a field with its settings. Equal arguments return the same object, so that the compiled epoch is
+    shared."""
     made = {"adam": _adam, "muon": make_muon}
     groups = {name: made[group.optimizer](group, optim) for name, group in field.param_groups(config)[0].items()}
     return optax.multi_transform(groups, lambda params: field.param_groups(config, params)[1])
 
 
 def make_muon(group: Group, optim: OptimConfig) -> optax.GradientTransformation:
-    """Returns Muon for the matrices among a group's parameters, and Adam for the others."""
+    """Returns Muon for the matrices among a group's parameters, combined with Adam for the others."""
     rate = schedule(group.learning_rate, optim)
     all_axes = {"matrices": optax.contrib.MuonDimensionNumbers(reduction_axis=1, output_axis=2)}
     matrices = optax.contrib.muon(
@@ -42,9 +43,9 @@ def make_muon(group: Group, optim: OptimConfig) -> optax.GradientTransformation:
 
 
 def _stacked(inner: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Lets a transformation see a tree of matrices as one stack, zeros around the smaller ones: Newton-Schulz iterations of
-    their own would take ten seconds to compile. Zeros stay zeros, so that steps are the same, but in units of the stack's
-    longest side."""
+    """Returns a transformation that is applied to a tree of matrices as one stack, padded with zeros: separate Newton-Schulz
+    iterations would take ten seconds to compile. Zeros remain zeros, so that steps are the same except that they scale with the
+    longest side of the stack."""
 
     def init(params: Params) -> Any:
         return inner.init({"matrices": _stack(params)})
@@ -73,7 +74,7 @@ def _adam(group: Group, optim: OptimConfig) -> optax.GradientTransformation:
 
 
 def schedule(peak: float, optim: OptimConfig) -> optax.Schedule:
-    """Returns a learning rate as a function of the step: a linear rise over the warm-up, then a cosine."""
+    """Returns a learning rate as a function of the step: linear over the warm-up, then a cosine decay from `peak`."""
     rise = round(optim.warmup * optim.steps)
     decay = optax.cosine_decay_schedule(peak, max(optim.steps - rise, 1), optim.final_fraction)
     return optax.join_schedules([optax.linear_schedule(peak / (rise + 1), peak, rise), decay], [rise]) if rise else decay

@@ -1,9 +1,7 @@
-"""What a person sees of a training: a live bar on a terminal, a plain line now and then in a log.
+"""Progress of a training: a live bar on a terminal, or a plain line at intervals in a log.
 
-About how long a training will take on this machine: what it takes on a known one (`Field.seconds`), and how this one
-compares.
-
-Ctrl-C during a training: it is saved first, and the message says how to go on.
+The module also estimates the time of a training on this machine, from that on a reference machine (`Field.seconds`) and a short
+benchmark, and handles Ctrl-C during training: the state is saved first, and the message explains how to continue.
 """
 
 import contextlib
@@ -31,13 +29,13 @@ from wbgs_jax._util.progress_lines import LOG_INTERVAL, Bar
 from wbgs_jax.fields import Field
 
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
-"""Figures that are measured now and then, and shown until they are measured again."""
+"""Metrics that are evaluated at intervals, and displayed until the next evaluation."""
 LABELS = {"batch_ssim": "SSIM", "held_out_ssim": "held-out SSIM", "held_out_power_error_db": "held-out power error dB"}
 UNSHOWN = ("step", "seconds")
 
 
 class TrainingProgress:
-    """Shows the figures of a training, steps a second and the time left, on stderr."""
+    """Shows the metrics of a training, steps per second and the remaining time, on stderr."""
 
     def __init__(self, total: int, done: int = 0, shown: bool = True):
         self.total, self.done, self.start_step, self.shown = total, done, done, shown
@@ -66,7 +64,7 @@ class TrainingProgress:
         self.bar.stop()
 
     def stage(self, what: str) -> None:
-        """Shows what is done before the first step."""
+        """Shows a stage of the work before the first step."""
         self.bar.update(self.task, status=f"{what} ...")
         if self.shown and not self.console.is_terminal:
             print(f"{what} ({time.monotonic() - self.started:.0f} s)", file=sys.stderr, flush=True)
@@ -86,29 +84,29 @@ class TrainingProgress:
             self.last_line = time.monotonic()
             left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
             print(f"step {step}/{self.total}  {status}{left}", file=sys.stderr, flush=True)
-        if not self.compiled:  # neither searches nor compilation come again: what they took tells no rate
+        if not self.compiled:  # calibration and compilation happen once: their time is not part of the rate
             self.compiled, self.started, self.start_step = True, time.monotonic(), step
 
 
 PROBE_SECONDS = 0.0095
-"""What `_probe` takes there: two cores of an AMD EPYC."""
+"""Time of `_probe` on the reference machine, two cores of an AMD EPYC."""
 SIZE, PRODUCTS, TRIALS = 512, 8, 15
 
 
 def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> float | None:
-    """Returns about how long a training takes here; None where no training like it has been timed.
+    """Returns the approximate time of a training on this machine, seconds; None if there is no reference time.
 
     Args:
-        field: what is trained.
-        preset: by name.
-        share: of the preset's steps that are still to do.
+        field: class of the field.
+        preset: name of the preset.
+        share: fraction of the preset's steps that remain.
     """
     known = field.seconds.get(preset)
     return None if known is None or jax.default_backend() != "cpu" else known * share * _probe() / PROBE_SECONDS
 
 
 def duration_words(seconds: float) -> str:
-    """Returns "about 12 minutes"."""
+    """Returns a duration in words, such as "about 12 minutes"."""
     if seconds < 90:
         return "about a minute"
     minutes = seconds / 60
@@ -116,7 +114,7 @@ def duration_words(seconds: float) -> str:
 
 
 def _probe() -> float:
-    """Returns the median time of a few matrix products: other programs that run count too."""
+    """Returns the median time of a few matrix products, seconds; it includes the effect of other running programs."""
 
     def products(x: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, PRODUCTS, lambda _, y: jnp.tanh(y @ x) / SIZE, x)
@@ -131,15 +129,15 @@ def _probe() -> float:
 
 
 class Interrupted(UserError):
-    """Ctrl-C: the state is saved, the message says how to go on."""
+    """Ctrl-C: the state is saved, and the message explains how to continue."""
 
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[dict[str, bool]]:
-    """Turns the first Ctrl-C into a flag that is looked at between epochs; a second one interrupts at once. One that comes too
-    late to be looked at is passed on at the end.
+    """Turns the first Ctrl-C into a flag that is checked between epochs; a second one interrupts immediately. The signals are
+    raised again at the end, in case the flag was not checked.
 
-    Signals reach the main thread only; elsewhere the flag is never set.
+    Signals reach the main thread only; in other threads the flag is never set.
     """
     flag, received = {"set": False}, list[int]()
 
@@ -156,5 +154,5 @@ def deferred_interrupt() -> Iterator[dict[str, bool]]:
     finally:
         for s, old in previous.items():
             signal.signal(s, old)
-    for number in received:  # nobody was told
+    for number in received:  # reached only if no exception has been raised, so the flag was not checked
         signal.raise_signal(number)

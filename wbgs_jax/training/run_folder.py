@@ -1,9 +1,9 @@
-"""A run folder: what it was trained on and how (`config.json`), its checkpoints, and the trained field in it.
+"""A run folder: its configuration (`config.json`), checkpoints, and the trained field.
 
 config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pictures/*.png
 kriging.npz   intervals.npz   power_confidence.npz
 
-One training a folder: two would write over each other's curves and checkpoints.
+There is one training per folder: two would overwrite each other's curves and checkpoints.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ from wbgs_jax.training import checkpoint
 FIRST_PRESET = "cpu"
 
 MANIFEST = "manifest.json"
-"""Written last, when a training is finished."""
+"""File that is written last, when a training is finished."""
 
 
 def sources_of(folder: Path, config: RunConfig) -> list[Path]:
@@ -45,13 +45,17 @@ def sources_of(folder: Path, config: RunConfig) -> list[Path]:
 
 
 def write_config(folder: Path, config: RunConfig) -> None:
-    """Starts a run folder."""
+    """Writes the configuration of a new run folder."""
     values = {"version": wbgs_jax.__version__} | {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     write_json(folder / "config.json", values | {"settings": to_dict(config.settings, config.field)})
 
 
 def read_config(folder: Path) -> RunConfig:
-    """Returns the configuration of a run folder; a folder without one, or of another version, is a `UserError`."""
+    """Returns the configuration of a run folder.
+
+    Raises:
+        UserError: the folder has no configuration, or it is damaged or of another version.
+    """
     path = folder / "config.json"
     if not path.exists():
         raise UserError(f"{folder} is not a run folder: it has no config.json; train first (make train SCENE=1)")
@@ -62,25 +66,29 @@ def read_config(folder: Path) -> RunConfig:
         raise UserError(f"{path} lacks {error}; it belongs to another version of wbgs-jax: train again") from error
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     if values["field"] not in field_names():
-        raise UserError(f"{path} names a field that is not known, {str(values['field'])[:40]!r}; mend it, or train again")
+        raise UserError(f"{path} names an unknown field {str(values['field'])[:40]!r}; correct it, or train again")
     kind = get_field(values["field"])
     settings = from_dict(values.pop("settings"), kind.presets[FIRST_PRESET], kind.name)
     for section, part in sections(settings, kind.name).items():
         _demand_types(path, part, f"{section}.")
     check(settings)
     check_config(kind.name, settings.field)
-    config = replaced(RunConfig("", "", "", 0, None, settings), **values)  # unchecked, until the next line
+    config = replaced(RunConfig("", "", "", 0, None, settings), **values)  # the next line checks the types
     _demand_types(path, config, "")
     return config
 
 
 def _demand_types(path: Path, value: Any, prefix: str) -> None:
     if wrong := misfit(value):
-        raise UserError(f"{path} is damaged ({prefix}{wrong}); mend it, or train again")
+        raise UserError(f"{path} is damaged ({prefix}{wrong}); correct it, or train again")
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
-    """Makes the run folder, or makes sure that the one there belongs to the same run."""
+    """Creates the run folder, or checks that an existing one belongs to the same run.
+
+    Raises:
+        UserError: the folder holds other files or another run, `resume` is needed, or it is not writable.
+    """
     if not (folder / "config.json").exists():
         if folder.is_dir() and set(folder.iterdir()) - {*left_by_killed(folder / "config.json")}:
             raise UserError(f"{folder} holds other files; choose another OUT")
@@ -88,9 +96,9 @@ def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
     elif found := difference(read_config(folder), config):
         raise UserError(f"{folder} holds a run of another configuration ({found}); choose another OUT or remove the folder")
     elif not resume:
-        raise UserError(f"{folder} already holds this run; add --resume to go on with it, or choose another OUT")
+        raise UserError(f"{folder} already holds this run; add --resume to continue it, or choose another OUT")
     if not os.access(folder, os.W_OK):
-        raise UserError(f"cannot write to run folder {folder}; choose another OUT or mend its permissions")
+        raise UserError(f"cannot write to run folder {folder}; choose another OUT or correct its permissions")
 
 
 def difference(a: RunConfig, b: RunConfig) -> str:
@@ -107,24 +115,28 @@ def difference(a: RunConfig, b: RunConfig) -> str:
 
 
 def open_run(folder: Path) -> TrainedField:
-    """Returns what `load_trained` does, for a command, with a note if the training is not finished."""
+    """Returns the result of `load_trained`, for a command, and warns if the training is not finished."""
     trained = load_trained(folder)
     if not (folder / MANIFEST).exists():
         warnings.warn(
-            f"the training of {folder} is not finished (step {trained.step} is saved): its answers know neither neighbours "
-            "nor how sure they are; train on with the same command and --resume",
+            f"the training of {folder} is not finished (step {trained.step} is saved): it has neither residual kriging nor "
+            "prediction intervals yet; continue training with the same command and --resume",
             stacklevel=2,
         )
     return trained
 
 
 def load_trained(folder: Path | str) -> TrainedField:
-    """Returns the field of a run's newest checkpoint; the data are not read."""
+    """Returns the field of a run's newest checkpoint; the data are not read.
+
+    Raises:
+        UserError: the folder is not a run folder, or it has no valid checkpoint.
+    """
     folder = Path(folder)
     config = read_config(folder)
     steps = checkpoint.checkpoint_steps(folder / "checkpoints")
     if not steps:
-        raise UserError(f"{folder} holds no checkpoint yet; train on with the same command and --resume")
+        raise UserError(f"{folder} holds no checkpoint yet; continue training with the same command and --resume")
     saved = checkpoint.read(folder / "checkpoints", steps[-1])
     field = field_from_arrays(get_field(config.field), jax.tree.map(jnp.asarray, saved.field), config.settings.field)
     params = checkpoint.fill(saved, field.init, jax.random.key(0), prefix=".params")
@@ -135,22 +147,22 @@ def load_trained(folder: Path | str) -> TrainedField:
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where nobody is kept out
+except ImportError:  # not available on Windows, where folders are not locked
     fcntl = None  # type: ignore[assignment]
 
 FILE = "training.lock"
 
 
 class Taken(UserError):
-    """Another process has the folder."""
+    """Another process has locked the folder."""
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps a run folder for this process while the block runs; the lock goes with the process, however that ends.
+    """Locks a run folder for this process while the block runs; the lock is released when the process ends, in any way.
 
     Raises:
-        Taken: another process has it; the message says which.
+        Taken: another process has locked it; the message names that process.
     """
     with (folder / FILE).open("a+") as stream:
         if fcntl is not None:
@@ -160,7 +172,7 @@ def locked(folder: Path) -> Iterator[None]:
                 stream.seek(0)
                 holder = stream.read(200).strip() or "another process"
                 raise Taken(f"{folder} is being trained by {holder}; wait for it, or choose another OUT") from None
-            except OSError:  # some clusters' file systems know no locks
+            except OSError:  # the file systems of some clusters do not support locks
                 warnings.warn(f"{folder} cannot be locked on its file system; train one run there at a time", stacklevel=3)
         stream.truncate(0)
         stream.write(f"process {os.getpid()}")

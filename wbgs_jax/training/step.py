@@ -1,8 +1,8 @@
 """The jitted part of training: pure functions on a `TrainState`.
 
-An epoch is a `lax.scan` over a block of batches with donated state. A step that overflowed its field's capacity, or whose loss
-or gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and says
-where it stopped, and the host decides (a larger capacity and repeat, or stop with a message).
+An epoch is a `lax.scan` over a block of batches with donated state. A step that overflows the capacity of its field, or whose
+loss or gradient is not finite, commits nothing, and neither do the steps after it: the epoch returns the last good state and
+where it stopped. The host then increases the capacity and repeats the step, or stops with a message.
 """
 
 from functools import partial
@@ -29,26 +29,26 @@ class TrainState:
     params: Params
     optimizer: Any
     statistics: tuple[Any, ...]
-    """What every hook has watched since it last acted."""
+    """Statistics of every hook since it last acted."""
     step: Int[Array, ""]
 
 
 @pytree
 class EpochReport:
-    """What an epoch of K steps tells the host."""
+    """Results of an epoch of K steps."""
 
     loss: Float[Array, " k"]
     """NaN for steps that did not run or failed."""
     metrics: dict[str, Float[Array, " k"]]
-    """Figures of the steps, such as the mean SSIM of the batch; NaN where they mean nothing."""
+    """Metrics of the steps, such as the mean SSIM of the batch; NaN where undefined."""
     good_steps: Int[Array, ""]
-    """Steps committed, counted from the epoch's start."""
+    """Number of committed steps."""
     overflow: Bool[Array, ""]
-    """The step after the last good one did not fit its capacity ..."""
+    """Whether the step after the last good one exceeded the capacity."""
     required: Int[Array, " r"] | None
-    """... and required this much (the largest seen); None for a field without a capacity."""
+    """Largest sizes that any step needed; None for a field without a capacity."""
     stopped: Bool[Array, ""]
-    """The epoch ended early, by overflow or a loss or gradient that is not finite."""
+    """Whether the epoch ended early, by overflow or by a loss or gradient that is not finite."""
 
 
 def init_state(params: Params, optimizer: optax.GradientTransformation, hooks: tuple[Hook, ...] = ()) -> TrainState:
@@ -68,8 +68,19 @@ def loss_and_gradients(
     mesh: Mesh | None = None,
     probe: Any = None,
 ) -> tuple[tuple[Float[Array, ""], Aux], tuple[Any, Any]]:
-    """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch. The devices of a mesh divide
-    the links evenly; the loss is the mean of theirs."""
+    """Returns ((loss, aux), (gradient of the parameters, gradient of the probe)) of one batch.
+
+    Args:
+        field: field.
+        params: its parameters.
+        prepared: result of the field's `prepare`.
+        data: training data.
+        index: indices of the links of the batch, all of one receiver.
+        capacity: static sizes of the field.
+        key: random key of the step.
+        mesh: devices among which the links are divided evenly; the loss is then the mean over the devices.
+        probe: zeros whose gradient a hook needs (`hooks.Hook.probe`), or None.
+    """
 
     def loss(index, params, probe, field, prepared, data, key):
         return field.loss(params, prepared, data.batch(index, key), capacity, probe)
@@ -83,7 +94,7 @@ def loss_and_gradients(
 
 
 def _all_finite(tree: Any) -> Bool[Array, ""]:
-    """Returns whether all numbers are finite: looked at together, since a GPU takes as long for a leaf as for all of them."""
+    """Returns whether all numbers are finite. They are checked together, since a GPU takes as long for one leaf as for all."""
     return jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])).all()
 
 
@@ -108,11 +119,23 @@ def run_epoch(
     stopped: Bool[Array, ""] | None = None,
     branches: bool = True,
 ) -> tuple[TrainState, EpochReport]:
-    """Runs the batches of an epoch from number `first` on; `key` is that of the run. Gives the state away. With a mesh all
-    arguments are on all of its devices, and so are the results. Where `stopped`, the epoch before ended early: no step runs.
+    """Runs the batches of an epoch and returns the new state with a report.
 
-    Without `branches` steps that are passed by are computed in vain: of a branch a GPU waits for the host in every step, and
-    they are rare.
+    Args:
+        state: state, which is donated.
+        field: field.
+        prepared: result of the field's `prepare`.
+        data: training data.
+        batches: indices of the links of K batches.
+        first: number of the first batch to run.
+        key: random key of the run.
+        optimizer: optimiser.
+        hooks: hooks.
+        capacity: static sizes of the field.
+        mesh: devices that share every batch; all arguments and results are then replicated on all of them.
+        stopped: whether the previous epoch ended early, in which case no step runs.
+        branches: whether skipped steps are not computed. On a GPU a branch waits for the host in every step; skipped steps are
+            rare, so that it is faster to compute them and discard the result.
     """
 
     def run(state: TrainState, index: Int[Array, " b"]):

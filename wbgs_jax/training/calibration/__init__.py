@@ -1,1 +1,1 @@
-"""What training finds out about a scene before gradient steps: antennas, materials, geometry, obstacles."""
+"""Calibration of a scene before the first training step: antennas, materials, geometry, array gains, absorption."""

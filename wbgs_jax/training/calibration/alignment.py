@@ -1,13 +1,14 @@
-"""Surfaces of a mesh that is wrong by millimetres to centimetres, put where the spectra say they are, on the host.
+"""Alignment of the surfaces of a mesh that is inaccurate by millimetres to centimetres with training spectra (host).
 
-A length that is off by a tenth of a wavelength is hardly seen, one that is off by a whole one cannot be told from right. So
-low frequencies come first, and each narrows it down for the next: every mover of the facets, and the receiver, gets a small
-rigid motion whose effect on phases is first-order (propagation/displacement.py), found by least squares (`gauss_newton.py`)
-or, where there are no snapshots, by descent (`gradient.py`); now and then things are moved and paths traced again. Materials
-are named as far as places are known by then, since powers tell where phases cannot, and by phases once places are found; then
-all is gone through once more, or twice where thicknesses are unknown, and more often where a free receiver still moves. A
-prior keeps what no path sees where it was. What comes out is kept if it predicts training spectra surely better than the mesh
-as it was, each with the position uncertainty that suits it best.
+A path length error of a tenth of a wavelength has little effect, and an error of a whole wavelength looks the same as none.
+Alignment therefore begins at low frequencies, and each frequency reduces the ambiguity of the next: every rigid body, and the
+receiver, is given a small rigid motion whose effect on phases is computed to first order (propagation/displacement.py). The
+motions are estimated by least squares (`gauss_newton.py`) or, without snapshots, by gradient descent (`gradient.py`); at
+intervals the surfaces are displaced and paths are traced again. Materials are chosen in view of the current uncertainty of
+positions, since powers are informative where phases are not, and by phases once positions are accurate. Everything is then
+repeated once, or twice if thicknesses are unknown, and more often as long as a free receiver still moves. A prior keeps
+surfaces that affect no path at their nominal positions. The result is kept if it predicts training spectra significantly better
+than the nominal mesh, both with the position uncertainty that fits them best.
 """
 
 import dataclasses
@@ -39,72 +40,72 @@ from wbgs_jax.training.hooks import Say, silent
 from wbgs_jax.types import Links
 
 SPREAD = 0.05
-"""How far surfaces are taken to be off when materials are named, in wavelengths of the highest frequency; at most as far as the
-prior says."""
+"""position_std that is assumed when materials are chosen, in wavelengths of the highest frequency; limited to the prior."""
 TRACED_AGAIN = 5.0
-"""Ratio of frequencies after which surfaces are moved and paths traced again."""
+"""Ratio of frequencies after which surfaces are displaced and paths are traced again."""
 APART = 1.5
-"""Ratio of two frequencies up to which snapshots are looked at one after the other, at least, but for the highest."""
+"""Minimum ratio of two successive maximum frequencies of the snapshots, except for the highest."""
 TURN = 1e-3
-"""Standard deviation (radians) of how far surfaces are turned."""
+"""Prior standard deviation (radians) of the rotation of surfaces."""
 HELD_RECEIVER, FREE_RECEIVER = (1e-3, 2e-3), (1e-2, 1e-2)
-"""Standard deviations (metres, radians) of how far the receiver stands elsewhere and is turned: held, since what all walls have
-in common is easily taken for the receiver's; and free. If it then goes far, what was found with it free replaces the other
-where spectra are surely better for it; otherwise both are followed to the end."""
+"""Prior standard deviations (metres, radians) of the displacement and rotation of the receiver: "held", since a common
+displacement of all walls is easily attributed to the receiver, and "free". If a free receiver moves far, the result with it
+free replaces the other if spectra fit significantly better; otherwise both are refined to the end."""
 MORE = 2
-"""Times that places are found again, with the materials that they told, where thicknesses are unknown: these depend on places,
-and places on thicknesses. Where they are known, once is enough."""
+"""Number of repetitions of the estimate of positions with the chosen materials if thicknesses are unknown, since thicknesses
+and positions depend on each other. If thicknesses are known, once is sufficient."""
 MOST = 5
-"""Times at most where the receiver is free: it can be far from where it was said to be, and walls that stand right take long to
-give back what they took on for it. Places are found again until it goes no further than a standard deviation of a held one."""
+"""Maximum number of these repetitions for a free receiver, which can be far from its nominal position: correctly placed walls
+that have compensated for it return slowly. Positions are estimated again until the receiver moves by less than a standard
+deviation of a held one."""
 SURE = 2.0
-"""As many standard errors over transmitters as the gain has to be sure by (`surely_better`): the mesh is doubted already."""
+"""n_sigma: standard errors over transmitters by which the result must fit better (`surely_better`); low, since the mesh has
+already been found to be inaccurate."""
 
 
 @dataclass(frozen=True)
 class GeometryReport:
-    """What was moved."""
+    """Result of the alignment."""
 
     before: float
-    """Mean score of training spectra with the mesh as it was ..."""
+    """Mean score of training spectra with the nominal mesh."""
     after: float
-    """... and with things moved."""
+    """Mean score of training spectra with displaced surfaces."""
     kept: bool
-    """Whether they stay there."""
+    """Whether the displacements are kept."""
     antennas_kept: bool
-    """Whether the antennas are those that were found before anything was moved."""
+    """Whether the antennas are the same as before the alignment."""
     typical_mm: float
-    """Root mean square of the shifts of movers, along all axes together ..."""
+    """Root mean square of the shifts of rigid bodies."""
     largest_mm: float
-    """... and the largest; ..."""
+    """Largest shift of a rigid body."""
     largest_deg: float
-    """... and by how much any of them was turned."""
+    """Largest rotation of a rigid body."""
     receiver_mm: float
-    """How far the receiver, or that of several which was moved furthest, was moved ..."""
+    """Shift of the receiver, the largest one of several receivers."""
     receiver_deg: float
-    """... and turned."""
+    """Rotation of the receiver, the largest one of several receivers."""
     bodies: list[dict[str, float]] = having(default_factory=list)
-    """Of every mover: how far it was shifted (mm), and the standard deviations (mm) of where it stands along the direction in
-    which that is known best, and along the one in which it is known least; where snapshots were heard."""
+    """For every rigid body its shift (mm) and the standard deviations (mm) of its position along the most and the least certain
+    direction; empty without snapshots."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A field in which things stand somewhere, with the paths of some transmitters there."""
+    """A candidate of the alignment: a field with displaced surfaces, its parameters, and paths traced in it."""
 
     field: Calibratable
-    """A field that can be `moved`."""
     params: WaveParams
     prepared: PreparedPaths
     known: Float[np.ndarray, "m 3 3"] | None = None
-    """Covariances of where the movers stand (square metres); None where they are not known."""
+    """Covariances of the positions of rigid bodies (square metres); None if they have not been estimated."""
     likely: Likely | None = None
-    """Slabs that materials may be; None where they have not been looked for."""
+    """Most likely slabs of materials; None if they have not been searched."""
 
 
 @dataclass(frozen=True)
 class _Heard:
-    """Some training spectra, and what they say of places."""
+    """Training spectra with which candidates are scored."""
 
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
@@ -113,13 +114,19 @@ class _Heard:
     say: Say
 
     def told(self, now: Place) -> Told:
-        """Returns what they say of a place, in an order drawn anew."""
+        """Returns these spectra, in a new random order, for scoring a candidate."""
         return Told(now.field, now.prepared, self.data, self.rng.permutation(self.spectra))
 
     def named(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
-        """Names the materials: as far as places are believed, or as if all of them were known; with the thicknesses that the
-        scene does not say, or in those that they have."""
-        self.say("search: materials, as far as places are known")
+        """Returns a candidate with newly chosen materials.
+
+        Args:
+            now: candidate.
+            rounds: maximum number of passes over all materials.
+            compared: "covariances" accounts for the uncertainty of positions, "snapshots" takes them as exact.
+            sized: whether unknown thicknesses are estimated as well.
+        """
+        self.say("calibration: materials, with uncertain positions")
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
         once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
         if sized:
@@ -129,17 +136,18 @@ class _Heard:
         return dataclasses.replace(now, params=params)
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
-        """Believes places as far as spectra say."""
+        """Returns a candidate with the position uncertainty that fits spectra best."""
         params, _ = search_placement(now.params, self.told(now).scores(self.config.placement_spectra, compared))
         return dataclasses.replace(now, params=params)
 
     def surprised(self, now: Place) -> float:
-        """Returns how badly some spectra, always the same ones, are explained as far as places are known."""
+        """Returns the mean negative log-likelihood of some spectra, always the same ones, given the position uncertainty."""
         told = Told(now.field, now.prepared, self.data, np.random.default_rng(0).permutation(self.spectra))
         return float(told.scores(self.config.spectra, "covariances")([now.params])[0].mean())
 
     def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
-        """Returns places, each with as much doubt as suits it, the scores of some spectra at each, and their transmitters."""
+        """Returns candidates, each with the position uncertainty that fits best, their scores on some spectra, and the
+        transmitters of these."""
         spectra = self.rng.choice(self.spectra, min(self.config.spectra, len(self.spectra)), replace=False)
         doubted = [self.guessed(one, "spectra") for one in places]
         scores = [Told(p.field, p.prepared, self.data, spectra).scores(compared="spectra")([p.params])[0] for p in doubted]
@@ -154,8 +162,17 @@ def learn_geometry(
     rng: np.random.Generator,
     say: Say = silent,
 ) -> tuple[Place, GeometryReport]:
-    """Returns the field with its surfaces where training spectra say they are, its materials named there, and the paths of all
-    transmitters; as it was, where that explains spectra no worse. `say` is told of what is looked for next."""
+    """Returns the field with aligned surfaces, newly chosen materials, and the paths of all transmitters; the nominal one
+    unless the alignment fits spectra significantly better.
+
+    Args:
+        place: field, parameters and paths before the alignment.
+        data: training data.
+        train: indices of the training links.
+        config: settings of the calibration.
+        rng: random numbers.
+        say: called with a description of each stage.
+    """
     tx = np.asarray(data.links.tx_index)
     some_tx = rng.permutation(np.unique(tx[train]))[: config.geometry_tx]
     own = train[np.isin(tx[train], some_tx)]
@@ -167,7 +184,7 @@ def learn_geometry(
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
         if _went_far(free.field.motion, 3.0):  # further than by chance
-            say("search: whether the receiver stands elsewhere")
+            say("calibration: displacement of the receiver")
             sure = _surely_better(free, held, heard, links)
             found = [(free, FREE_RECEIVER)] if sure else [*found, (free, FREE_RECEIVER)]
     begun = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
@@ -175,9 +192,10 @@ def learn_geometry(
 
 
 def _refined(now: Place, receiver: tuple[float, float], heard: _Heard) -> list[Place]:
-    """Returns where things are found by all transmitters, with ever better materials; the last is not always the best."""
+    """Returns candidates that are aligned with all transmitters, with successively better materials; the last one is not always
+    the best."""
     data, config = heard.data, heard.config
-    now = dataclasses.replace(heard.named(heard.guessed(now), 1), likely=None)  # where things stood before rules nothing out
+    now = dataclasses.replace(heard.named(heard.guessed(now), 1), likely=None)  # slabs of earlier positions rule nothing out
     moved = [now, heard.named(now, config.rounds, "snapshots", sized=True)]
     unknown = bool(np.any(np.asarray(now.field.known_thickness) == 0))
     least = 0 if data.snapshots is None else MORE if unknown else 1
@@ -193,16 +211,16 @@ def _refined(now: Place, receiver: tuple[float, float], heard: _Heard) -> list[P
 
 
 def _went_far(motion: Motion, deviations: float) -> bool:
-    """Returns whether a receiver went further than so many standard deviations of how far one goes that is held."""
+    """Returns whether a receiver has moved by more than so many prior standard deviations of a held receiver."""
     far = (np.linalg.norm(motion.receiver, axis=-1), np.linalg.norm(motion.receiver_turn, axis=-1))
     return any(bool(np.any(one > deviations * width)) for one, width in zip(far, HELD_RECEIVER, strict=True))
 
 
 def _begun(place: Place, heard: _Heard, links: Links) -> Place:
-    """Returns the field with surfaces doubted and materials named anew, as far as places are known.
+    """Returns the initial candidate, with the prior uncertainty of surfaces and newly chosen materials.
 
-    Where phases are wrong, a wrong antenna can explain them best, and materials then make up for it. So antennas that were
-    found, at either end, have to explain spectra better than those of before, each with materials of its own.
+    If phases are inaccurate, a wrong antenna may fit best, with materials that compensate for it. Antennas that were found by
+    calibration must therefore fit better than the initial ones at either end, each with materials of its own.
     """
     new, seed = place.field.init(jax.random.key(0)), int(heard.rng.integers(2**32))
     alike = dataclasses.replace(place.params, materials=new.materials)
@@ -211,27 +229,26 @@ def _begun(place: Place, heard: _Heard, links: Links) -> Place:
     begins = []
     for antennas in itertools.product(*([found] if same(found, before) else [found, before] for found, before in ends)):
         params = dataclasses.replace(first.params, **dict(zip(ENDS, antennas, strict=True)))
-        alike_heard = dataclasses.replace(heard, rng=np.random.default_rng(seed))  # the same spectra name materials of each
+        alike_heard = dataclasses.replace(heard, rng=np.random.default_rng(seed))  # the same spectra for all combinations
         begins.append(alike_heard.named(dataclasses.replace(first, params=params), heard.config.rounds, sized=True))
     return min(begins, key=heard.surprised)
 
 
 def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
-    """Returns whether spectra are surely better where one place was found than where another was."""
+    """Returns whether spectra fit significantly better with one candidate than with another."""
     _, (ours, others), tx = heard.compared([_retraced(one, one.params, links, heard.data) for one in (place, other)])
     return surely_better(others - ours, tx, SURE)
 
 
 def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, float], named: bool) -> Place:
-    """Returns the field with things moved as spectra say, from low frequencies to high ones; its paths are those of before.
-    Paths are traced again on the way, and materials named, if they are.
+    """Returns the candidate aligned with the spectra `heard`, from low to high frequencies. Paths are traced again in between,
+    but those of the result precede the last displacement.
 
     Args:
-        now: with the paths of the transmitters of `links`.
-        heard: what their spectra say.
-        links: of which paths are traced.
-        receiver: standard deviations of how far it stands elsewhere and is turned.
-        named: whether materials are named.
+        now: candidate with the paths of the transmitters of `links`.
+        links: links whose paths are traced.
+        receiver: prior standard deviations of the displacement (metres) and rotation (radians) of the receiver.
+        named: whether materials are chosen again whenever paths are traced.
     """
     data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
@@ -239,7 +256,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)
     covariance = np.diag(variances[numbers])
     for highest in frequencies_apart(frequency):
-        heard.say(f"search: places, up to {highest / 1e9:.4g} GHz")
+        heard.say(f"calibration: alignment up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _retraced(dataclasses.replace(now, field=now.field.moved(motion)), now.params, links, data), none
             now = heard.named(now, 1) if named else now
@@ -258,7 +275,8 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
 
 
 def frequencies_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
-    """Returns frequencies of the data that stand apart, ascending; the lowest and the highest are among them."""
+    """Returns frequencies of the data whose successive ratios are at least `APART`, ascending, always with the lowest and the
+    highest."""
     lowest, *others = np.unique(frequency_hz).tolist()
     found, highest = [lowest], max([lowest, *others])
     for one in others:
@@ -267,14 +285,14 @@ def frequencies_apart(frequency_hz: Float[np.ndarray, " n"]) -> list[float]:
 
 
 def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Motion:
-    """Returns the standard deviations of all numbers of a motion before anything was heard."""
+    """Returns the prior standard deviations of all components of a motion."""
     far = {"shift": shift, "turn": TURN, "receiver": receiver[0], "receiver_turn": receiver[1]}
     return Motion(**{name: jnp.full_like(getattr(motion, name), width) for name, width in far.items()})
 
 
 def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, GeometryReport]:
-    """Returns the best place, with its uncertainty. A moved one has to be surely better at what counts in the end, spectra: the
-    likelihood of snapshots forgives a wrong mesh that is doubted enough."""
+    """Returns the best candidate with its position uncertainty. A displaced one must fit spectra significantly better than the
+    nominal one; the likelihood of snapshots is not used, since it tolerates an inaccurate mesh with a large uncertainty."""
     (as_it_was, *others), (before, *after), tx = heard.compared([place, *moved])
     best = int(np.argmin([own.mean() for own in after]))
     kept = surely_better(before - after[best], tx, SURE)
@@ -286,7 +304,7 @@ def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, Geo
 
 
 def _sizes(motion: Motion) -> dict[str, float]:
-    """Returns how far things were moved."""
+    """Returns typical and largest displacements for the report."""
     size = jax.tree.map(lambda leaf: np.linalg.norm(np.asarray(leaf), axis=-1), motion)
     return {
         "typical_mm": float(1e3 * np.sqrt(np.mean(size.shift**2))),
@@ -300,16 +318,17 @@ def _sizes(motion: Motion) -> dict[str, float]:
 def _known(
     covariance: Float[np.ndarray, "q q"], numbers: Int[np.ndarray, " q"], variances: Float[np.ndarray, " p"], movers: int
 ) -> Float[np.ndarray, "m 3 3"]:
-    """Returns the covariances of the shifts of all movers: of those that were adjusted as known by now, of others the prior."""
+    """Returns the covariances of the shifts of all rigid bodies: posterior ones of those that were adjusted, the prior of the
+    others."""
     found = variances[: 3 * movers].reshape(movers, 3)[:, None] * np.eye(3)
-    for first in range(0, int(np.sum(numbers < 3 * movers)), 3):  # shifts come first, three numbers a mover
+    for first in range(0, int(np.sum(numbers < 3 * movers)), 3):  # shifts come first, three components per rigid body
         own = slice(first, first + 3)
         found[numbers[first] // 3] = covariance[own, own]
     return found
 
 
 def _bodies(motion: Motion, known: Float[np.ndarray, "m 3 3"] | None) -> list[dict[str, float]]:
-    """Returns how far every mover was shifted, and how well it is known where it stands."""
+    """Returns the shift and the position uncertainty of every rigid body; an empty list without covariances."""
     if known is None:
         return []
     shifts = 1e3 * np.linalg.norm(np.asarray(motion.shift), axis=-1)
@@ -324,13 +343,13 @@ def _retraced(now: Place, params: WaveParams, links: Links, data: TrainingData) 
 
 
 def _doubted(now: Place, spread: float) -> Place:
-    """Believes that every surface may be off by so many metres (standard deviation); transmitters are where they are said."""
+    """Returns a candidate with this position_std (metres) for all surfaces; that of the transmitters is unchanged."""
     placement = now.params.placement
     spreads = jnp.full_like(placement, np.log(spread)).at[-1].set(placement[-1])
     return dataclasses.replace(now, params=dataclasses.replace(now.params, placement=spreads))
 
 
 def _fresh(learned: WaveParams, initial: WaveParams) -> WaveParams:
-    """Returns parameters as they were before, but for materials, antennas and how far places are believed."""
+    """Returns the initial parameters, with the learned materials, antennas and position uncertainty."""
     known = {name: getattr(learned, name) for name in ("materials", "placement", *ENDS)}
     return dataclasses.replace(initial, **known)

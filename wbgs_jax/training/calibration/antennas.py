@@ -1,8 +1,9 @@
-"""Search for the antennas of transmitters and elements where nobody has said what they are.
+"""Calibration of the antennas of transmitters and elements whose pattern is unknown.
 
-An antenna is turned along the axes, and isotropic, a short dipole or the directional element of 3GPP TR 38.901. All
-transmitters share theirs. A wrong one misplaces the power of every path: in the authors' published sample the transmitters look
-down the scene's -z axis, and a field that takes them for isotropic says of half of them less than the mean image does.
+Candidates are the isotropic antenna, the short dipole and the directional element of 3GPP TR 38.901, oriented along the axes.
+All transmitters have the same antenna. A wrong antenna distorts the power of every path: in the authors' published sample the
+transmitters point along the scene's -z axis, and a field with isotropic ones is less accurate than the mean image for half of
+the transmitters.
 """
 
 from dataclasses import dataclass
@@ -20,28 +21,29 @@ from wbgs_jax.training.calibration.objective import Scores, by_transmitter, sure
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 ENDS = "transmitter", "element"
-"""Whose antennas are searched."""
+"""Parameters whose antennas are calibrated."""
 UP = ("+x", "+y", "+z")
-"""Axes that an antenna may stand along: upside down it differs by a sign."""
+"""Directions of an antenna's z axis; an opposite direction only changes the sign."""
 LARGE, SURE_OF_LARGE = 0.3, 1.5
-"""A gain of so much (natural logarithm: a quarter less is left) is taken by as many standard errors. With few transmitters it
-costs far more to miss the antenna than to take a wrong one, which gains nothing: docs/history.md has the chances of both."""
+"""A large gain (natural logarithm: the error is reduced by a quarter) must be significant by fewer standard errors. With few
+transmitters it is much worse to miss the correct antenna than to take a wrong one that gains nothing; docs/history.md lists the
+probabilities of both."""
 
 
 @dataclass(frozen=True)
 class AntennaReport:
-    """What a search did."""
+    """Result of the calibration of antennas."""
 
     before: float
-    """Mean score of the spectra that were looked at."""
+    """Mean score of the spectra with the initial antennas."""
     after: float
-    """The same with the antennas that were taken."""
+    """Mean score of the spectra with the chosen antennas."""
     taken: dict[str, str]
-    """What was taken for the transmitters and for the elements; nothing: what they were."""
+    """Descriptions of new antennas of the transmitters and of the elements; unchanged antennas are not listed."""
 
 
 def antenna_candidates() -> dict[str, Antenna]:
-    """Returns the antennas that are tried, by a description."""
+    """Returns the candidate antennas by description."""
     found = {}
     for up in UP:
         for pattern in ("iso", "dipole"):
@@ -68,13 +70,21 @@ def search_antennas(
     config: SearchConfig,
     known_elements: bool,
 ) -> tuple[WaveParams, AntennaReport]:
-    """Returns parameters with the antennas whose scores are best, in turn for transmitters and elements, where they are surely
-    better than what is there, or better by much; elements whose pattern the data say are left alone."""
+    """Returns parameters with the antennas that score best, chosen alternately for transmitters and elements. An antenna is
+    replaced only if the new one is significantly better, or better by a large amount.
+
+    Args:
+        params: parameters.
+        score: scores of candidates.
+        tx_index: transmitters of the scored spectra.
+        config: settings of the calibration.
+        known_elements: whether the data define the pattern of the elements, which is then unchanged.
+    """
     taken, settled, before, after = dict[str, str](), 0, np.zeros(1), np.zeros(1)
     ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
-        end, candidates = ends[turn % len(ends)], antenna_candidates()  # anew: training gives every array away once
-        # What is there is scored among the others: by itself it would need a program of its own.
+        end, candidates = ends[turn % len(ends)], antenna_candidates()  # new arrays, since training donates each of them once
+        # The current antenna is scored together with the others; alone it would need a separate program.
         tried = [params, *(replaced(params, **{end: antenna}) for antenna in candidates.values())]
         scores = score(tried)
         best = 1 + int(np.argmin(scores[1:].mean(1)))
@@ -82,15 +92,15 @@ def search_antennas(
         settled += 1
         if surely_better(scores[0] - scores[best], tx_index, config.antenna_sure) or gains_much(scores, tx_index):
             taken[end], params, after, settled = list(candidates)[best - 1], tried[best], scores[best], 1
-        if settled == len(ends):  # the other end is what it was when this one was looked at
+        if settled == len(ends):  # the other end has not changed since this one was scored
             break
     return params, AntennaReport(float(before.mean()), float(after.mean()), taken)
 
 
 def gains_much(scores: Float[np.ndarray, "k n"], tx_index: Int[np.ndarray, " n"]) -> bool:
-    """Returns whether the best of several candidates gains `LARGE` over the first one.
+    """Returns whether the best of several candidates gains more than `LARGE` over the first one.
 
-    For every transmitter the candidate is chosen by the others: so that it was chosen among many adds nothing to its gain.
+    For every transmitter the candidate is chosen with the other transmitters, so that the selection does not bias its gain.
     """
     of_tx = np.stack([by_transmitter(own, tx_index) for own in scores])
     chosen = 1 + (of_tx.sum(1, keepdims=True) - of_tx)[1:].argmin(0)

@@ -1,12 +1,12 @@
-"""Elements of an array that are out of tune: complex gains by which snapshots differ from what their geometry says.
+"""Calibration of array gains, the complex gains of elements by which measured snapshots differ from predicted ones.
 
-Cables and receivers of an array differ by degrees and decibels, at all frequencies alike as far as is known here. With x_i the
-snapshot that a field says of link i and y_i the one that was heard, gains g and one factor c_i of every link make
+Cables and receivers of an array differ by degrees and decibels; the gains are assumed to be independent of the frequency. With
+x_i the predicted and y_i the measured snapshot of link i, the gains g and a factor c_i for every link minimise
 
     sum_i  w_i |y_i - c_i g x_i|^2,    w_i = 1 / (1 - correlation^2 of y_i and g x_i)
 
-least, in turn for c, w and g: a calibration by known sources, the field in the place of the sources. It is found on half of the
-spectra that are looked at, and believed where it explains the other half surely better.
+alternately for c, w and g. This is a calibration by known sources, with the field in place of the sources. The gains are
+estimated on half of the spectra in use, and kept if the other half fits significantly better with them.
 """
 
 import dataclasses
@@ -24,39 +24,35 @@ from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.training.calibration.objective import Told, surely_better
 
 ROUNDS = 20
-"""Of least squares."""
+"""Iterations of least squares."""
 AT_ONCE = 8
-"""Snapshots."""
+"""Number of snapshots that are computed together."""
 FEWEST = 32
-"""Snapshots of a receiver without which its array is taken as it is."""
+"""Minimum number of snapshots of a receiver; with fewer its array is not calibrated."""
 SURE = 3.0
-"""As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
+"""n_sigma: standard errors over transmitters by which the gains must improve the fit (`surely_better`)."""
 
 
 @dataclass(frozen=True)
 class TuningReport:
-    """What was found."""
+    """Result of the calibration of array gains."""
 
     before: float
-    """Mean score of spectra with arrays in tune ..."""
+    """Mean score of spectra without new gains."""
     after: float
-    """... and with the gains."""
+    """Mean score of spectra with the gains."""
     kept: bool
-    """Whether they are used."""
+    """Whether the gains are used."""
     phase_deg: float
-    """Root mean square over elements of their phases ..."""
+    """Standard deviation of the phases of elements."""
     amplitude_db: float
-    """... and of their amplitudes."""
+    """Standard deviation of the amplitudes of elements."""
 
 
 def search_tuning(params: WaveParams, told: Told, count: int) -> tuple[Calibratable, TuningReport]:
-    """Returns the field with its arrays tuned as training snapshots say, where that is surely better; as it is otherwise.
-
-    Args:
-        params: of a field whose arrays can be given gains.
-        told: training spectra, with snapshots, and the field.
-        count: how many of them are looked at: one half says the gains, the other whether they are right.
-    """
+    """Returns the field with calibrated array gains if these fit significantly better, else unchanged. `params` are its
+    parameters, and `told` training spectra, with snapshots, and the field; `count` spectra are used: the gains are estimated on
+    half of them and tested on the other half."""
     field, links = told.field, told.data.links
     chosen = told.spectra[:count]
     half = np.unique(np.asarray(links.tx_index)[chosen], return_inverse=True)[1] % 2 == 0
@@ -78,8 +74,8 @@ def _parts(tuned: Calibratable) -> tuple[np.ndarray, np.ndarray]:
 def gains_of(
     field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "r elements"]:
-    """Returns the gains of all receivers' elements, 1 where too few snapshots were heard; their mean phase is 0 and their root
-    mean square 1, since a common factor says nothing."""
+    """Returns the gains of the elements of all receivers, 1 for receivers with too few snapshots. Their mean phase is 0 and
+    their root mean square 1, since a common factor is not observable."""
     receiver = np.asarray(told.data.links.receiver_index)[spectra]
     positions = told.data.receivers.element_positions
     gains = np.ones(positions.shape[:2], complex)
@@ -93,11 +89,11 @@ def gains_of(
 def _snapshots(
     field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the snapshots (n, elements) that a field says of some links, and those that were heard."""
-    padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeats itself: one shape
-    said = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
-    assert told.data.snapshots is not None, "tuning is found from snapshots"
-    return np.asarray(said)[: len(spectra)], np.asarray(told.data.snapshots)[spectra]
+    """Returns predicted and measured snapshots (n, elements) of links."""
+    padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeated to whole blocks
+    predicted = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
+    assert told.data.snapshots is not None, "array gains are estimated from snapshots"
+    return np.asarray(predicted)[: len(spectra)], np.asarray(told.data.snapshots)[spectra]
 
 
 @jax.jit
@@ -107,7 +103,7 @@ def _said(
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
         batch = data.batch(link[None], jax.random.key(0))
         seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        assert seen.snapshots is not None, "it is coherent"
+        assert seen.snapshots is not None, "a coherent field predicts snapshots"
         return seen.snapshots[0]
 
     found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)
@@ -117,7 +113,7 @@ def _said(
 def least_squares(
     said: Complex[np.ndarray, "n elements"], heard: Complex[np.ndarray, "n elements"]
 ) -> Complex[np.ndarray, " elements"]:
-    """Returns the gains by which snapshots that were said become those that were heard, each up to a factor of its own."""
+    """Returns the gains that turn predicted snapshots into measured ones, each up to a complex factor."""
     power = _power(said) * _power(heard)
     usable = np.isfinite(power) & (power > 0)
     x, y = (part[usable].astype(complex) / np.sqrt(_power(part[usable]))[:, None] for part in (said, heard))

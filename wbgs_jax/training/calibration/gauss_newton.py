@@ -1,13 +1,13 @@
-"""Where surfaces and the receiver stand, by least squares over snapshots, as surveyors adjust a network.
+"""Gauss-Newton alignment of surfaces and receivers: least squares over snapshots, like the adjustment of a survey network.
 
-What a model leaves unexplained of a snapshot is linear in small motions: every path turns by its wavenumber times the change
-of its length (propagation/displacement.py). With a normal prior of every motion this gives the normal equations of a
-Gauss-Newton step, and with their inverse how well every motion is known by now. What nobody has seen stays where it was.
+The residual of a snapshot is linear in small motions: the phase of every path changes by its wavenumber times the change of its
+length (propagation/displacement.py). With a normal prior of every motion this gives the normal equations of a Gauss-Newton
+step; their inverse is the covariance of the motions. Surfaces that affect no path stay at their positions.
 
-Nobody knows the common factor of a snapshot: only what is orthogonal to the prediction counts. The noise level of every
-snapshot is unknown too (`losses.log_decorrelation`), which gives those that are explained badly less weight. Paths whose
-lengths are uncertain by more than a wavelength are expected to cancel, and tell nothing, until lower frequencies have told
-where their surfaces are.
+The common factor of a snapshot is unknown, so that only the component orthogonal to the prediction is used. The noise level of
+every snapshot is unknown as well (`losses.log_decorrelation`), which gives less weight to those that fit badly. Paths whose
+lengths are uncertain by more than a wavelength are expected to cancel and carry no information until lower frequencies have
+determined the positions of their surfaces.
 """
 
 from functools import partial
@@ -32,19 +32,19 @@ from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Links, Receiver
 
 ROUNDS = 3
-"""Steps at every frequency."""
+"""Gauss-Newton steps at every frequency."""
 AT_ONCE = 8
-"""Snapshots."""
+"""Number of snapshots that are processed together."""
 ALIKE = 30.0
-"""What places do not explain (wrong materials, paths that are missing) is alike in many snapshots: so many say as much as one
-whose error is its own."""
+"""Number of snapshots that carry as much information as one with independent errors: errors that positions cannot explain
+(wrong materials, missing paths) are correlated between snapshots."""
 LONGEST_STEP = 0.1
-"""In wavelengths of the highest frequency: beyond, phases are not linear."""
+"""Longest step, in wavelengths of the highest frequency; beyond it, phases are not linear."""
 MOST = 256
-"""Movers that are adjusted, at most: a step costs the square of their number. Others stay, and are believed as far as the prior
-says."""
+"""Maximum number of rigid bodies that are adjusted, since the cost of a step is quadratic in it. The others stay at their
+positions with the uncertainty of the prior."""
 ARM = 3.0
-"""Metres from its centre at which a turn moves a surface as far as a shift."""
+"""Distance from the centre of a surface, metres, at which a rotation displaces it as far as a shift."""
 
 
 def adjust(
@@ -60,19 +60,19 @@ def adjust(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Motion, Float[np.ndarray, "q q"]]:
-    """Returns the motion by which snapshots up to some frequency are explained best, and its covariance.
+    """Returns the motion that fits snapshots up to some frequency best, and its covariance.
 
     Args:
-        field, params: a coherent field, which is not moved: the motion is small.
+        field, params: a coherent field, which is not displaced: the motion is small.
         prepared: paths of the links of the pool.
-        motion: the one to start with, of all receivers.
-        covariance: of the numbers that are adjusted, by lower frequencies, or by the prior.
-        widths: standard deviations of the prior of the whole motion, that of the field included.
-        numbers: those of the motion that are adjusted (`adjusted_numbers`).
-        data: with snapshots.
-        pool: links, up to the highest frequency that counts.
-        count: snapshots that a step looks at, drawn anew for each.
-        rng: draws them.
+        motion: initial motion, with all receivers.
+        covariance: covariance of the adjusted components, from lower frequencies or from the prior.
+        widths: prior standard deviations of the total motion, which includes that of the field.
+        numbers: indices of the adjusted components of the motion (`adjusted_numbers`).
+        data: training data with snapshots.
+        pool: indices of links up to the highest frequency in use.
+        count: number of snapshots per step, drawn anew for each.
+        rng: random numbers.
     """
     flat, back = ravel_pytree(motion)
     start, moves = np.asarray(ravel_pytree(field.motion)[0], np.float64)[numbers], np.array(flat, np.float64)
@@ -84,7 +84,7 @@ def adjust(
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
     for _ in range(ROUNDS):
         blocks = -(-min(count, len(pool)) // AT_ONCE)
-        some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # of one shape, whatever the pool: compiled once
+        some = np.zeros((-(-count // AT_ONCE), AT_ONCE), np.int32)  # the shape is independent of the pool: compiled once
         some[:blocks] = rng.choice(pool, (blocks, AT_ONCE))
         now = back(jnp.asarray(moves, jnp.float32))
         equations = normal_equations(field, params, now, prepared, data, some, variance, np.int32(blocks), numbers)
@@ -96,8 +96,8 @@ def adjust(
 
 
 def adjusted_numbers(prepared: PreparedPaths, motion: Motion) -> Int[np.ndarray, " q"]:
-    """Returns which numbers of a motion are adjusted, as `ravel_pytree` orders them: those of all receivers, and those of the
-    movers that change the lengths of paths most, at most `MOST` of these."""
+    """Returns the indices of the components of a motion that are adjusted, in the order of `ravel_pytree`: those of all
+    receivers, and those of the rigid bodies that change path lengths most, at most `MOST` of them."""
     movers, size = len(motion.shift), ravel_pytree(motion)[0].size
     if movers <= MOST:
         return np.arange(size, dtype=np.int32)
@@ -108,19 +108,19 @@ def adjusted_numbers(prepared: PreparedPaths, motion: Motion) -> Int[np.ndarray,
 
 
 def _places(numbers: Int[Array, " q"], size: int) -> Int[Array, " p"]:
-    """Returns the place of every number of a motion among those that are adjusted; their count for the others."""
+    """Returns the index of every component of a motion among the adjusted ones; the number of these for the others."""
     return jnp.full(size, len(numbers)).at[numbers].set(jnp.arange(len(numbers)))
 
 
 def _arms(motion: Motion) -> Float[np.ndarray, " p"]:
-    """Returns how far every number of a motion moves things, per metre or radian."""
+    """Returns the displacement (metres) per unit (metre or radian) of every component of a motion."""
     one = jax.tree.map(np.ones_like, motion)
     return np.asarray(ravel_pytree(Motion(one.shift, ARM * one.turn, one.receiver, one.receiver_turn))[0])
 
 
 @partial(jax.jit, static_argnames=("movers", "size"))
 def _felt(prepared: PreparedPaths, movers: int, size: int) -> Float[Array, " p"]:
-    """Returns how strongly the lengths of all paths together depend on every number of a motion."""
+    """Returns the sums over all paths of squared derivatives of their lengths with respect to the components of a motion."""
 
     def add(total: Float[Array, " p"], pair: Any) -> tuple[Float[Array, " p"], None]:
         paths, receiver = pair
@@ -138,11 +138,11 @@ def length_variances(
     """Returns the variances (square metres) of the lengths of all paths.
 
     Args:
-        prepared: of the paths.
-        covariance: of the numbers of the motion that are adjusted.
-        others: variances of those that are not; 0 for the rest.
-        numbers: those that are adjusted.
-        movers: of the motion.
+        prepared: paths of all pairs.
+        covariance: covariance of the adjusted components of the motion.
+        others: variances of the components that are not adjusted; 0 for the adjusted ones.
+        numbers: indices of the adjusted components.
+        movers: number of rigid bodies.
     """
     shared, place = jnp.pad(covariance, (0, 1)), _places(numbers, len(others))
 
@@ -160,7 +160,8 @@ def length_variances(
 def _terms(
     prepared: PreparedPaths, paths: TracedPaths, receiver: Int[Array, ""], movers: int
 ) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
-    """Returns the numbers of a motion of all receivers that all paths to one of them depend on, and the derivatives."""
+    """Returns the indices of the components of a motion (with all receivers) that the lengths of paths to one receiver depend
+    on, and the derivatives."""
     terms = [length_terms(some, prepared.surfaces, movers) for some in (paths.specular, paths.diffracted)]
     number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
     return jnp.where(number < 6 * movers, number, number + 3 * receiver), derivative
@@ -178,29 +179,40 @@ def normal_equations(
     blocks: Int[Array, ""],
     numbers: Int[Array, " q"],
 ) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
-    """Returns the matrix J^T W J and the vector J^T W r of some snapshots, the first so many blocks: what is left of them is
-    about r - J (a further motion), in units of its standard deviation. J has the columns of the numbers that are adjusted."""
+    """Returns the matrix J^T W J and the vector J^T W r of snapshots. Their residual after a further motion m is about r - J m,
+    in units of its standard deviation.
+
+    Args:
+        field, params: a coherent field.
+        motion: current motion, with all receivers.
+        prepared: paths of all pairs.
+        data: training data with snapshots.
+        index: indices of the links, in blocks.
+        variance: variances of the path lengths (`length_variances`).
+        blocks: number of blocks in use; the others are padding.
+        numbers: indices of the adjusted components, the columns of J.
+    """
     movers, receivers, q = len(motion.shift), len(motion.receiver), len(numbers)
     place = _places(numbers, ravel_pytree(motion)[0].size)
 
     def one(link: Int[Array, ""]) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
         batch = data.batch(link[None], jax.random.key(0))
-        assert batch.snapshots is not None, "phases are what it looks at"
-        asked: Links = jax.tree.map(lambda leaf: leaf[0], batch.links)
-        plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(asked.receiver_index))
-        paths, frequency = prepared.of(asked), asked.query.frequency_hz
+        assert batch.snapshots is not None, "the alignment needs phases"
+        queried: Links = jax.tree.map(lambda leaf: leaf[0], batch.links)
+        plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(queried.receiver_index))
+        paths, frequency = prepared.of(queried), queried.query.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
         arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
-        expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(asked)])
+        expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(queried)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
         if plan.tuning is not None:
             voltages = voltages * element_gains(plan.tuning)
-        number, derivative = _terms(prepared, paths, asked.receiver_index, movers)
+        number, derivative = _terms(prepared, paths, queried.receiver_index, movers)
         lengths = jnp.zeros((len(number), q + 1)).at[jnp.arange(len(number))[:, None], place[number]].add(derivative)
         parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
         real, imaginary = jnp.split(jnp.matmul(parts.T, lengths[:, :q], precision=EXACT), 2)
-        turns = place[6 * movers + 3 * receivers + 3 * asked.receiver_index + jnp.arange(3)]
+        turns = place[6 * movers + 3 * receivers + 3 * queried.receiver_index + jnp.arange(3)]
         turned = _turned(voltages, arrived, plan.receiver, frequency)
         changes = (wavenumber * (imaginary - 1j * real)).at[:, turns].add(turned)
         return _whitened(jnp.sum(voltages, 0), changes, batch.snapshots[0])
@@ -218,7 +230,7 @@ def normal_equations(
 def _turned(
     voltages: Complex[Array, "k elements"], arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""]
 ) -> Complex[Array, "elements 3"]:
-    """Returns how the elements' voltages change with the rotation vector (world frame) of the receiver."""
+    """Returns the derivatives of the elements' voltages with respect to the rotation vector (world frame) of the receiver."""
     axes = rotation_matrix(receiver.orientation)  # row i: the world's axis i in the receiver's frame
     aside = -jnp.cross(axes[:, None], arrived.direction)
     phases = jnp.matmul(aside, receiver.element_wavelengths(frequency_hz).T, precision=EXACT)
@@ -228,10 +240,10 @@ def _turned(
 def _whitened(
     predicted: Complex[Array, " elements"], changes: Complex[Array, "elements p"], truth: Complex[Array, " elements"]
 ) -> tuple[Float[Array, "n p"], Float[Array, " n"]]:
-    """Returns the Jacobian and what is left of a snapshot, real and imaginary parts one below the other, free of what a common
-    factor explains, in units of the standard deviation that is left."""
+    """Returns the Jacobian and the residual of a snapshot, with real parts above imaginary parts, without the component that a
+    common factor explains, in units of the standard deviation of the residual."""
     faintest = jnp.asarray(FAINTEST, predicted.real.dtype)
-    scale, norm = (jnp.maximum(jnp.max(jnp.abs(y)), faintest) for y in (predicted, truth))  # squares of faint ones would vanish
+    scale, norm = (jnp.maximum(jnp.max(jnp.abs(y)), faintest) for y in (predicted, truth))  # small squares would underflow
     predicted, changes, truth = predicted / scale, changes / scale, truth / norm
     norm = jnp.sqrt(jnp.sum(squared_magnitude(truth)))
     power = jnp.sum(squared_magnitude(predicted))

@@ -1,7 +1,8 @@
-"""Where surfaces and the receiver stand, by gradient descent, for data that hold spectra and no snapshots.
+"""Gradient alignment of surfaces and receivers, for data with spectra but without snapshots.
 
-Steps are in proportion to the wavelength of the highest frequency, and waves as coherent as places are known by then. Materials
-and corrections are learned beside the motion. With snapshots `gauss_newton.py` is faster and nearer to the truth.
+Steps are proportional to the wavelength of the highest frequency, and the coherence of waves follows from the current
+uncertainty of positions. Materials and corrections are learned together with the motion. With snapshots, `gauss_newton.py` is
+faster and more accurate.
 """
 
 import dataclasses
@@ -22,18 +23,20 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData, batches_of_one_receiver
 
 STEP = 0.012
-"""Learning rate, in wavelengths of the highest frequency, at most ..."""
+"""Learning rate of motions, in wavelengths of the highest frequency."""
 LONGEST_STEP = 2e-3
-"""... so many metres."""
+"""Upper bound of this learning rate, metres."""
 UNSEEN = 3e-3
-"""Gradient of the loss, per radian of a path's phase, of a surface that is hardly seen: below it, steps shrink with it."""
+"""Gradient of the loss, per radian of a path's phase, below which steps shrink with the gradient, since the surface has hardly
+any effect."""
 BATCH = 8
+"""Links per step."""
 SHORTEST_ARM = 0.05
-"""Metres: smaller things turn like one of this size."""
+"""Minimum lever arm of rotations, metres, for small bodies."""
 RATE = 5e-3
-"""Of the materials and corrections that are learned beside ..."""
+"""Learning rate of the materials and corrections."""
 SEARCHED = ("transmitter", "element", "placement", "thick", "curved")
-"""... these, which are searched elsewhere and stay as they were found."""
+"""Parameters that other parts of the calibration determine; they are not changed here."""
 
 
 def descend(
@@ -47,22 +50,22 @@ def descend(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[WaveParams, Motion]:
-    """Returns parameters and a motion after some steps on spectra up to some frequency.
+    """Returns parameters and a motion after a number of steps on spectra up to some frequency.
 
     Args:
-        field, params: a coherent field, which is not moved: the motion is small.
+        field, params: a coherent field, which is not displaced: the motion is small.
         prepared: paths of the links of the pool.
-        motion: the one to start with, of all receivers.
-        widths: standard deviations of the prior of the whole motion, that of the field included.
-        data: with spectra.
-        pool: links, up to the highest frequency that counts.
-        count: steps.
-        rng: draws their batches.
+        motion: initial motion, with all receivers.
+        widths: prior standard deviations of the total motion, which includes that of the field.
+        data: training data with spectra.
+        pool: indices of links up to the highest frequency in use.
+        count: number of steps.
+        rng: random numbers.
     """
     batches = batches_of_one_receiver(data, pool, count, BATCH, rng)
     wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.query.frequency_hz)[pool].max())
     rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN * 2 * np.pi / wavelength
-    # The curvature of the normal prior, beside a loss that is a mean over so many numbers.
+    # Curvature of the normal prior, relative to a loss that is a mean over this number of values.
     numbers = len(pool) * data.receivers.element_positions.shape[-2]
     prior = jax.tree.map(lambda far: 1 / (far**2 * numbers), widths)
     return _steps(field, params, motion, prepared, data, batches, rate, unseen, prior)
@@ -80,9 +83,9 @@ def _steps(
     unseen: float | Float[Array, ""],
     prior: Motion,
 ) -> tuple[WaveParams, Motion]:
-    """Learns a motion, with materials and corrections beside it, on some batches."""
+    """Returns the parameters and the motion after one step on every batch."""
     others, reach = optax.adam(RATE), _reach(field)
-    # Steps of motions shrink to a tenth over the batches.
+    # The steps of motions decay to a tenth over the batches.
     shifts = optax.adam(optax.cosine_decay_schedule(1.0, batches.shape[0], 0.1), eps=unseen)
 
     def objective(learned: tuple[WaveParams, Motion], index: Int[Array, " b"]) -> Float[Array, ""]:
@@ -113,8 +116,8 @@ def _steps(
 
 
 def _reach(field: Calibratable) -> Motion:
-    """Returns how far (metres) a motion of 1 metre or radian moves what it moves; the receiver's turn moves no more than phases
-    along its array, and counts like metres."""
+    """Returns the displacement (metres) caused by 1 metre or radian of every component of a motion. The rotation of a receiver
+    only changes phases along its array, and is treated like metres."""
     facets, movers = field.facets, len(field.motion.shift)
     arms = jnp.linalg.norm(facets.corners - centres(facets, movers)[facets.mover][:, None], axis=-1)
     radius = jnp.full(movers, SHORTEST_ARM).at[facets.mover].max(jnp.max(arms, -1))

@@ -1,11 +1,11 @@
-"""Search for the materials of a scene.
+"""Calibration of the materials of a scene.
 
-The phase behind a slab turns by many radians at high frequencies. Its permittivity then has a valley of the loss for every
-turn, and gradient descent ends in the one it begins in. Low frequencies first (`optim.curriculum`) is a way around; where the
-data leave a gap between two frequencies that is too wide to step over, several valleys are equally deep. What tells them
-apart is knowledge: rooms are built of few materials, and ITU-R P.2040 lists them. Material by material the entry that fits the
-spectra best is taken, unless what is there fits better, and by more than chance where that is no entry; a few spectra say which
-entries are worth a closer look. Training goes on from there.
+At high frequencies a slab changes the phase by many radians. As a function of its permittivity, the loss then has a local
+minimum for every cycle, and gradient descent ends in the one where it begins. Training on low frequencies first
+(`optim.curriculum`) can avoid this; if the data have too wide a gap between two frequencies, several minima are equally deep.
+Prior knowledge distinguishes them: buildings consist of few materials, and ITU-R P.2040 lists these. For one material after the
+other, the entry of the list that fits the spectra best is chosen, unless the current properties fit better (significantly
+better, if they are not an entry of the list). A few spectra narrow down the entries first. Training starts from the result.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     "floorboard": (3.66, 0.0044, 1.3515),
     "metal": (1.01, 1e7, 0.0),
 }
-"""ITU-R P.2040-3, table 3 (metal has permittivity 1 there; log(eps_r - 1) is what is stored)."""
+"""ITU-R P.2040-3, table 3 (metal has permittivity 1 there, but log(eps_r - 1) is stored)."""
 USUAL_M: dict[str, float] = {
     "concrete": 0.2,
     "brick": 0.115,
@@ -49,42 +49,40 @@ USUAL_M: dict[str, float] = {
     "floorboard": 0.02,
     "metal": 0.002,
 }
-"""Metres: how thick walls, boards and panes of each are sold or built; where to begin when a scene does not say."""
+"""Usual thicknesses of walls, boards and panes, metres: the initial values if a scene does not define them."""
 UNSEEN = 1e-6
-"""A material that changes the scores by less is in no path of the spectra, and stays what it is."""
+"""A material that changes the scores by less does not occur in the paths of the spectra, and is not changed."""
 
 
 SHORTLIST = 4
-"""Entries that are looked at closely: the best at a first glance."""
+"""Number of entries that are compared on all spectra: the best ones on the first few."""
 
 
 @dataclass(frozen=True)
 class SearchReport:
-    """What a search did."""
+    """Result of the calibration of materials."""
 
     before: float
-    """Mean log decorrelation of the spectra that were looked at."""
+    """Mean score (log decorrelation) of the spectra with the initial materials."""
     after: float
-    """The same with the materials that were taken."""
+    """Mean score of the spectra with the chosen materials."""
     taken: dict[int, str]
-    """Materials, and the entry that each of them got."""
+    """Chosen entries by material."""
     thickness_mm: dict[int, float] = field(default_factory=dict)
-    """Thicknesses that were found for materials whose thickness the scene does not say."""
+    """Estimated thicknesses of materials whose thickness the scene does not define."""
 
 
 def search_materials(
     params: WaveParams, told: Told, count: int, config: SearchConfig, compared: Compared = "snapshots", usual: bool = False
 ) -> tuple[WaveParams, SearchReport]:
-    """Returns parameters with the materials by which spectra are explained best.
+    """Returns parameters with the materials that fit spectra best. `told` are training spectra, with the field and its paths.
 
     Args:
-        params: with `materials`.
-        told: what training spectra say.
-        count: spectra that are looked at.
-        config: of the search.
-        compared: of these spectra.
-        usual: whether those that change become as thick as is usual (where the scene says how thick they are, that counts for
-            nothing).
+        params: parameters with `materials`.
+        count: number of spectra in use.
+        config: settings of the calibration.
+        compared: the compared quantity.
+        usual: whether changed materials also get their usual thickness, which has no effect if the scene defines the thickness.
     """
     score, tx_index = told.scores(count, compared), told.tx_index(count)
     before, taken, settled = np.zeros(0), dict[int, str](), 0
@@ -104,25 +102,25 @@ def search_materials(
         before = before if turn else scores[0]
         settled += 1
         listed = any(same(params.materials, entry.materials) for entry in entries)
-        gain, error = standard_error(scores[best] - scores[0], tx_index)  # of what is there
+        gain, error = standard_error(scores[best] - scores[0], tx_index)  # gain of the current properties
         kept = scores[0].mean() < scores[best].mean() if listed else gain > config.sure * error
         if np.ptp(scores.mean(1)) >= UNSEEN and not kept:
             taken[material] = list(ITU_MATERIALS)[likely[best - 1]]
             settled = settled if same(params.materials, candidates[best].materials) else 1
             params, scores = candidates[best], scores[best:]
-        if settled == materials:  # all others are what they were when each was looked at
+        if settled == materials:  # no other material has changed since each was scored
             break
     return params, SearchReport(float(before.mean()), float(scores[0].mean()), taken)
 
 
 def unknown_mm(materials: Materials, known_thickness: Float[np.ndarray, " m"]) -> dict[int, float]:
-    """Returns how thick (mm) those materials are whose thickness the scene does not say (0)."""
+    """Returns the thicknesses (mm) of those materials whose thickness the scene does not define (0)."""
     metres = np.exp(np.asarray(materials.log_thickness))
     return {int(i): round(1e3 * float(metres[i]), 2) for i in np.flatnonzero(known_thickness == 0)}
 
 
 def entries_of(materials: Materials) -> dict[int, str]:
-    """Returns which materials are entries of ITU-R P.2040, and which."""
+    """Returns the entries of ITU-R P.2040 by material, for those materials that are entries."""
     own = np.exp(np.stack([materials.log_susceptibility, materials.log_conductivity, materials.slope]))
     listed = {name: np.exp([np.log(permittivity - 1), np.log(c), d]) for name, (permittivity, c, d) in ITU_MATERIALS.items()}
     alike = ((i, name) for i, one in enumerate(own.T) for name, entry in listed.items() if np.allclose(one, entry, rtol=1e-4))
@@ -130,15 +128,15 @@ def entries_of(materials: Materials) -> dict[int, str]:
 
 
 def with_entry(materials: Materials, material: int, name: str, metres: float | None = None) -> Materials:
-    """Returns a copy in which one material is an entry of ITU-R P.2040, so many metres thick, or as thick as before."""
+    """Returns a copy in which one material is an entry of ITU-R P.2040, with a new thickness (metres) if one is given."""
     return with_properties(materials, material, *ITU_MATERIALS[name], metres)
 
 
 def with_properties(
     materials: Materials, material: int, permittivity: float, c: float, d: float, metres: float | None = None
 ) -> Materials:
-    """Returns a copy in which one material has another relative permittivity (above 1), the conductivity c f^d (S/m, f in GHz),
-    and is so many metres thick, or as thick as before."""
+    """Returns a copy in which one material has another relative permittivity (above 1) and the conductivity c f^d (S/m, f in
+    GHz), with a new thickness (metres) if one is given."""
     new = {
         "log_susceptibility": np.log(permittivity - 1),
         "log_conductivity": np.log(c),
@@ -149,8 +147,8 @@ def with_properties(
 
 
 def _with(leaf: Float[Array, " m"], index: int, value: float | None) -> Float[Array, " m"]:
-    """Returns what `leaf.at[index].set(value)` does, in an eighth of the time: there are thousands of candidates. Without a
-    value it is a copy, so that candidates of all kinds differ in the same leaves and have one program (objective.py)."""
+    """Returns `leaf.at[index].set(value)`, computed in an eighth of the time, since there are thousands of candidates. Without
+    a value it returns a copy, so that all kinds of candidates differ in the same leaves and share a program (objective.py)."""
     copy = np.array(leaf)
     if value is not None:
         copy[index] = value

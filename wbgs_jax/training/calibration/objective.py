@@ -1,5 +1,5 @@
-"""How badly candidates for a field's parameters explain some training spectra, and whether one is surely better: what the
-searches before a training, and the choices after it, compare."""
+"""Scores of candidate parameters of a field on training spectra, and the test whether one candidate is significantly better,
+for calibration before training and selections after it. Lower scores are better."""
 
 import functools
 from collections.abc import Hashable, Sequence
@@ -20,29 +20,31 @@ from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch, Links
 
 AT_ONCE = 8
-"""Spectra."""
+"""Number of spectra that are scored together."""
 SIDE_BY_SIDE = 32, 6
-"""Candidates. Compiling a program takes as long as scoring ten thousand, so that there are two for all numbers of them."""
+"""Numbers of candidates that are scored together. Compiling a program takes as long as scoring ten thousand candidates, so that
+only these two sizes are used."""
 POWER_MARGIN_DB = 1.0
-"""What powers are not expected to be nearer than, so that the logarithm of a lucky hit says little."""
+"""Error of received power that is added before the logarithm, so that accidental agreement has little effect."""
 RAREST = 1e-4
-"""Chance that SciPy's 9,999 random flips can tell from none."""
+"""Smallest probability that SciPy's 9,999 random sign flips can resolve."""
 FEWEST_SURE = 5
-"""Transmitters of which less proves nothing: the signs of three agree by chance once in eight times."""
+"""Minimum number of transmitters for significance: the signs of three are all positive by chance in one of eight cases."""
 ALIKE = 1e-6
-"""Mean absolute error of spectra below which none is better than another."""
+"""Mean absolute error of spectra below which all candidates are equally good."""
 Compared = Literal["snapshots", "covariances", "spectra", "powers"]
-"""What is compared: snapshots as if every phase were known (log decorrelation), snapshots as far as candidates know phases
-(`losses.surprise`), spectra (log mean absolute error), as also where nothing else is known, or powers (log absolute error in
-dB), as always where they are all that is known. A link on which nothing was heard scores the same, whatever the candidate."""
+"""The compared quantity: "snapshots" with exact phases (log decorrelation); "covariances" for the negative log-likelihood of
+snapshots given the uncertainty of phases (`losses.surprise`); "spectra" (log mean absolute error), which is also used if there
+are no snapshots; "powers" (log absolute error in dB), which is always used if there is nothing else. A link on which nothing
+was received has the same score for every candidate."""
 
 
 @runtime_checkable
 class Scores(Protocol):
-    """How badly candidates for all parameters explain some spectra."""
+    """Function that scores candidate parameters on spectra."""
 
     def __call__(self, candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
-        """Returns the scores of K candidates on all of the spectra, or on the first so many."""
+        """Returns the scores of K candidates on all of the spectra, or on the `first` ones; lower is better."""
         ...
 
 
@@ -53,12 +55,20 @@ def make_scores(
     spectra: Int[Array, " n"],
     compared: Compared = "snapshots",
 ) -> Scores:
-    """Returns the function that scores candidates on some spectra. What leaves say that all candidates share
-    (the very same arrays) is computed once for all of them."""
+    """Returns the function that scores candidates on spectra. Computations that depend only on leaves shared by all candidates
+    (identical array objects) are done once for all of them.
+
+    Args:
+        field: field.
+        prepared: its paths.
+        data: training data.
+        spectra: indices of the links.
+        compared: the compared quantity.
+    """
 
     @functools.cache
     def block(start: int) -> tuple[PreparedPaths, Batch]:
-        """Returns what is looked at of so many spectra; the last block repeats its last."""
+        """Returns the data of the block of spectra from `start` on; the last block is padded by repeating the last spectrum."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
         return _looked_at(field, prepared, data, own)
 
@@ -66,14 +76,14 @@ def make_scores(
         room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
         if len(candidates) > room:
             return np.concatenate([score(candidates[:room], first), score(candidates[room:], first)])
-        structure, asked = jax.tree.structure(candidates[0]), len(spectra[:first])
+        structure, count = jax.tree.structure(candidates[0]), len(spectra[:first])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
         differ = _as_compiled(differ, compared, candidates[0], field, block(0))
         padded = [column + column[-1:] * (room - len(candidates)) for column in columns]
         leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
-        found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, asked, AT_ONCE)]
-        together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :asked]
+        found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, count, AT_ONCE)]
+        together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :count]
         return together if any(differ) else np.repeat(together, len(candidates), 0)
 
     return score
@@ -81,34 +91,34 @@ def make_scores(
 
 @dataclass(frozen=True)
 class Told:
-    """Some training spectra, and what they say of a field with the paths of their transmitters."""
+    """Training spectra, with a field and the paths of their transmitters, for scoring candidates."""
 
     field: Calibratable
     prepared: PreparedPaths
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
-    """In the order in which they are looked at."""
+    """Indices of the links, in the order of use."""
 
     def scores(self, count: int | None = None, compared: Compared = "snapshots", highest_hz: float = np.inf) -> Scores:
-        """Returns the function that scores candidates on the first of those up to a frequency."""
+        """Returns the function that scores candidates on the first `count` of the spectra up to a frequency."""
         own = self.spectra[self.frequency_hz() <= highest_hz * (1 + 1e-6)][:count]
         return make_scores(self.field, self.prepared, self.data, jnp.asarray(own, jnp.int32), compared)
 
     def frequency_hz(self) -> Float[np.ndarray, " n"]:
-        """Returns their frequencies."""
+        """Returns the frequencies of the spectra."""
         return np.asarray(self.data.links.query.frequency_hz)[self.spectra]
 
     def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
-        """Returns the transmitters of the first of them."""
+        """Returns the transmitters of the first `count` spectra."""
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
 
 
 _programs: dict[Hashable, list[tuple[bool, ...]]] = {}
-"""Which leaves differ between the candidates that programs score, by all else that these depend on."""
+"""Masks of the leaves that differ between candidates, for all compiled programs, by everything else that programs depend on."""
 
 
 def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> tuple[bool, ...]:
-    """Returns which leaves to take for different: those that are, or more of them, where there is a program for these."""
+    """Returns the mask of leaves that are treated as different: those that differ, or a superset for which a program exists."""
     shapes = ((jax.tree.structure(tree), *map(np.shape, jax.tree.leaves(tree))) for tree in trees)
     known = _programs.setdefault((compared, *shapes), [])
     wider = [one for one in known if all(own or not needed for own, needed in zip(one, differ, strict=True))]
@@ -121,7 +131,7 @@ def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> t
 def _looked_at(
     field: Calibratable, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " m"]
 ) -> tuple[PreparedPaths, Batch]:
-    """Returns what is prepared of a block of spectra, and what was observed: a batch of one link each."""
+    """Returns the prepared paths of a block of spectra, and their observations: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
     return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
@@ -136,20 +146,20 @@ def _score(
     batches: Batch,
     compared: Compared,
 ) -> Float[Array, "k m"]:
-    """Returns the scores of K candidates whose leaves that differ have a leading axis; of one, where none does."""
+    """Returns the scores of K candidates, whose different leaves have a leading axis; K is 1 if no leaf differs."""
 
     def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
         params = jax.tree.unflatten(structure, leaves)
         seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
         elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
-        several = batch.snapshots if elements > 1 else None  # that of a single element tells its power only
+        several = batch.snapshots if elements > 1 else None  # the snapshot of a single element contains its power only
         if several is not None and compared == "snapshots" and seen.snapshots is not None:
             return log_decorrelation(seen.snapshots, several)[0]
         if several is not None and compared == "covariances" and seen.covariance is not None:
             return surprise(seen.covariance, several)[0]
         if batch.pas is None or compared == "powers" or elements == 1:
             received = batch.received_db
-            assert received is not None and seen.power_db is not None, "images are searched by spectra"
+            assert received is not None and seen.power_db is not None, "data without powers are compared by spectra"
             unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])
             return unlike if batch.snapshots is None else jnp.where(jnp.any(batch.snapshots != 0), unlike, 0)
         unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(seen.pas - batch.pas)), ALIKE))
@@ -165,12 +175,17 @@ def _score(
 
 
 def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:
-    """Returns whether the mean gain over transmitters is positive, as surely as so many standard errors of a normal mean say.
+    """Returns whether the mean gain over transmitters is significantly positive.
 
     Signs are flipped transmitter by transmitter (Fisher's randomisation test): gains of logarithms have long tails, and a
-    t statistic doubts 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never sure at
-    three errors, fewer than `FEWEST_SURE` at none. Gains that are not finite are not sure. Where so many errors mean less than
-    one chance in ten thousand, which is as few as random flips can tell, the errors themselves are counted.
+    t statistic would reject 20 gains that are all positive because one of them is large. Fewer than 10 transmitters are never
+    significant at three standard errors, and fewer than `FEWEST_SURE` at none; neither are gains that are not finite. If the
+    required probability is below one in ten thousand, which random flips cannot resolve, standard errors are compared instead.
+
+    Args:
+        gains: gains of N spectra.
+        tx_index: their transmitters.
+        errors: n_sigma, the required significance in standard errors of a normal mean.
     """
     by_tx = by_transmitter(gains, tx_index)
     if len(by_tx) < FEWEST_SURE or not np.isfinite(by_tx).all():

@@ -1,16 +1,17 @@
-"""Bodies that a mesh has and the room does not: furniture that has been carried away, or that stands there twice.
+"""Calibration of obstacles: removal of spurious bodies, and the absorption grid.
 
-What is not there neither reflects nor shades, as if it were made of air, and that is how it is tried: every mover of the facets
-gets a material of its own, and a mover is left out if low frequencies are explained surely better without it. (Its edges still
-diffract in that trial, so some go unnoticed.) Then paths are traced and materials named again. That counts if it explains other
-snapshots, of all frequencies, surely better, as far as places are known; it lets others be seen, and the movers are gone
-through again. High frequencies are not asked: there a body that stands a little elsewhere is worse than none.
+Spurious bodies are in the mesh but not in reality, such as furniture that has been removed or that is contained twice. A body
+that does not exist neither reflects nor obstructs waves, as if it were made of air, and is tested in this way: every rigid body
+gets a material of its own, and a body is removed if low frequencies fit significantly better without it. (Its edges still
+diffract in this test, so that some spurious bodies are not found.) Paths are then traced again and materials are chosen again.
+The removal is kept if other snapshots, of all frequencies, fit significantly better, given the position uncertainty. It may
+reveal further spurious bodies, so that the test is repeated. High frequencies are not used in it: there a body that is slightly
+displaced fits worse than none.
 
-Search for clutter: what stands in the way of waves and is not in the mesh (propagation/absorption.py).
-
-Its density is fitted to the spectra of most transmitters by gradient descent, all else being what it is. If those of the others
-are explained better with it, and not by chance, training goes on from there and learns it beside everything else; a few
-transmitters, or a mesh that lacks nothing, do not show that, and then there is no clutter.
+The absorption grid stands for objects that attenuate waves and are not in the mesh (propagation/absorption.py). Its density is
+fitted to the spectra of most transmitters by gradient descent, with everything else fixed. If those of the others fit
+significantly better with it, the grid is kept, and training refines it together with all other parameters. With few
+transmitters, or with a complete mesh, there is no such evidence, and the grid is not used.
 """
 
 import dataclasses
@@ -37,51 +38,52 @@ from wbgs_jax.training.calibration.uncertainty import search_placement
 from wbgs_jax.training.hooks import Say, silent
 
 AIR = (1.0001, 1e-9, 0.0, 1e-4)
-"""Relative permittivity, c and d of the conductivity c f^d, metres: what reflects nothing and lets everything pass."""
+"""Relative permittivity, c and d of the conductivity c f^d, and thickness (metres) of a slab that transmits everything."""
 ROUNDS = 3
-"""Times that all movers are gone through, at most."""
+"""Maximum number of passes over all rigid bodies."""
 MOST = 512
-"""Movers that are tried, at most: those with the largest facets."""
+"""Maximum number of rigid bodies that are tested, those with the largest facets."""
 CLOSELY = 32
-"""Movers that are looked at closely: those without which a glance explains spectra best."""
+"""Number of rigid bodies that are tested on all spectra: those without which the first few fit best."""
 BELIEVED = 0.1
-"""Wavelengths: a body that stands no further off than this is better than none."""
+"""Displacement, in wavelengths, up to which a body fits better than none."""
 LEAST = 1e-3
-"""What less than this is gained by (natural logarithm of what is left) is not worth a change."""
+"""Minimum gain (natural logarithm of the decorrelation) for the removal of a body."""
 SURE, SURE_OF_ONE = 2.0, 2.5
-"""As many standard errors over transmitters as the gain of a pass has to be sure by (`surely_better`), and that of a body, of
-which there are many."""
+"""n_sigma: standard errors over transmitters by which the gain of a pass must be significant (`surely_better`), and that of a
+single body, which is higher since there are many."""
 
 
 @dataclass(frozen=True)
 class AbsentReport:
-    """What was left out."""
+    """Result of the search for spurious bodies."""
 
     before: float
-    """How badly training snapshots are explained on average (`losses.surprise`), with the mesh as it was ..."""
+    """Mean negative log-likelihood of training snapshots (`losses.surprise`) with the complete mesh."""
     after: float
-    """... and without the bodies."""
+    """Mean negative log-likelihood of training snapshots without the removed bodies."""
     centres: list[list[float]]
-    """Of all that were left out: metres, world frame."""
+    """Centres of the removed bodies, world frame, metres."""
 
 
 def search_absent(
     params: WaveParams, told: Told, config: SearchConfig, say: Say = silent
 ) -> tuple[WaveParams, Told, AbsentReport]:
-    """Returns parameters, and the field with its paths, without the bodies whose absence snapshots tell.
+    """Returns parameters, and the field with its paths, without spurious bodies. `told` are training spectra with the field;
+    they need snapshots, since spectra alone would take ten times as long.
 
     Args:
-        params: with materials that have been named, by the first of the spectra.
-        told: what training spectra say, with snapshots: spectra alone would cost ten times as much.
-        config: `absent_spectra` are looked at, up to the highest frequency at which places are believed.
-        say: is told of every pass.
+        params: parameters with materials that have been chosen with the first of the spectra.
+        config: settings of the calibration; `absent_spectra` are used, up to the highest frequency at which positions are
+            sufficiently accurate.
+        say: called with a description of every pass.
     """
-    judged = dataclasses.replace(told, spectra=told.spectra[::-1])  # by other spectra than those that name materials
+    judged = dataclasses.replace(told, spectra=told.spectra[::-1])  # spectra other than those that materials are chosen with
     tx, where = judged.tx_index(config.spectra), list[list[float]]()
     before = now = _explained(params, judged, config)
     once = dataclasses.replace(config, rounds=1)
     for _ in range(ROUNDS):
-        say("search: bodies that are not there")
+        say("calibration: spurious bodies")
         movers = absent_movers(params, told, config)
         if not len(movers):
             break
@@ -98,14 +100,15 @@ def search_absent(
 
 
 def _explained(params: WaveParams, told: Told, config: SearchConfig) -> Float[np.ndarray, " n"]:
-    """Returns how badly snapshots are explained, with as much doubt of all places as suits them: phases of what stands a little
-    elsewhere are then believed no more, and it is better than nothing."""
+    """Returns the negative log-likelihoods of snapshots with the position uncertainty that fits best: phases of slightly
+    displaced bodies then have little effect, and such a body fits better than none."""
     doubted, _ = search_placement(params, told.scores(config.placement_spectra, "covariances"))
     return told.scores(config.spectra, "covariances")([doubted])[0]
 
 
 def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[np.ndarray, " k"]:
-    """Returns the movers without which snapshots are explained surely better, each without those before it; never all."""
+    """Returns the rigid bodies without which snapshots fit significantly better, each tested without the previous ones; never
+    all bodies."""
     highest = BELIEVED * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
     low = told.frequency_hz() <= highest
     if not low.any():
@@ -115,7 +118,7 @@ def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[n
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
-    # First those that differ: what is there as it is then needs no program of its own (objective.py).
+    # The modified parameters first: scoring the current ones then needs no separate program (objective.py).
     without_one = score([_of_air(params, one) for one in tried], config.absent_glance)
     gains = score([params], config.absent_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
@@ -132,10 +135,10 @@ def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[n
 
 
 def _each_by_itself(params: WaveParams, told: Told) -> tuple[Told, WaveParams]:
-    """Returns the field, its paths and its parameters with every mover of a material of its own, alike to begin with, and of a
-    thickness that nobody knows."""
+    """Returns the field, its paths and its parameters with a separate material for every rigid body, equal to its current one
+    but with a thickness that is a parameter."""
     facets = told.field.facets
-    source = np.zeros(len(told.field.motion.shift), int)  # of a large mesh, some have lost all of their facets
+    source = np.zeros(len(told.field.motion.shift), int)  # bodies of a large mesh may have lost all of their facets
     source[np.asarray(facets.mover)] = np.asarray(facets.material)
     thickness = jnp.log(told.field.material_properties(params).thickness[source])
     own: Materials = jax.tree.map(lambda leaf: leaf[source], params.materials)
@@ -152,43 +155,45 @@ def _of_air(params: WaveParams, mover: int) -> WaveParams:
 
 
 def _carried(params: WaveParams, field: Calibratable) -> WaveParams:
-    """Returns the first parameters of a field with the materials and antennas that were found in another."""
+    """Returns the initial parameters of a field, with the materials and antennas that were found for another field."""
     return replaced(field.init(jax.random.key(0)), **{name: getattr(params, name) for name in ("materials", *ENDS)})
 
 
 JUDGES = 0.25
-"""Share of the transmitters whose spectra say whether clutter is there."""
+"""Fraction of the transmitters on whose spectra the absorption grid is tested."""
 FEWEST = 6
-"""Judges: fewer are never sure."""
+"""Minimum number of these transmitters; fewer are never significant."""
 SURE_OF_CLUTTER = 1.0
-"""As many standard errors over transmitters as the gain has to be sure by (`surely_better`): where there is no clutter, what
-was fitted explains other spectra worse, and so long as it does not it does no harm."""
+"""n_sigma: standard errors over transmitters by which the gain must be significant (`surely_better`). It is low, since a grid
+that is not needed makes other spectra fit worse, and does no harm otherwise."""
 LEAST_CLUTTER = 2e-4
-"""Error that clutter has to spare; spectra are at most 1."""
+"""Minimum reduction of the mean absolute error; spectra are at most 1."""
 BATCH = 8
+"""Links per step."""
 
 
 @dataclass(frozen=True)
 class ClutterReport:
-    """What was found."""
+    """Result of the fit of an absorption grid."""
 
     before: float
-    """Mean absolute error of the judges' spectra without clutter ..."""
+    """Mean absolute error of the test spectra without the grid."""
     after: float
-    """... and with it, taken or not."""
+    """Mean absolute error of the test spectra with the grid, whether it is used or not."""
     taken: bool
+    """Whether the grid is used."""
 
 
 def search_clutter(
     params: WaveParams, told: Told, config: SearchConfig, rng: np.random.Generator
 ) -> tuple[WaveParams, Told, ClutterReport | None]:
-    """Returns parameters and field with clutter, if it is there; no report where too few could say so.
+    """Returns parameters and field with an absorption grid if it fits significantly better, else unchanged, and a report, which
+    is None if there are too few transmitters. `told` are training spectra with the field.
 
     Args:
-        params: of a coherent field without clutter.
-        told: what training spectra say.
-        config: of the search.
-        rng: draws who judges, and the batches of the others.
+        params: parameters of a coherent field without an absorption grid.
+        config: settings of the calibration.
+        rng: random numbers for the test transmitters, and for the batches of the others.
     """
     tx = told.tx_index()
     everyone = rng.permutation(np.unique(tx))
@@ -209,7 +214,7 @@ def search_clutter(
 
 
 def _errors(told: Told, params: WaveParams) -> Float[np.ndarray, " n"]:
-    """Returns mean absolute errors: of their logarithms, spectra that are right anyway would have most to say."""
+    """Returns mean absolute errors; their logarithms would be dominated by spectra that are accurate anyway."""
     found: Float[np.ndarray, " n"] = np.exp(told.scores(None, "spectra")([params])[0])
     return found
 
@@ -218,7 +223,7 @@ def _errors(told: Told, params: WaveParams) -> Float[np.ndarray, " n"]:
 def _fitted(
     field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, batches: Int[Array, "k b"]
 ) -> Float[Array, "x y z 2"]:
-    """Returns the clutter after a step on every batch."""
+    """Returns the stored density of the grid after one step on every batch."""
     optimizer = optax.adam(optax.cosine_decay_schedule(field.config.clutter_lr, len(batches)))
 
     def loss(clutter: Float[Array, "x y z 2"], index: Int[Array, " b"]) -> Float[Array, ""]:

@@ -1,9 +1,9 @@
-"""Search on the host, before the first epoch, for what gradients alone cannot find: antennas, materials, bodies that are not
-there, idealisations, tuning, places, clutter.
+"""Calibration before the first epoch (host), for what gradients alone cannot find: antennas, materials, spurious bodies,
+propagation options, array gains, positions, and the absorption grid.
 
-The first two are a choice among known ones by how well they explain some training spectra; bodies without which spectra are
-explained better are left out of the mesh; surfaces are moved where it is doubtful, and how far they may still be off is
-guessed. Training goes on from there.
+Antennas and materials are chosen from lists by how well they fit training spectra; bodies without which spectra fit better are
+removed from the mesh; surfaces of an inaccurate mesh are aligned, and their remaining position uncertainty is estimated.
+Training starts from the result.
 """
 
 import dataclasses
@@ -32,17 +32,17 @@ from wbgs_jax.training.calibration.uncertainty import search_placement
 from wbgs_jax.training.hooks import Context, Edit, Hook, Say
 
 GAINS_DB = (100.0, 5.0), (5.0, 0.5)
-"""How far a gain may be from the one before, and the steps in which it is tried."""
+"""Successive ranges of the gain about the previous value, and steps within them, dB."""
 ROOMS_DB = -40.0, 10.0
-"""What rooms do to received powers beyond free space, in the median. Snapshots whose powers are not among these are in a unit
-of their own, as measured voltages are; what is less far off, gradients find."""
+"""Plausible range of the median received power relative to free space, dB. Snapshots outside it are in another unit, like
+measured voltages; smaller deviations are corrected by gradients."""
 SWEEPS = 2
-"""Times that antennas are searched anew after materials are named, at most."""
+"""Maximum number of times that antennas are calibrated again after materials have been chosen."""
 
 
 def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[WaveParams, float]:
-    """Returns parameters with the gain over all paths by which received powers are explained best, and that gain (dB), near one
-    that is given: nobody may have said what was transmitted."""
+    """Returns parameters with the overall gain that fits received powers best, and that gain (dB); the transmitted power may be
+    unknown. The search begins at `gain` (dB)."""
     for reach, step in GAINS_DB:
         tried = gain + np.arange(-reach, reach + step, step)
         candidates = [dataclasses.replace(params, log_gain=jnp.asarray(db * np.log(10) / 20, jnp.float32)) for db in tried]
@@ -52,26 +52,27 @@ def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[W
 
 
 def unusual_level(told: Told) -> float:
-    """Returns the median of received powers beyond free space (dB), if no room explains it; else zero."""
-    assert told.data.snapshots is not None, "asked of snapshots"
+    """Returns the median received power relative to free space (dB) if it is implausible (`ROOMS_DB`), else zero."""
+    assert told.data.snapshots is not None, "the level is that of snapshots"
     snapshots, links = jax.tree.map(lambda leaf: leaf[told.spectra], (told.data.snapshots, told.data.links))
     rx = told.data.receivers.position[links.receiver_index]
     power, query = received_power_db(snapshots), links.query
     beyond = np.asarray(beyond_free_space_db(power, query.tx_position, rx, query.frequency_hz))
-    heard = np.asarray(snapshots).any(-1)
-    level = float(np.median(beyond[heard])) if heard.any() else 0.0
+    received = np.asarray(snapshots).any(-1)
+    level = float(np.median(beyond[received])) if received.any() else 0.0
     return 0.0 if ROOMS_DB[0] <= level <= ROOMS_DB[1] else level
 
 
 @dataclass(frozen=True)
 class Search(Hook):
-    """The hook of fields whose parameters hold antennas and `materials`, and whose links are prepared."""
+    """The hook that calibrates a `Calibratable` field, whose parameters contain antennas and `materials` and whose links are
+    prepared."""
 
     config: SearchConfig
     stream: int = 6
 
     def due(self, step: int, steps: int) -> bool:
-        """Returns whether it is before the first step."""
+        """Returns whether the first step is next and calibration is enabled."""
         return step == 0 and (self.config.rounds > 0 or self.config.antenna_rounds > 0)
 
     def apply(
@@ -83,15 +84,15 @@ class Search(Hook):
         step: int,
         rng: np.random.Generator,
     ) -> Edit:
-        """Returns the antennas, materials and idealisations that explain some training spectra best, and the field, without
-        bodies that are not there and with its surfaces moved if the mesh is doubtful."""
-        assert isinstance(field, Calibratable), "the search is of fields of rays alone"
+        """Returns parameters with the antennas, materials and propagation options that fit training spectra best, and the field
+        without spurious bodies and, if the mesh is inaccurate, with aligned surfaces."""
+        assert isinstance(field, Calibratable), "only fields that trace paths can be calibrated"
         config, data, prepared, say = self.config, context.data, context.prepared, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
         told = Told(field, prepared, data, spectra)
-        if not data.has_spectra:  # a number a link tells materials apart, but neither phases nor directions
-            say("search: gain and materials")
+        if not data.has_spectra:  # one number per link distinguishes materials, but contains neither phases nor directions
+            say("calibration: gain and materials")
             params, gain = search_gain(params, told.scores(config.spectra))
             if config.rounds:
                 params, named = search_materials(params, told, config.spectra, config, usual=True)
@@ -99,10 +100,10 @@ class Search(Hook):
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
         if config.antenna_rounds:
-            say("search: antennas")
+            say("calibration: antennas")
             params, _ = self._antennas(params, told, report)
         if config.rounds:
-            say("search: materials")
+            say("calibration: materials")
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             if config.absent_spectra and data.snapshots is not None:
@@ -112,14 +113,14 @@ class Search(Hook):
                     field, prepared = told.field, told.prepared
                     params, named, _ = search_slabs(params, told, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
-            say("search: idealisations")
+            say("calibration: propagation options")
             for _ in range(SWEEPS):
                 params = self._idealisations(params, told, report)
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
                 params, _ = search_materials(params, told, config.ideal_spectra, config)
-            say("search: how far surfaces may be off")
+            say("calibration: position uncertainty")
             _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             field = self._tuning(params, told, report)
@@ -127,7 +128,7 @@ class Search(Hook):
             if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
                 place, moved = learn_geometry(Place(field, params, prepared), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
-                if "antennas" in report:  # what is in it may have been dropped since
+                if "antennas" in report:  # the alignment may have reverted some of them
                     found = report["antennas"]["taken"].items()
                     kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
                     report["antennas"]["taken"] = kept
@@ -139,14 +140,14 @@ class Search(Hook):
             report["placement"] = dataclasses.asdict(guessed)
             params, field = self._clutter(params, told, report, rng, say)
             thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
-            report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # named again since then
+            report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # materials may have changed
         if data.snapshots is not None and (level := unusual_level(told)):
-            told = dataclasses.replace(told, field=field)  # which may know of clutter since
+            told = dataclasses.replace(told, field=field)  # which may have an absorption grid now
             params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
         return Edit(params, (), None, report, field, prepared)
 
     def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
-        """Returns parameters with the antennas that are found, and whether there are any."""
+        """Returns parameters with calibrated antennas, and whether any antenna has changed."""
         count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
         params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
         before = report.get("antennas", dataclasses.asdict(found))
@@ -154,7 +155,7 @@ class Search(Hook):
         return params, bool(found.taken)
 
     def _tuning(self, params: WaveParams, told: Told, report: dict[str, Any]) -> Calibratable:
-        """Returns the field with arrays that are out of tune as spectra say, which takes two transmitters."""
+        """Returns the field with calibrated array gains, which needs at least two transmitters."""
         count = self.config.tuning_spectra
         if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
             return told.field
@@ -165,17 +166,17 @@ class Search(Hook):
     def _clutter(
         self, params: WaveParams, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say
     ) -> tuple[WaveParams, Calibratable]:
-        """Returns parameters and field with what stands in the way and is not in the mesh."""
+        """Returns parameters and field with an absorption grid, if it fits better."""
         if not self.config.clutter_spectra:
             return params, told.field
-        say("search: what the mesh lacks")
+        say("calibration: absorption grid")
         params, told, found = search_clutter(params, told, self.config, rng)
         if found:
             report["clutter"] = dataclasses.asdict(found)
         return params, told.field
 
     def _idealisations(self, params: WaveParams, told: Told, report: dict[str, Any]) -> WaveParams:
-        """Returns parameters without the idealisations that spectra contradict."""
+        """Returns parameters with calibrated propagation options."""
         params, found = search_idealisations(params, told, self.config)
         named = {name: dataclasses.asdict(one) for name, one in found.items()}
         report["idealisations"] = report.get("idealisations", {}) | named

@@ -1,8 +1,10 @@
-"""Search for what ray tracers leave out and nature does not: thick walls and curved waves.
+"""Calibration of the propagation options: effects that ray tracers leave out, namely the finite thickness of walls and the
+curvature of waves.
 
-In nature a wave that passes a wall of thickness t goes without the air's phase k t cos(theta); ray tracers whose walls are
-surfaces without thickness count it on top of the slab's own. In nature waves reach an array as spheres around mirrored sources;
-ray tracers with synthetic arrays make them plane. Data are of one kind or of the other, and training spectra tell which.
+In reality a wave that passes a wall of thickness t does not acquire the phase k t cos(theta) of the air that the wall replaces;
+ray tracers whose walls are surfaces without thickness add it to the phase of the slab. In reality waves reach an array as
+spherical waves about mirrored sources; ray tracers with synthetic arrays make them plane. Data are of one kind or the other,
+which training spectra reveal.
 """
 
 import dataclasses
@@ -14,30 +16,30 @@ from wbgs_jax.training.calibration.material_fit import search_materials
 from wbgs_jax.training.calibration.objective import Told, surely_better
 
 SURE = 3.0
-"""As many standard errors over transmitters as a gain has to be sure by (`surely_better`)."""
+"""n_sigma: standard errors over transmitters by which a gain must be significant (`surely_better`)."""
 
 
 @dataclass(frozen=True)
 class Idealisation:
-    """What was found out about one of them."""
+    """Result for one propagation option."""
 
     ideal: float
-    """Mean score of the spectra as ray tracers have them ..."""
+    """Mean score of the spectra as in ray tracers."""
     natural: float
-    """... and as nature has them."""
+    """Mean score of the spectra as in reality."""
     dropped: bool
-    """Whether nature's is taken."""
+    """Whether the option is set as in reality."""
 
 
 def search_idealisations(params: WaveParams, told: Told, config: SearchConfig) -> tuple[WaveParams, dict[str, Idealisation]]:
-    """Returns parameters without the idealisations that spectra surely contradict; materials are named anew before walls are
-    said to be thick."""
+    """Returns parameters with options set as in reality if spectra fit significantly better, and the results by option. Before
+    the finite thickness of walls is tested, materials are chosen again with it. `told` are training spectra with the field."""
     once, found, count = dataclasses.replace(config, rounds=1), {}, config.ideal_spectra
     score, tx_index = told.scores(count), told.tx_index(count)
     for name in ("curved", "thick"):
         if float(getattr(params, name)):
             continue
-        natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # training gives every array away once
+        natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # a new array: training donates it once
         if name == "thick":
             natural, _ = search_materials(natural, told, count, once)
         before, after = score([params, natural])

@@ -1,10 +1,10 @@
-"""Search for the thicknesses of walls and boards that nobody has measured, together with what they are made of.
+"""Calibration of unknown thicknesses of walls and boards, together with their materials.
 
-What passes a slab, or comes back from its far side, has turned by its optical thickness, t sqrt(eps_r), in wavelengths. At low
-frequencies few thicknesses can be told from each other and one look at all of them is enough; every higher frequency then tells
-those apart that the ones before it left, just as surfaces are put in place (alignment.py). Entries of the list of materials are
-tried with the thickness that keeps the optical thickness as it is. Materials as thick as is usual are the beginning; what comes
-out is taken if it explains snapshots surely better than the materials that were named without it.
+A wave that passes a slab, or is reflected by its far side, is delayed by its optical thickness, t sqrt(eps_r), in wavelengths.
+At low frequencies few thicknesses can be distinguished, and a single comparison of all of them is sufficient; every higher
+frequency then distinguishes those that the lower ones could not, as in the alignment of surfaces (alignment.py). Entries of the
+list of materials are tried with the thickness that preserves the optical thickness. The calibration begins with usual
+thicknesses; the result is kept if it fits snapshots significantly better than the materials chosen without it.
 """
 
 import dataclasses
@@ -28,39 +28,40 @@ from wbgs_jax.training.calibration.material_fit import (
 from wbgs_jax.training.calibration.objective import Compared, Scores, Told, surely_better
 
 SHEETS = (0.002, 0.004, 0.006, 0.01, 0.015)
-"""Metres: thicknesses of what is thinner than a step of the first look."""
+"""Thicknesses of sheets that are thinner than a step at the first frequency, metres."""
 THINNEST, THICKEST = 5e-4, 0.35
-"""Metres."""
+"""Range of thicknesses, metres."""
 FIRST_STEP, STEP = 1 / 6, 1 / 8
-"""Of the wavelength in the material, from one thickness to the next at the first frequency and at those after it."""
+"""Steps between thicknesses at the first frequency and at later ones, in wavelengths within the material."""
 MOST = 40
-"""Thicknesses of one entry at the first look, besides sheets."""
+"""Maximum number of thicknesses per entry at the first frequency, in addition to sheets."""
 APART = 1.25
-"""Ratio of two frequencies that are looked at one after the other, at least."""
+"""Minimum ratio of two successive frequencies."""
 BELIEVED = 0.1
-"""Wavelengths: where surfaces may stand further off (standard deviation), phases tell nothing of thicknesses."""
+"""position_std, in wavelengths, beyond which phases contain no information about thicknesses."""
 FEWER = 3
-"""A third of the spectra of a glance tell which third of many slabs deserve the whole of it."""
+"""A third of the first spectra (`thickness_glance`) is used to select the third of many slabs scored on all of them."""
 SHORTLIST = 4
-"""Slabs that are looked at closely: the best at a glance."""
+"""Number of slabs that are compared on all spectra: the best ones on the first few."""
 ONCE_MORE = 60
-"""Slabs that are tried again when all materials have been looked at once, or surfaces have moved: the best at a glance ..."""
+"""Number of slabs that are tried again after a pass over all materials or a displacement of surfaces: the best ones on the
+first few spectra."""
 ENTRIES = 6
-"""... and entries of the list that are tried at higher frequencies: those of the best of them."""
+"""Number of entries of the list that are tried at higher frequencies: those of the best slabs."""
 SURE = 2.0
-"""As many standard errors over transmitters as the gain has to be sure by (`surely_better`)."""
+"""n_sigma: standard errors over transmitters by which the gain must be significant (`surely_better`)."""
 
 
 class Slab(NamedTuple):
-    """An entry of the list of materials, so many metres thick."""
+    """An entry of the list of materials with its thickness, metres."""
 
     entry: str
     metres: float
 
 
 Likely = dict[int, list[Slab]]
-"""Of all materials of unknown thickness the best slabs at a first glance, the best first; all slabs of a material that no path
-has met."""
+"""Best slabs on the first spectra by material of unknown thickness, the best first; all slabs for a material that occurs in no
+path."""
 
 
 def search_slabs(
@@ -71,23 +72,22 @@ def search_slabs(
     compared: Compared = "snapshots",
     likely: Likely | None = None,
 ) -> tuple[WaveParams, SearchReport, Likely | None]:
-    """Returns parameters with the materials that explain spectra best, and with thicknesses that the scene does not say; and
-    the slabs that were likely, if any were looked for.
+    """Returns parameters with the materials and unknown thicknesses that fit spectra best, a report, and the most likely slabs
+    (None if they have not been searched). `told` are training spectra with the field and its paths.
 
-    Thicknesses are searched where snapshots are known; to pictures alone materials are as thick as is usual.
+    Thicknesses are estimated from snapshots; with spectra alone, materials get their usual thickness.
 
     Args:
-        params: with `materials`, one of them for each of the field's thicknesses.
-        told: what training spectra say.
-        config: of the search for materials; `thickness_spectra` are looked at for every frequency.
-        count: spectra by which materials are named.
-        compared: of those.
-        likely: slabs, where those that are not likely have been ruled out before.
+        params: parameters with `materials`.
+        config: settings of the calibration; `thickness_spectra` are used at every frequency.
+        count: number of spectra with which materials are chosen.
+        compared: the compared quantity.
+        likely: slabs from an earlier search, to which this one is restricted; None for all.
     """
     score, known = told.scores(count, compared), np.asarray(told.field.known_thickness)
     unknown = known == 0
     named, report = search_materials(params, told, count, config, compared, usual=bool(unknown.any()))
-    if not unknown.any() or told.data.snapshots is None:  # a spectrum costs as much as ten snapshots, and tells less
+    if not unknown.any() or told.data.snapshots is None:  # spectra cost ten times as much and contain less information
         return named, report, likely
     once = dataclasses.replace(config, rounds=1)
     params, likely = _sized(named, unknown, told, config, compared, likely)
@@ -107,7 +107,7 @@ def _sized(
     compared: Compared,
     likely: Likely | None,
 ) -> tuple[WaveParams, Likely]:
-    """Returns parameters with materials and thicknesses as spectra of ever higher frequencies say, and the likely slabs."""
+    """Returns parameters with materials and thicknesses estimated at successively higher frequencies, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
     first, *others = frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
     likely = dict(likely or {m: _all_slabs(first) for m in materials})
@@ -119,7 +119,7 @@ def _sized(
     for frequency_hz in others:
         score = told.scores(config.thickness_spectra, compared, frequency_hz)
         for material in materials:
-            seen = len(likely[material]) <= ONCE_MORE  # of what no path has met, no entry is likelier than another
+            seen = len(likely[material]) <= ONCE_MORE  # all slabs are equally likely for a material that occurs in no path
             entries = list(dict.fromkeys(slab.entry for slab in likely[material]))[: ENTRIES if seen else None]
             near = _slabs_near(params.materials, material, entries, frequency_hz, before)
             params, _ = _best(params, material, near, score, config.thickness_glance)
@@ -128,8 +128,9 @@ def _sized(
 
 
 def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: float) -> list[float]:
-    """Returns the highest frequencies of the looks, ascending: those of the data as far as they stand apart and their phases
-    are believed, but not the lowest by itself, which tells little, unless the first look at the next would miss thick walls."""
+    """Returns the maximum frequencies of the successive comparisons, ascending: those of the data with ratios of at least
+    `APART`, up to `believed_hz`, beyond which phases are inaccurate. The lowest frequency alone contains little information; it
+    is left out unless the first comparison at the next one would not include thick walls."""
     found = [float(frequency_hz.max())]
     for one in np.unique(frequency_hz)[::-1]:
         found += [float(one)] if one * APART <= found[-1] else []
@@ -140,7 +141,7 @@ def frequencies_to_look_at(frequency_hz: Float[np.ndarray, " n"], believed_hz: f
 
 
 def _all_slabs(frequency_hz: float) -> list[Slab]:
-    """Returns all entries of the list in all thicknesses that differ at a frequency."""
+    """Returns all entries of the list with all thicknesses that can be distinguished at a frequency."""
     found = []
     for name in ITU_MATERIALS:
         found += [Slab(name, float(metres)) for metres in (*SHEETS, *_steps(name, frequency_hz)[:MOST])]
@@ -148,12 +149,12 @@ def _all_slabs(frequency_hz: float) -> list[Slab]:
 
 
 def _steps(entry: str, frequency_hz: float) -> Float[np.ndarray, " n"]:
-    """Returns thicknesses (metres) that differ at a frequency, up to the thickest."""
+    """Returns thicknesses (metres) that can be distinguished at a frequency, up to `THICKEST`."""
     return np.arange(0.02, THICKEST, FIRST_STEP * _wavelength(entry, frequency_hz))
 
 
 def _slabs_near(materials: Materials, material: int, entries: list[str], frequency_hz: float, before_hz: float) -> list[Slab]:
-    """Returns entries in thicknesses that could not be told from the present one at the frequency before."""
+    """Returns entries with thicknesses that could not be distinguished from the current one at the previous frequency."""
     optical = float(jnp.exp(materials.log_thickness[material]) * jnp.sqrt(1 + jnp.exp(materials.log_susceptibility[material])))
     around, found = int(np.ceil(frequency_hz / before_hz)), []
     for name in entries:
@@ -164,13 +165,13 @@ def _slabs_near(materials: Materials, material: int, entries: list[str], frequen
 
 
 def _wavelength(entry: str, frequency_hz: float) -> float:
-    """Returns metres, in the material."""
+    """Returns the wavelength in the material, metres."""
     return SPEED_OF_LIGHT / frequency_hz / float(np.sqrt(ITU_MATERIALS[entry][0]))
 
 
 def _best(params: WaveParams, material: int, slabs: list[Slab], score: Scores, glance: int) -> tuple[WaveParams, list[Slab]]:
-    """Returns parameters in which a material is the best of some slabs, or what it was, where it makes no difference or fits
-    better; and the likely ones of them, the best first."""
+    """Returns parameters with the best of some slabs for a material, and the likely slabs, the best first. The material is
+    unchanged if its current properties fit better, or if it has no effect."""
     few, left = len(slabs) // FEWER, slabs
     if few > ONCE_MORE:
         left = _ranked(params, material, slabs, score, -(-glance // FEWER))[:few] or slabs
@@ -182,7 +183,8 @@ def _best(params: WaveParams, material: int, slabs: list[Slab], score: Scores, g
 
 
 def _ranked(params: WaveParams, material: int, slabs: list[Slab], score: Scores, spectra: int) -> list[Slab]:
-    """Returns slabs, the best first by so many spectra; none, where the material makes no difference to these."""
+    """Returns slabs sorted by their scores on the first `spectra` spectra, the best first; an empty list if the material has no
+    effect on these."""
     scores = score([_made_of(params, material, slab) for slab in slabs], spectra).mean(1)
     return [] if np.ptp(scores) < UNSEEN else [slabs[i] for i in np.argsort(scores)]
 

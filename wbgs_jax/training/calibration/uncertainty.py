@@ -1,8 +1,8 @@
-"""How far surfaces may stand from where the mesh has them: a first guess, the same for all of them and for the transmitters.
+"""Calibration of position_std: an initial estimate, common to all surfaces and the transmitters.
 
-A surface that is off by more than a tenth of a wavelength says nothing about phases. A field that believes it nevertheless is
-further from the truth than one that adds powers. The guess is the one by which spectra are explained best; training learns how
-far it is for each.
+A surface that is displaced by more than a tenth of a wavelength contains no information about phases. A field that takes its
+position as exact is less accurate than one that adds powers. The estimate is the value that fits spectra best; training then
+refines it for each rigid body.
 """
 
 import dataclasses
@@ -20,18 +20,18 @@ SPREADS_M = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 
 @dataclass(frozen=True)
 class PlacementReport:
-    """What was found."""
+    """Result of the calibration of position_std."""
 
     spread_mm: float
-    """Standard deviation along each axis."""
+    """Estimated standard deviation along each axis, mm."""
     certain: float
-    """Mean score of spectra if every place were known (to the least of `SPREADS_M`) ..."""
+    """Mean score of spectra with practically exact positions (the smallest of `SPREADS_M`)."""
     uncertain: float
-    """... and with the standard deviation that was taken."""
+    """Mean score of spectra with the estimated standard deviation."""
 
 
 def search_placement(params: WaveParams, score: Scores) -> tuple[WaveParams, PlacementReport]:
-    """Returns parameters with the uncertainty of all places by which spectra are explained best."""
+    """Returns parameters with the standard deviation of all positions that fits spectra best."""
     candidates = [
         dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(spread))) for spread in SPREADS_M
     ]
