@@ -112,7 +112,7 @@ def test_another_receiver_has_another_map(runs, tmp_path):
         ("wave", ["--ghz", "28", "--height", "nan", "--out", "OUT/a.npz"], ["--height nan"]),
         ("wave", ["--ghz", "28", "--area", "0,0:0,1", "--out", "OUT/a.npz"], ["--area 0,0:0,1 is no rectangle"]),
         ("wave", ["--ghz", "28", "--area", "0,0:x,1", "--out", "OUT/a.npz"], ["is no rectangle"]),
-        ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["no k-factor", "wave"]),
+        ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["not provide k-factor", "wave"]),
         ("wideband", ["--ghz", "0.5", "--out", "OUT/a.npz"], ["from 1 GHz on"]),
     ],
 )

@@ -38,7 +38,7 @@ def test_a_file_of_queries(tmp_path):
         ("x,y,z,ghz\n1,2,3,28\n1,2,up,28\n", ["line 3"]),
         ("x,y,z,ghz\n1,2,3\n", ["line 2"]),
         ("x,y,z,ghz\n1,2,nan,28\n", ["line 2"]),
-        ("x,y,z,ghz\n1,2,3e9,28\n", ["no position"]),
+        ("x,y,z,ghz\n1,2,3e9,28\n", ["not a position"]),
     ],
 )
 def test_files_that_are_refused(tmp_path, text, words):
