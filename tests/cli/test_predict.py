@@ -81,7 +81,10 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         (["--tx", "1,2", "--ghz", "28", "--out", "OUT/a.npz"], ["--tx 1,2 "]),
         (["--tx", "1,2,x", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,x"]),
         (["--tx", "1,2,nan", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,nan"]),
-        (["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"], ["from 1 GHz on, not at 0.9 GHz", "wave or hybrid"]),
+        (
+            ["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"],
+            ["from 1 GHz upwards, not at 0.9 GHz", "wave or hybrid"],
+        ),
         (["--tx", INSIDE[0], "--ghz", "28e9", "--out", "OUT/a.npz"], ["2.8e+10", "0.3 to 100 GHz"]),
         (["--tx", INSIDE[0], "--ghz", "nan", "--out", "OUT/a.npz"], ["nan"]),
         ([*ASK, "--out", "OUT/a.csv"], ["--out", ".npz"]),
@@ -143,7 +146,7 @@ def test_the_trained_band_can_be_asked_for_wherever_it_lies(tmp_path):
         answered = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.915, "--out", tmp_path / "pas.npz")
         assert answered.code == 0 and not [line for line in answered.lines if line.startswith("warning")], answered.err
         refused = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.9, "--out", tmp_path / "no.npz")
-        assert refused.code == 2 and "of this run answers from 0.915 GHz on, not at 0.9 GHz" in refused.err
+        assert refused.code == 2 and "of this run can be queried from 0.915 GHz upwards, not at 0.9 GHz" in refused.err
 
 
 def test_where_powers_alone_were_learned_there_are_no_spectra(tmp_path):
@@ -393,8 +396,8 @@ def test_the_whole_channel(coherent, tmp_path):
         (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is not an array"]),
         (["--what", "mimo", "--tx-array", "0x3"], ["--tx-array 0x3"]),
         (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is not a velocity"]),
-        (["--what", "frequency-response", "--points", "1"], ["is no band"]),
-        (["--what", "frequency-response", "--band-mhz", "-5"], ["is no band"]),
+        (["--what", "frequency-response", "--points", "1"], ["is not a band"]),
+        (["--what", "frequency-response", "--band-mhz", "-5"], ["is not a band"]),
         (["--what", "frequency-response", "--band-mhz", "100000"], ["reaches -22 GHz"]),
         (["--what", "paths", "--export", "OUT/a.csv"], ["does not end in .zip"]),
     ],
