@@ -355,7 +355,7 @@ def test_below_the_band_only_paths_answer(coherent, tmp_path):
     out = tmp_path / "low.npz"
     result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.4, "--what", "power", "--out", out)
     assert result.code == 0
-    assert [line for line in result.lines if line.startswith("warning: 0.4 GHz lies below 1 GHz: rays")]
+    assert [line for line in result.lines if line.startswith("warning: 0.4 GHz lies below 1 GHz: ray methods")]
     with np.load(out) as answer:
         assert -80 < answer["power_db"][0, 0] < 0
     result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.2, "--out", out)
