@@ -67,7 +67,7 @@ class Command:
     rx: str = ""
     """Receiver, by default the first of the data: its index; x,y,z in metres; or
     x,y,z,w,i,j,k with a quaternion (wxyz) that rotates its array into the
-    world frame. Receivers that are not in the data need a field with paths."""
+    world frame. New receivers need a field with paths."""
     what: What = "spectra"
     """Quantity to predict: power angular spectra, or one that only some fields provide."""
     tx_velocity: str = "0,0,0"
