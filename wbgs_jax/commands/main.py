@@ -1,4 +1,4 @@
-"""The console script `wbgs-jax`. Each of its commands is a thin module, which `python -m wbgs_jax.commands.MODULE` runs too."""
+"""The console script `wbgs-jax`, also run by `python -m wbgs_jax`. Each of its commands is a thin module."""
 
 import importlib
 import sys

@@ -40,7 +40,8 @@ from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_p
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 BEYOND_M = 2.0
-"""Distance from readings, receivers and walls within which predictions have an interval: the next room, not a building."""
+"""Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
+the next building."""
 SUFFIXES = {"out": (".json",), "picture": (".png",), "answers": (".csv",), "mesh": (".ply",)}
 
 

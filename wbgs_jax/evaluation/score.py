@@ -1,5 +1,4 @@
-"""Scores of a trained field on held-out links: figures for every kind of output that field and data have, beside the
-baselines.
+"""Scores of a trained field on held-out links, compared with baselines, for every kind of output that field and data have.
 
 Besides the accuracy of spectra, snapshots and received powers, the report has
 

@@ -112,8 +112,8 @@ def features(
     power_db: Float[Array, " b"] | None = None,
 ) -> Float[Array, "b k"]:
     """Returns features that may be correlated with the quality of predicted spectra: the distance to the nearest training
-    transmitter; mean and standard deviation of the spectrum, which are large where many paths interfere; the frequency; and the
-    received power relative to free space, which indicates how deep in the shadow a transmitter is (0 if not passed)."""
+    transmitter; mean and standard deviation of the spectrum, more of which is bright where many paths interfere; the frequency;
+    and the received power relative to free space, which indicates how deep in the shadow a transmitter is (0 if not passed)."""
     distance, octave = _distance(query, tx_position), _octave(query)
     mean, spread = jnp.mean(pas, (-2, -1)), jnp.std(pas, (-2, -1))
     beyond = jnp.zeros_like(octave) if power_db is None else _beyond(power_db, query, rx_position)
