@@ -226,7 +226,7 @@ def test_answers_far_away_are_refused(tmp_path):
     run = make_coherent_run(tmp_path / "box")
     asked = ["--run", run, "--ghz", "10", "--out", tmp_path / "x.npz"]
     assert_error_for_people(call(predict.main, *asked, "--tx", "1e9,0,0"), "--tx 1e9,0,0 is not a position")
-    assert_error_for_people(call(predict.main, *asked, "--tx", "1,0,1", "--rx", "1e39,0,0"), "--rx 1e39,0,0 is no receiver")
+    assert_error_for_people(call(predict.main, *asked, "--tx", "1,0,1", "--rx", "1e39,0,0"), "--rx 1e39,0,0 is not a receiver")
     assert not (tmp_path / "x.npz").exists()
 
 

@@ -236,7 +236,7 @@ def test_it_predicts_and_is_exported_by_the_command_line(trained, tmp_path, kind
     with np.load(tmp_path / "power.npz") as answer:
         np.testing.assert_allclose(answer["power_db"], float(wb.load_trained(folder).params["power_db"][0]), rtol=1e-6)
     refused = call(predict_command.main, *ask, "--what", "delay-spread", "--out", tmp_path / "none.npz")
-    assert_error_for_people(refused, "the toy field has no delay-spread")
+    assert_error_for_people(refused, "the toy field does not provide delay-spread")
 
 
 def test_it_is_used_as_a_library(trained, tmp_path):
@@ -296,7 +296,7 @@ def test_what_it_does_not_know_is_an_error_for_people(tmp_path):
     try:
         arguments = ["--scene", tmp_path / "power.npz", "--field", "blind", *TRAIN[2:], "--out", tmp_path / "run"]
         refused = call(train_command.main, *arguments)
-        assert_error_for_people(refused, "received powers, of which the blind field knows nothing", "toy", "wave")
+        assert_error_for_people(refused, "received powers, which the blind field does not predict", "toy", "wave")
         assert not (tmp_path / "run").exists()
     finally:
         del base._FIELDS["blind"]

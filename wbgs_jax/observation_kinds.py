@@ -1,7 +1,7 @@
-"""Kinds of observation: what a link can be measured by, as data (docs/architecture.md, "A kind of observation").
+"""Registry of the kinds of observation of a link (docs/architecture.md, "A kind of observation").
 
-Observations are one pytree, `{name of the kind: array}`, in scene files, data sets, training data and batches. Everything
-else asks a kind what follows from it: spectra, received power, or both.
+Observations are a pytree `{name of the kind: array}` in scene files, datasets, training data and batches. All other code uses
+a kind only through the quantities that can be computed from it: spectra, received power, or both.
 """
 
 import dataclasses
@@ -16,65 +16,65 @@ from wbgs_jax.radio.array import PAS_SHAPE, cbf, normalise, snapshot_to_pas
 from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
 
 Observations = dict[str, Shaped[Array, "n ..."]]
-"""What was observed on n links, by the name of the kind (`KINDS`)."""
+"""Observations of n links by the name of their kind (`KINDS`)."""
 HostObservations = dict[str, Shaped[np.ndarray, "n ..."]]
-"""The same in scene files, where n stands for three axes of links, and in data sets."""
+"""The same on the host: in scene files, where n stands for the three axes of links, and in datasets."""
 Spectra = Float[Array, "n 90 360"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """What one link can be measured by. Spectra, received power, or both follow from it."""
+    """A kind of observation, from which spectra, received power, or both can be computed."""
 
     name: str
-    """Key of the array in scene files, data sets, training data and batches."""
+    """Key of the array in scene files, datasets, training data and batches."""
     words: str
-    """What people call several of them."""
+    """Plural noun for messages."""
     dtype: type[np.generic]
-    """Of the array, in files and on the device."""
+    """dtype of the array, in files and on the device."""
     axes: tuple[str | int, ...]
-    """Of one link's values, behind the axes of links: lengths, or names of those that other arrays of a scene file share, such
-    as "elements"."""
+    """Axes of the values of a link, after the axes of links: lengths, or names of axes shared with other arrays of a scene
+    file, such as "elements"."""
     to_spectra: Callable[..., Spectra] | None = None
-    """(values (n, *axes), elements, steering) -> spectra (n, 90, 360), of maximum 1; None: there are none. `elements`
-    are the positions (elements, 3) of the receiver's array, or (n, elements, 3) where every link has its own, in wavelengths;
-    `steering` their steering vectors (90, 360, elements) where these are known, else None."""
+    """(values (n, *axes), elements, steering) -> spectra (n, 90, 360) with maximum 1; None if there are no spectra. `elements`
+    are the element positions of the receiver's array in wavelengths, (elements, 3), or (n, elements, 3) if they differ between
+    links; `steering` are their steering vectors (90, 360, elements) if already computed, otherwise None."""
     to_power: Callable[[Any], Float[Array, " n"]] | None = None
-    """values (n, *axes) -> received power relative to the transmitted power, dB; None: they have no scale."""
+    """values (n, *axes) -> received power relative to the transmitted power, dB; None if the values have no scale."""
     measured: Callable[[np.ndarray], Bool[np.ndarray, "*links"]] | None = None
-    """values (*links, *axes) -> which links were measured (host); None: all of them."""
+    """values (*links, *axes) -> mask of the measured links (host); None if all are."""
     fault: Callable[[np.ndarray], str] = lambda values: ""
-    """values (*links, *axes) -> what they must not contain, in words; empty if they may be what they are (host)."""
+    """values (*links, *axes) -> description of invalid values for the error message; empty if all are valid (host)."""
     needs_array: bool = False
-    """Spectra depend on the receiver's array."""
+    """Whether spectra depend on the receiver's array."""
     silence: float = 0
-    """Value of links on which nothing is heard: no power is learned from it."""
+    """Value of links without a received signal, from which no power is learned."""
 
     def __post_init__(self) -> None:
         if self.to_spectra is None and self.to_power is None:
-            raise ValueError(f"neither spectra nor power follow from {self.words}; define one of them")
+            raise ValueError(f"{self.words} have neither to_spectra nor to_power; define one of them")
 
 
 KINDS: dict[str, Kind] = {}
-"""All kinds by name. Where observations of several kinds are known, the first that has spectra gives the spectra, and the first
-that has a power gives the power."""
+"""All kinds by name. If there are observations of several kinds, spectra are computed from the first kind that has any, and so
+is power."""
 
 
 def register_kind(kind: Kind) -> Kind:
-    """Makes a kind known to scene files, data sets and batches."""
+    """Registers a kind for scene files, datasets and batches, and returns it."""
     KINDS[kind.name] = kind
     return kind
 
 
 def only_kind(names: Iterable[str], holder: str) -> Kind:
-    """Returns the one kind among the names of some arrays.
+    """Returns the only kind among the names of arrays.
 
     Raises:
-        ValueError: there is none, or there are several; the message starts with `holder`, what holds the arrays.
+        ValueError: there is no kind among them, or several; the message starts with `holder`, the object with the arrays.
     """
     found = [name for name in KINDS if name in set(names)]
     if len(found) != 1:
-        raise ValueError(f"{holder} holds {' and '.join(found) or 'none'} of {', '.join(KINDS)}, and needs one")
+        raise ValueError(f"{holder} contains {' and '.join(found) or 'none'} of {', '.join(KINDS)}, but must contain one")
     return KINDS[found[0]]
 
 
@@ -83,7 +83,7 @@ def spectra_of(
     elements: Float[Array, "elements 3"] | Float[Array, "n elements 3"],
     steering: Complex[Array, "90 360 elements"] | None = None,
 ) -> Spectra | None:
-    """Returns the power angular spectra of n links (`Kind.to_spectra`); None where none follow from what was observed."""
+    """Returns the power angular spectra of n links (`Kind.to_spectra`); None if the observations have none."""
     for name, kind in KINDS.items():
         if name in observations and kind.to_spectra is not None:
             return kind.to_spectra(observations[name], elements, steering)
@@ -91,7 +91,7 @@ def spectra_of(
 
 
 def power_of(observations: Observations) -> Float[Array, " n"] | None:
-    """Returns the received power of n links (dB); None where spectra alone are known, which have no scale."""
+    """Returns the received power of n links (dB); None for spectra, which have no scale."""
     for name, kind in KINDS.items():
         if name in observations and kind.to_power is not None:
             return kind.to_power(observations[name])
@@ -102,36 +102,36 @@ T = TypeVar("T", bound="Observed")
 
 
 class Observed:
-    """What has observations: data sets, training data, batches."""
+    """Base class of objects with observations: datasets, training data and batches."""
 
     observations: Any
 
     def has(self, kind: str) -> bool:
-        """Returns whether observations of a kind, by its name, are known."""
+        """Returns whether there are observations of a kind, by its name."""
         return kind in self.observations
 
     @property
     def has_spectra(self) -> bool:
-        """Whether power angular spectra are known, observed or of the snapshots."""
+        """Whether power angular spectra are available, observed or computed from snapshots."""
         return any(KINDS[name].to_spectra is not None for name in self.observations)
 
     @property
     def has_scale(self) -> bool:
-        """Whether received power is known, observed or of the snapshots."""
+        """Whether received power is available, observed or computed from snapshots."""
         return any(KINDS[name].to_power is not None for name in self.observations)
 
     @property
     def snapshots(self) -> Any:
-        """Complex array snapshots (n, elements); None where they are not known."""
+        """Complex array snapshots (n, elements); None if they were not observed."""
         return self.observations.get("snapshots")
 
     @property
     def power_db(self) -> Any:
-        """Observed power relative to the transmitted power (n,), dB; None where it was not measured itself."""
+        """Observed power relative to the transmitted power (n,), dB; None if power itself was not observed."""
         return self.observations.get("power_db")
 
     def with_observations(self: T, **observations: Any) -> T:
-        """Returns the same links with these observations, by kind, instead of those that it has."""
+        """Returns a copy with these observations, by kind, instead of its own."""
         return dataclasses.replace(self, observations=observations)  # type: ignore[type-var]
 
 
@@ -144,10 +144,10 @@ def _spectra_of_snapshots(values: Any, elements: Any, steering: Any) -> Spectra:
 
 
 def _fault_of_snapshots(values: np.ndarray) -> str:
-    known, nothing = np.isfinite(values).all(-1), np.isnan(values).all(-1)
-    if not (known | nothing).all():
-        return "infinity, or NaN in some elements of a link alone"
-    return "" if known.any() else "NaN alone"
+    finite, missing = np.isfinite(values).all(-1), np.isnan(values).all(-1)
+    if not (finite | missing).all():
+        return "infinity, or NaN in only some elements of a link"
+    return "" if finite.any() else "only NaN"
 
 
 register_kind(
@@ -173,8 +173,8 @@ register_kind(
         np.float32,
         (),
         to_power=lambda values: values,
-        measured=lambda values: values > NOT_HEARD_DB,  # nor is NaN
-        fault=lambda values: "infinity, or NaN alone" if np.isinf(values).any() or np.isnan(values).all() else "",
+        measured=lambda values: values > NOT_HEARD_DB,  # False for NaN
+        fault=lambda values: "infinity, or only NaN" if np.isinf(values).any() or np.isnan(values).all() else "",
         silence=NOT_HEARD_DB,
     )
 )

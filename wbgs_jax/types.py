@@ -86,7 +86,7 @@ class Query:
 
     @property
     def query(self) -> "Query":
-        """Itself: what is asked of links of which nothing else is known."""
+        """The query itself, so that it can be used in place of `Links`."""
         return self
 
 
@@ -113,23 +113,23 @@ class Links:
 
 @pytree
 class Batch(Observed):
-    """B links of one receiver, and what was observed on them."""
+    """B links of one receiver and their observations."""
 
     links: Links
     receiver: Receiver
     observations: Observations
-    """By kind, as data have them, but spectra: wherever there are any, "pas" holds them as float32 of maximum 1."""
+    """Observations by kind, as in datasets, except for spectra: if available, "pas" contains them as float32 with maximum 1."""
     key: Key[Array, ""]
     """Random key of this training step."""
 
     @property
     def pas(self) -> Float[Array, "b 90 360"] | None:
-        """Normalised power angular spectra, observed or of the snapshots; None where there are none."""
+        """Normalised power angular spectra, observed or computed from snapshots; None if there are none."""
         return self.observations.get("pas")
 
     @property
     def received_db(self) -> Float[Array, " b"] | None:
-        """The received power (dB), observed or of the snapshots; None where spectra alone are known."""
+        """The received power (dB), observed or computed from snapshots; None for spectra."""
         return power_of(self.observations)
 
 

@@ -104,7 +104,7 @@ def window(viewer: Viewer) -> Iterator[Window]:
         page.on("pageerror", lambda error: opened.errors.append(str(error)))
         page.goto(f"http://localhost:{viewer.port}")
         page.wait_for_selector("canvas")
-        page.get_by_text("what the receiver sees").wait_for()
+        page.get_by_text("spectrum at the receiver").wait_for()
         page.add_style_tag(content=".mantine-Notifications-root {display: none}")  # that there is no graphics card
         yield opened
         browser.close()

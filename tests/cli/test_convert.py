@@ -95,7 +95,7 @@ def test_a_model_without_an_answer(tmp_path):
         (["room.glb", "--out", "a.npz"], ["scene file room.glb does not exist"]),
         (["--run", "RUN", "--out", "a.ply"], ["--tx", "--ghz 28"]),
         (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.obj"], ["a.obj", "gaussians.ply"]),
-        (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["predicts no paths"]),
+        (["--run", "RUN", "--tx", "1,0,1", "--ghz", "28", "--out", "a.npz"], ["does not predict paths"]),
         (["--paths", "gone", "--ghz", "28", "--out", "a.npz"], ["cannot read gone"]),
         (["--paths", "gone", "--out", "a.npz"], ["cannot read gone"]),
         (["--paths", "gone", "--out", "a.ply"], ["does not end in .npz"]),

@@ -108,12 +108,12 @@ def test_another_receiver_has_another_map(runs, tmp_path):
         ("wave", ["--ghz", "28", "--picture", "OUT/a.svg"], [".png"]),
         ("wave", ["--ghz", "0.1", "--out", "OUT/a.npz"], ["0.3 to 100 GHz"]),
         ("wave", ["--ghz", "28", "--step", "0", "--out", "OUT/a.npz"], ["--step 0"]),
-        ("wave", ["--ghz", "28", "--step", "1e-4", "--out", "OUT/a.npz"], ["1,000,000 places"]),
+        ("wave", ["--ghz", "28", "--step", "1e-4", "--out", "OUT/a.npz"], ["1,000,000 positions"]),
         ("wave", ["--ghz", "28", "--height", "nan", "--out", "OUT/a.npz"], ["--height nan"]),
-        ("wave", ["--ghz", "28", "--area", "0,0:0,1", "--out", "OUT/a.npz"], ["--area 0,0:0,1 is no rectangle"]),
-        ("wave", ["--ghz", "28", "--area", "0,0:x,1", "--out", "OUT/a.npz"], ["is no rectangle"]),
-        ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["no k-factor", "wave"]),
-        ("wideband", ["--ghz", "0.5", "--out", "OUT/a.npz"], ["from 1 GHz on"]),
+        ("wave", ["--ghz", "28", "--area", "0,0:0,1", "--out", "OUT/a.npz"], ["--area 0,0:0,1 is not a rectangle"]),
+        ("wave", ["--ghz", "28", "--area", "0,0:x,1", "--out", "OUT/a.npz"], ["is not a rectangle"]),
+        ("wideband", ["--ghz", "28", "--what", "k-factor", "--out", "OUT/a.npz"], ["not provide k-factor", "wave"]),
+        ("wideband", ["--ghz", "0.5", "--out", "OUT/a.npz"], ["from 1 GHz upwards"]),
     ],
 )
 def test_what_cannot_be_mapped(runs, tmp_path, field, arguments, words):

@@ -81,7 +81,10 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         (["--tx", "1,2", "--ghz", "28", "--out", "OUT/a.npz"], ["--tx 1,2 "]),
         (["--tx", "1,2,x", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,x"]),
         (["--tx", "1,2,nan", "--ghz", "28", "--out", "OUT/a.npz"], ["1,2,nan"]),
-        (["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"], ["from 1 GHz on, not at 0.9 GHz", "wave or hybrid"]),
+        (
+            ["--tx", INSIDE[0], "--ghz", "28", "0.9", "--out", "OUT/a.npz"],
+            ["from 1 GHz upwards, not at 0.9 GHz", "wave or hybrid"],
+        ),
         (["--tx", INSIDE[0], "--ghz", "28e9", "--out", "OUT/a.npz"], ["2.8e+10", "0.3 to 100 GHz"]),
         (["--tx", INSIDE[0], "--ghz", "nan", "--out", "OUT/a.npz"], ["nan"]),
         ([*ASK, "--out", "OUT/a.csv"], ["--out", ".npz"]),
@@ -143,7 +146,7 @@ def test_the_trained_band_can_be_asked_for_wherever_it_lies(tmp_path):
         answered = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.915, "--out", tmp_path / "pas.npz")
         assert answered.code == 0 and not [line for line in answered.lines if line.startswith("warning")], answered.err
         refused = predict("--run", run, "--tx", "1,0,1", "--ghz", 0.9, "--out", tmp_path / "no.npz")
-        assert refused.code == 2 and "of this run answers from 0.915 GHz on, not at 0.9 GHz" in refused.err
+        assert refused.code == 2 and "of this run can be queried from 0.915 GHz upwards, not at 0.9 GHz" in refused.err
 
 
 def test_where_powers_alone_were_learned_there_are_no_spectra(tmp_path):
@@ -151,7 +154,7 @@ def test_where_powers_alone_were_learned_there_are_no_spectra(tmp_path):
         run = make_toy_run(tmp_path / "powers", HearingField(RippleConfig()), tiny_scene(kind="power"))
         for wanted in (["--out", tmp_path / "pas.npz", *ASK], ["--export", tmp_path / "field.zip"]):
             refused = predict("--run", run, *wanted)
-            assert refused.code == 2 and "from which the hearing field learned no spectra; ask for --what power" in refused.err
+            assert refused.code == 2 and "from which the hearing field learned no spectra; use --what power" in refused.err
         refused = call(map_command.main, "--run", run, "--ghz", 28, "--what", "best-beam", "--out", tmp_path / "beams.npz")
         assert refused.code == 2 and "learned no spectra" in refused.err
         assert predict("--run", run, *ASK, "--what", "power", "--out", tmp_path / "power.npz").code == 0
@@ -174,10 +177,10 @@ def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
                 assert json.loads(str(answer["meta"]))["field"] == "hearing"
         refused = predict(*ask, "--what", "k-factor", "--out", tmp_path / "k.npz")
         assert (refused.code, len(refused.lines)) == (2, 1)
-        assert "the hearing field has no k-factor" in refused.err and "wave" in refused.err
+        assert "the hearing field does not provide k-factor" in refused.err and "wave" in refused.err
         blind = make_toy_run(tmp_path / "ripple", RippleField(RippleConfig()))
         refused = predict("--run", blind, *ASK, "--what", "power", "--out", tmp_path / "none.npz")
-        assert refused.code == 2 and "the ripple field has no power, only spectra" in refused.err
+        assert refused.code == 2 and "the ripple field does not provide power, only spectra" in refused.err
         assert "hearing" in refused.err  # among those that have it
         assert not (tmp_path / "k.npz").exists() and not (tmp_path / "none.npz").exists()
 
@@ -193,7 +196,10 @@ def test_powers_come_with_how_sure_they_are(tmp_path):
     assert result.code == 0, result.err
     lines = [line for line in result.err.splitlines() if "within" in line]
     assert len(lines) == 4
-    assert lines[1] == "TX (1, 2, 1) m at 5 GHz: -54.0 dB of the transmitted power; expected 1.9 dB off, 90 % within 3.9 dB"
+    assert (
+        lines[1]
+        == "TX (1, 2, 1) m at 5 GHz: -54.0 dB relative to the transmitted power; expected error 1.9 dB, 90 % within 3.9 dB"
+    )
     with np.load(tmp_path / "power.npz") as answer:
         np.testing.assert_allclose(answer["within_db"], np.full((2, 2), 3.9), rtol=1e-5)
         np.testing.assert_allclose(answer["expected_error_db"], np.full((2, 2), 1.9), rtol=1e-5)
@@ -293,7 +299,7 @@ def test_what_was_interrupted_goes_on(hearing, tmp_path, monkeypatch):
     refused = predict(*ask, "--out", out)
     assert refused.code == 2 and "--resume" in refused.err
     refused = predict(*hearing, "--line", "0,0,1:2,0,1:6", "--ghz", 2, 5, "--what", "power", "--out", out, "--resume")
-    assert refused.code == 2 and "another question (queries)" in refused.err
+    assert refused.code == 2 and "another command (queries changed)" in refused.err
     assert predict(*ask, "--out", out, "--resume").code == 0
     assert len(asked) == 3 and not part.exists()
     with np.load(out) as one, np.load(whole) as other:
@@ -349,7 +355,7 @@ def test_below_the_band_only_paths_answer(coherent, tmp_path):
     out = tmp_path / "low.npz"
     result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.4, "--what", "power", "--out", out)
     assert result.code == 0
-    assert [line for line in result.lines if line.startswith("warning: 0.4 GHz lies below 1 GHz: rays")]
+    assert [line for line in result.lines if line.startswith("warning: 0.4 GHz lies below 1 GHz: ray methods")]
     with np.load(out) as answer:
         assert -80 < answer["power_db"][0, 0] < 0
     result = predict("--run", coherent, "--tx", INSIDE[0], "--ghz", 0.2, "--out", out)
@@ -384,14 +390,14 @@ def test_the_whole_channel(coherent, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--what", "paths"], ["knows no paths", "wave or hybrid"]),
-        (["--what", "mimo"], ["knows no paths"]),
-        (["--what", "frequency-response"], ["knows no paths"]),
-        (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is no array"]),
+        (["--what", "paths"], ["does not predict paths", "wave or hybrid"]),
+        (["--what", "mimo"], ["does not predict paths"]),
+        (["--what", "frequency-response"], ["does not predict paths"]),
+        (["--what", "mimo", "--tx-array", "4"], ["--tx-array 4 is not an array"]),
         (["--what", "mimo", "--tx-array", "0x3"], ["--tx-array 0x3"]),
         (["--what", "paths", "--tx-velocity", "1,2"], ["--tx-velocity 1,2 is not a velocity"]),
-        (["--what", "frequency-response", "--points", "1"], ["is no band"]),
-        (["--what", "frequency-response", "--band-mhz", "-5"], ["is no band"]),
+        (["--what", "frequency-response", "--points", "1"], ["is not a band"]),
+        (["--what", "frequency-response", "--band-mhz", "-5"], ["is not a band"]),
         (["--what", "frequency-response", "--band-mhz", "100000"], ["reaches -22 GHz"]),
         (["--what", "paths", "--export", "OUT/a.csv"], ["does not end in .zip"]),
     ],

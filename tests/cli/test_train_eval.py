@@ -220,8 +220,8 @@ def test_resuming_and_what_stands_in_its_way(run, scene):
         (["--scene", "SCENE", "--preset", "smoke", "--wideband.radiance-widths"], ["radiance-widths", "at least 1"]),
         (["--data", "LAYOUT", "--frequency-ghz", "5"], ["freq.txt"]),
         (["--scene", "SCENE", "--frequency-ghz", "5"], ["--frequency-ghz is for folders"]),
-        (["--scene", "SCENE", "--validation", "1"], ["--validation", "share"]),
-        (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "share"]),
+        (["--scene", "SCENE", "--validation", "1"], ["--validation", "fraction"]),
+        (["--scene", "SCENE", "--validation", "-0.1"], ["--validation", "fraction"]),
         (["--scene", "SCENE", "--receiver", "1"], ["receivers 0 to 0"]),
         (["--scene", "SCENE", "--train-tx", "5"], ["4 training transmitters"]),
         (["--scene", "SCENE", "--test-box", "0", "0", "0"], ["--test-box has 3 numbers"]),
@@ -256,7 +256,7 @@ def test_a_stop_behind_the_last_step_says_how_to_go_on(run, scene, monkeypatch):
         patch.setattr(train_command, "learn_few", stopped)
         result = call(train_command.main, *arguments)
     assert "0 steps, " in result.err
-    assert result.code == 2 and result.err.endswith("\nerror: stopped; run the same command with --resume to go on\n")
+    assert result.code == 2 and result.err.endswith("\nerror: stopped; run the same command with --resume to continue\n")
     with pytest.warns(UserWarning, match=r"the training of .*run is not finished \(step 4 is saved\)"):
         assert call(eval_command.main, "--run", run, "--no-pictures").code == 0
     assert not (run / "manifest.json").exists()

@@ -138,9 +138,11 @@ def test_power_has_no_angular_spectrum(data):
 
 def test_inconsistent_data_sets_are_refused(data):
     dataset = data["snapshot", "wavelengths"]
-    with pytest.raises(ValueError, match="box holds none of pas, snapshots, power_db, and needs one"):
+    with pytest.raises(ValueError, match="box contains none of pas, snapshots, power_db, but must contain one"):
         dataset.with_observations()
-    with pytest.raises(ValueError, match="box holds snapshots and power_db of pas, snapshots, power_db, and needs one"):
+    with pytest.raises(
+        ValueError, match="box contains snapshots and power_db of pas, snapshots, power_db, but must contain one"
+    ):
         dataset.with_observations(power_db=np.zeros(len(dataset)), snapshots=dataset.snapshots)
     with pytest.raises(ValueError, match="receiver_index must lie between 0 and 2"):
         dataclasses.replace(dataset, receiver_index=dataset.receiver_index + 1)

@@ -64,7 +64,7 @@ def test_links_of_no_part_stay_in_none(parts):
 @pytest.mark.parametrize(
     "change, said",
     [
-        (lambda one: tiny_dataset(6, kind="pas"), "holds snapshots and the other spectra"),
+        (lambda one: tiny_dataset(6, kind="pas"), "contains snapshots, the other spectra"),
         (lambda one: tiny_dataset(6, unit="metres"), "their arrays differ"),
         (lambda one: dataclasses.replace(one, vertices=one.vertices + 1), "their surfaces differ"),
     ],

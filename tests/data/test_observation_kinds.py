@@ -86,7 +86,7 @@ def test_a_new_kind_goes_through_files_joins_and_splits(tmp_path, rssi):
     )
     with pytest.raises(UserError, match="readings with their standard deviations, which have no angular spectrum"):
         dataset.pas(np.arange(2))
-    with pytest.raises(UserError, match="one holds readings with their standard deviations and the other snapshots"):
+    with pytest.raises(UserError, match="one contains readings with their standard deviations, the other snapshots"):
         join([apart[0], tiny_dataset(9)])
 
 
@@ -104,7 +104,7 @@ def test_a_field_learns_a_new_kind(tmp_path, rssi):
     save_scene(tmp_path / "s.npz", readings())
     dataset = hold_out_validation(load_dataset(tmp_path / "s.npz"))
     with registered(RippleField, LevelField):
-        with pytest.raises(UserError, match=r"of which the ripple field knows nothing; choose one of: .*level"):
+        with pytest.raises(UserError, match=r"which the ripple field does not predict; choose one of: .*level"):
             check_data(dataset, RippleField)
         settings = toy_settings(optim={"batch": 4}, field={"learning_rate": 1.0})
         result = train(dataset, "level", settings, 0, tmp_path / "run")
@@ -134,9 +134,9 @@ def test_where_several_kinds_are_known_the_spectra_are_those_that_were_stored(rn
 
 
 def test_a_kind_has_spectra_or_power():
-    with pytest.raises(ValueError, match="neither spectra nor power follow from colours"):
+    with pytest.raises(ValueError, match="colours have neither to_spectra nor to_power"):
         Kind("colour", "colours", np.uint8, (3,))
-    with pytest.raises(ValueError, match="a box holds none of pas, snapshots, power_db, and needs one"):
+    with pytest.raises(ValueError, match="a box contains none of pas, snapshots, power_db, but must contain one"):
         only_kind(["colour"], "a box")
 
 

@@ -35,4 +35,6 @@ def test_folders_of_others_are_refused_by_what_they_lack(tmp_path):
 def test_an_unknown_file_of_paths(tmp_path):
     (tmp_path / "paths.dat").write_text("anything")
     arguments = ["--paths", tmp_path / "paths.dat", "--ghz", "28", "--out", tmp_path / "o.npz"]
-    assert_error_for_people(call(convert_command.main, *arguments), "of no known kind; give an .npz with Sionna's arrays")
+    assert_error_for_people(
+        call(convert_command.main, *arguments), "of an unknown kind; give an .npz file with Sionna's arrays"
+    )

@@ -48,7 +48,7 @@ def test_blocks_that_are_there_are_used_only_when_that_is_said(tmp_path):
     open_parts(target, QUESTION, False).add({"power": np.ones(2)})
     with pytest.raises(UserError, match="add --resume"):
         open_parts(target, QUESTION, False)
-    with pytest.raises(UserError, match=r"another question \(numbers\)"):
+    with pytest.raises(UserError, match=r"another command \(numbers changed\)"):
         open_parts(target, QUESTION | {"numbers": [1, 3]}, True)
     assert len(open_parts(target, QUESTION, True)) == 1
 

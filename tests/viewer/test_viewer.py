@@ -173,7 +173,7 @@ def test_marks_leave_room_for_their_numbers():
     ("options", "says"),
     [
         (["--html", "scene.htm"], "does not end in .html"),
-        (["--port", "70000"], "is no port"),
+        (["--port", "70000"], "is not a port"),
         (["--run", "nowhere"], "not a run"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Many rows through a function that was compiled for a few."""
+"""Evaluation of a compiled function for many rows, in blocks of one shape."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,12 +8,12 @@ import numpy as np
 
 
 def map_blocks(function: Callable[[Any], Any], rows: Any, size: int) -> Any:
-    """Returns `function(rows)`, computed for at most `size` rows at a time: one compilation, and little memory.
+    """Returns `function(rows)`, computed for at most `size` rows at a time, which needs one compilation and little memory.
 
     Args:
-        function: of a tree like `rows`, to a tree of arrays with the same leading axis.
-        rows: a tree of arrays with one leading axis, which is not empty.
-        size: rows of a block. The last block repeats its last row until it is full.
+        function: maps a tree like `rows` to a tree of arrays with the same leading axis.
+        rows: a tree of arrays with a common leading axis, which must not be empty.
+        size: number of rows of a block. The last block is filled up with copies of its last row.
 
     Returns:
         A tree of NumPy arrays.

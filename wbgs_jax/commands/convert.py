@@ -1,11 +1,11 @@
-"""Hand a trained field to other programs, and their channels and rooms to a training:
+"""Convert a trained field for other programs, or their paths and models to files for training:
 
 wbgs-jax convert --run RUN --tx x,y,z --ghz 28 --out gaussians.ply          Gaussians, for splat viewers
-wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths, as sionna.rt.Paths has them
+wbgs-jax convert --run RUN --tx x,y,z [x,y,z ...] --ghz 28 --out paths.npz  paths as arrays of sionna.rt.Paths
 wbgs-jax convert --run RUN --grid LOW:HIGH:NXxNYxNZ --ghz 28 --out folder   a DeepMIMO scenario
 wbgs-jax convert --paths sionna.npz --array 4x4 --out scene.npz             paths of Sionna RT as a scene file
 wbgs-jax convert --paths scenario --ghz 28 --array 4x4 --out scene.npz      a DeepMIMO scenario as a scene file
-wbgs-jax convert room.glb --materials materials.toml --out data/room.npz    a model of a room, beside measured spectra
+wbgs-jax convert room.glb --materials materials.toml --out data/room.npz    a model of a room, for measured spectra
 """
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
@@ -28,76 +28,76 @@ from wbgs_jax._util.files import check_writable
 from wbgs_jax.commands.options import load_field, parse_frequencies, warn
 from wbgs_jax.inference.queries import parse_array, parse_grid
 
-# What takes JAX is imported where it is wanted, as in predict.py.
+# Modules that load JAX are imported where they are used, as in predict.py.
 
 COLORS = "viridis"
 BRIGHT = 0.99
-"""Share of the Gaussians that are no brighter than the end of the colours."""
+"""Quantile of the brightness at which the colour map ends."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Hand a trained field to other programs, and their channels and rooms to a training."""
+    """Convert a trained field for other programs, or their paths and models to files for training."""
 
     out: Path
-    """From a run: .ply (Gaussians), .npz (paths), or a folder (DeepMIMO). Else: a scene file or a room file, .npz."""
+    """Output. With --run: .ply (Gaussians), .npz (paths) or a folder (DeepMIMO); otherwise a scene or room file, .npz."""
     model: tyro.conf.Positional[Path | None] = None
-    """A room: .glb, .gltf, .obj, .ply, or Sionna RT's .xml; or ..."""
+    """Input, one of three: a model of a room (.glb, .gltf, .obj, .ply, or .xml of Sionna RT), ..."""
     run: Path | None = None
-    """... a run folder, or ..."""
+    """... the run folder of a trained field, ..."""
     paths: Path | None = None
-    """... paths: an .npz with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
+    """... or paths: an .npz file with the arrays of sionna.rt.Paths, or a DeepMIMO scenario (folder, .npz, .mat)."""
     materials: Path | None = None
-    """Of a model: a .toml with the materials of its objects (docs/own_scene.md)."""
+    """Model: a .toml file with the materials of its objects (docs/own_scene.md)."""
     up: Literal["y", "z"] | None = None
-    """Of a model: the axis that points up (.glb, .gltf: y; others: z)."""
+    """Model: the axis that points upwards; by default y for .glb and .gltf, z for others."""
     scale: float | None = None
-    """Of a model: metres in one unit of it."""
+    """Model: length of its unit in metres."""
     tx: tuple[str, ...] = ()
-    """Of a run: transmitters, each as x,y,z in metres."""
+    """Run: transmitters, each as x,y,z in metres."""
     grid: str = ""
-    """Or a grid of them, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
+    """Run: a grid of transmitters instead, LOWEST:HIGHEST:NXxNYxNZ, such as -2,-2,1.5:2,2,1.5:9x9x1."""
     ghz: float | None = None
-    """Frequency; of --paths where these do not say it."""
+    """Frequency; with --paths only if the file lacks it."""
     rx: str = ""
-    """Of a run: another receiver than the first (`wbgs-jax predict --help`)."""
+    """Run: the receiver, by default the first (see `wbgs-jax predict --help`)."""
     array: str = ""
-    """Of --paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart; by default the paths' own, else 4x4."""
+    """Paths: the receivers' array, ROWSxCOLUMNS elements half a wavelength apart; by default that of the file, else 4x4."""
     port: int | None = None
-    """Of --paths with two polarisations: which one, 1 or 2."""
+    """Paths with two polarisations: the one to use, 1 or 2."""
     tx_antenna: int | None = None
-    """Of --paths whose transmitters have several antennas: which one, 1, 2, ..."""
+    """Paths with several antennas per transmitter: the one to use, 1, 2, ..."""
     mesh: Path | None = None
-    """Of --paths: the room, a room file or a model in metres."""
+    """Paths: the room, as a room file or a model in metres."""
     swap: bool = False
-    """Of --paths: train for the other side: the transmitters' of Sionna RT, the users' of DeepMIMO."""
+    """Paths: swap both ends; the transmitters of Sionna RT, or the users of DeepMIMO, become the receivers."""
     tx_set: int | None = None
-    """Of a DeepMIMO scenario: the set of base stations, ..."""
+    """DeepMIMO: index of the set of base stations, ..."""
     tx_index: int | None = None
-    """... one of them (0, 1, ...; by default all), ..."""
+    """... of one base station in it (by default all), ..."""
     rx_set: int | None = None
-    """... and the set of users."""
+    """... and of the set of users."""
 
 
 def check(command: Command) -> None:
-    """Raises a `UserError` for a command line that cannot work."""
+    """Raises a `UserError` for an invalid command line."""
     if [command.run, command.paths, command.model].count(None) != 2:
         raise UserError(
-            "give one of --run RUN, to hand a field on, --paths FILE, to make a scene file of other paths, or a model such as "
-            "room.glb, to make a room file of it"
+            "give one of --run RUN, to convert a trained field, --paths FILE, to create a scene file from paths, or a model "
+            "such as room.glb, to create a room file"
         )
     if command.run is None and command.out.suffix != ".npz":
-        raise UserError(f"--out {command.out} does not end in .npz; scene files and room files do")
+        raise UserError(f"--out {command.out} does not end in .npz, as scene files and room files must")
     if command.run is None:
         return
     if bool(command.tx) == bool(command.grid) or command.ghz is None:
-        raise UserError("a run is asked for transmitters at a frequency: give --tx x,y,z or --grid, and --ghz 28")
+        raise UserError("--run needs transmitters and a frequency: give either --tx x,y,z or --grid, and --ghz 28")
     if command.out.suffix not in (".ply", ".npz", ""):
-        raise UserError(f"--out {command.out} is of no known kind; give gaussians.ply, paths.npz, or a folder for DeepMIMO")
+        raise UserError(f"--out {command.out} is of an unknown kind; give gaussians.ply, paths.npz, or a folder for DeepMIMO")
 
 
 def hand_on(command: Command) -> str:
-    """Writes what a field knows, and returns a line about it."""
+    """Writes the Gaussians or paths of a trained field, and returns a line for the user."""
     assert command.run is not None and command.ghz is not None, "checked"
     positions = parse_grid(command.grid) if command.grid else parse_positions(command.tx)
     hertz = parse_frequencies((command.ghz,))
@@ -110,7 +110,7 @@ def hand_on(command: Command) -> str:
 def _write_gaussians(
     command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
 ) -> str:
-    """Writes the Gaussians: brighter colours send more towards the receiver, opacity is their attenuation."""
+    """Writes the Gaussians: brighter colours stand for a stronger signal towards the receiver, opacity for attenuation."""
     from matplotlib import colormaps
 
     from wbgs_jax.interchange.gaussian_ply import write_gaussians
@@ -121,7 +121,7 @@ def _write_gaussians(
     seen = trained.field.inspect(trained.params, plan, query).gaussians
     if seen is None:
         raise UserError(
-            f"the {trained.field.name} field of this run has no Gaussians; train a field that has (docs/which_field.md)"
+            f"the {trained.field.name} field of this run has no Gaussians; train one that has (docs/which_field.md)"
         )
     signal, attenuation = (np.abs(np.asarray(values)).mean(1) for values in (seen.signal, seen.attenuation))
     brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], BRIGHT)), 1e-12)
@@ -147,7 +147,7 @@ def _write_paths(
 
 
 def take_in(command: Command) -> str:
-    """Writes a scene file of other programs' paths, and returns a line about it."""
+    """Writes a scene file from the paths of another program, and returns a line for the user."""
     from wbgs_jax.data.load import check_kind
     from wbgs_jax.data.scene_file import save_scene
     from wbgs_jax.interchange.deepmimo import is_deepmimo, load_deepmimo
@@ -161,7 +161,9 @@ def take_in(command: Command) -> str:
     hertz = None if command.ghz is None else 1e9 * command.ghz
     if command.paths.is_file() and command.paths.suffix.lower() not in (".npz", ".mat"):
         check_kind(command.paths)
-        raise UserError(f"{command.paths} is of no known kind; give an .npz with Sionna's arrays, or a DeepMIMO scenario")
+        raise UserError(
+            f"{command.paths} is of an unknown kind; give an .npz file with Sionna's arrays, or a DeepMIMO scenario"
+        )
     room = None if command.mesh is None else open_room(command.mesh)
     shape, name = parse_array(command.array, "--array") if command.array else None, command.out.stem
     if is_deepmimo(command.paths):
@@ -173,13 +175,13 @@ def take_in(command: Command) -> str:
         choice = shape, command.port, command.tx_antenna, command.swap
         scene = scene_of_sionna(read_paths(command.paths), name, hertz, *choice, room, str(command.paths))
     save_scene(command.out, scene)
-    heard = int((np.abs(scene.observations["snapshots"]) > 0).any((-1, -2, -3)).sum())
-    count = f"{len(scene.tx_positions)} transmitters, {heard} with paths"
+    connected = int((np.abs(scene.observations["snapshots"]) > 0).any((-1, -2, -3)).sum())
+    count = f"{len(scene.tx_positions)} transmitters, {connected} with paths"
     return f"scene: {command.out} ({count}); next: wbgs-jax train --scene {shlex.quote(str(command.out))}"
 
 
 def take_room(command: Command) -> str:
-    """Writes a room file of a model, lists its objects, and returns a line about it."""
+    """Writes a room file from a model, lists its objects, and returns a line for the user."""
     from wbgs_jax.data.room_file import save_room
     from wbgs_jax.interchange.rooms import describe_room, read_room, room_of
 
@@ -189,7 +191,7 @@ def take_room(command: Command) -> str:
     save_room(command.out, room)
     say(describe_room(objects, ["closed" if one.mesh.is_watertight else "sheet" for one in objects]))
     low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (room.vertices.min(0), room.vertices.max(0)))
-    beside = "it belongs into a folder of spectra, as room.npz, or beside snapshots (docs/own_scene.md)"
+    beside = "put it into a folder of spectra as room.npz, or use it with snapshots (docs/own_scene.md)"
     return f"room: {command.out} ({len(objects)} objects from ({low}) to ({high}) m); {beside}"
 
 

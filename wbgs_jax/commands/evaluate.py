@@ -1,7 +1,7 @@
 """Evaluate a trained field: `wbgs-jax eval --run RUN [--data ...] [--json]`.
 
-Scores the held-out spectra (scikit-image SSIM, data range 1, default window; PSNR; MAE) beside the baselines, draws pictures
-into the run folder and writes the report to `eval.json` there; of other data (`--data`), to `eval-NAME.json`.
+Scores the field on held-out spectra (SSIM of scikit-image with data range 1 and the default window; PSNR; MAE), compares it
+with baselines, writes figures and the report `eval.json` (for other data, `--data`: `eval-NAME.json`) into the run folder.
 """
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
@@ -41,13 +41,13 @@ class Command:
     run: Path
     """Run folder."""
     data: str | None = None
-    """Other data than the run was trained on: a scene, a scene file or a folder."""
+    """Other data than those of the training: a scene, a scene file or a folder."""
     part: Part = "test"
-    """What to score: the test transmitters, or those held out for choices (`wbgs-jax train --validation 0.1`)."""
+    """Transmitters to score: those of the test, or those held out for validation (`wbgs-jax train --validation 0.1`)."""
     json: bool = False
-    """Print the report as one JSON object on stdout, and nothing else there."""
+    """Print only the report on stdout, as one JSON object."""
     pictures: bool = True
-    """Draw pictures into the run folder."""
+    """Write figures into the run folder."""
     results: Path | None = None
     """Also write quality_<dataset>_<field>_<preset>_<device>.json with provenance into this folder."""
 
@@ -90,7 +90,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def for_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
-    """Returns what answers at the receivers of other data; where nothing does, the field as it is, with a note."""
+    """Returns the field for the receivers of other data; if no part of it is valid there, the field itself, with a warning."""
     try:
         return at_receivers(trained, dataset)
     except UserError as error:
@@ -99,7 +99,7 @@ def for_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
 
 
 def next_lines(trained: TrainedField, dataset: Dataset, run: Path) -> list[str]:
-    """Returns what to look at next."""
+    """Returns suggestions for the next commands."""
     folder = shlex.quote(str(run))
     place = ",".join(f"{x:.3g}" for x in dataset.tx_positions[dataset.test[0] if len(dataset.test) else 0])
     ghz = f"{dataset.frequencies_hz.max() / 1e9:g}"

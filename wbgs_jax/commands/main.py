@@ -1,4 +1,4 @@
-"""The console script `wbgs-jax`: one word a command, each a thin module that `python -m wbgs_jax.COMMAND` runs too."""
+"""The console script `wbgs-jax`, also run by `python -m wbgs_jax`. Each of its commands is a thin module."""
 
 import importlib
 import sys
@@ -9,7 +9,7 @@ from wbgs_jax._util.errors import UserError
 
 
 class Entry(NamedTuple):
-    """A command."""
+    """A command: its module and its line in the help."""
 
     module: str
     help: str
@@ -17,14 +17,12 @@ class Entry(NamedTuple):
 
 COMMANDS = {
     "train": Entry("wbgs_jax.commands.train", "train a field on the spectra of a scene"),
-    "eval": Entry("wbgs_jax.commands.evaluate", "score a trained field on held-out transmitters, and draw it"),
-    "predict": Entry("wbgs_jax.commands.predict", "ask a trained field for spectra or channels, or export it"),
-    "map": Entry("wbgs_jax.commands.map", "ask a trained field for maps over a floor: power, best beams, spreads"),
-    "view": Entry("wbgs_jax.commands.view", "look at a trained field in a browser: drag its transmitter, see paths and maps"),
-    "measure": Entry("wbgs_jax.commands.measure", "learn a map of received power from readings, and score it"),
-    "convert": Entry(
-        "wbgs_jax.commands.convert", "Gaussians, paths and channels for other programs, and theirs for a training"
-    ),
+    "eval": Entry("wbgs_jax.commands.evaluate", "score a trained field on held-out transmitters, and draw figures"),
+    "predict": Entry("wbgs_jax.commands.predict", "predict spectra or channel quantities with a trained field, or export it"),
+    "map": Entry("wbgs_jax.commands.map", "predict maps over a floor: received power, best beams, K-factor, spreads"),
+    "view": Entry("wbgs_jax.commands.view", "show a trained field in a browser: drag the transmitter, see paths and maps"),
+    "measure": Entry("wbgs_jax.commands.measure", "fit a map of received power to measured powers, and score it"),
+    "convert": Entry("wbgs_jax.commands.convert", "write Gaussians or paths for other programs, or read theirs for training"),
     "layout": Entry("wbgs_jax.commands.export_folder", "write a scene file as a folder of the published layout"),
 }
 
@@ -32,7 +30,7 @@ COMMANDS = {
 def usage() -> str:
     """Returns what `wbgs-jax --help` prints."""
     rows = [f"  {name:8} {entry.help}" for name, entry in COMMANDS.items()]
-    head, tail = "usage: wbgs-jax COMMAND [OPTIONS]", "wbgs-jax COMMAND --help says more of each."
+    head, tail = "usage: wbgs-jax COMMAND [OPTIONS]", "wbgs-jax COMMAND --help lists the options of a command."
     return "\n".join([head, "", "Wideband RF radiance fields in JAX.", "", *rows, "", tail])
 
 

@@ -1,4 +1,4 @@
-"""Ask a trained field for maps over a floor: what reaches the receiver from a transmitter at every place of a level plane.
+"""Predict maps with a trained field: a quantity at the receiver for transmitters all over a horizontal plane.
 
 wbgs-jax map --run RUN --ghz 28 [60 ...] --out map.npz --picture map.png
 wbgs-jax map --run RUN --ghz 28 --what best-beam|k-factor|delay-spread|angular-spread --height 1.2 --step 0.1 --out map.npz
@@ -23,7 +23,7 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
 from wbgs_jax.inference.quantities import INTERVALS, names_for
 
-# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
+# Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
 
 MOST_PLACES = 1_000_000
 if TYPE_CHECKING:
@@ -34,42 +34,42 @@ else:
 
 @dataclass(frozen=True)
 class Command:
-    """Ask a trained field for maps of transmitters over a level plane."""
+    """Predict maps with a trained field, for transmitters all over a horizontal plane."""
 
     run: Path
     """Run folder."""
     ghz: tuple[float, ...]
-    """Frequencies, 1 to 100, and from 0.3 for fields with paths: a map each."""
+    """Frequencies, one map for each; 1 to 100, or 0.3 to 100 for fields that predict paths."""
     what: What = "power"
-    """What to map; all but best-beam only where the field knows it."""
+    """Quantity to map; some fields provide only best-beam."""
     height: float | None = None
-    """Of the transmitters, metres; by default the median of those of the data."""
+    """Height of the transmitters, metres; by default the median in the data."""
     step: float = 0.25
-    """Metres between places."""
+    """Distance between neighbouring transmitters, metres."""
     area: str = ""
-    """Corners of the plane, x0,y0:x1,y1 in metres; by default all of the scene."""
+    """Corners of the plane, x0,y0:x1,y1 in metres; by default the whole scene."""
     rx: str = ""
-    """Another receiver than the first of the data: the number of one of them, x,y,z in metres, or x,y,z,w,i,j,k with the
-    quaternion that turns its array into the world frame."""
+    """Receiver, by default the first of the data: its index, x,y,z in metres, or
+    x,y,z,w,i,j,k with a quaternion (wxyz) that rotates its array into the world frame."""
     out: Path | None = None
-    """Write the maps to this .npz file: values (frequency, y, x)."""
+    """Write the maps to this .npz file, as arrays (frequency, y, x)."""
     picture: Path | None = None
-    """Draw the maps (the first 6) with the walls into this .png file."""
+    """Draw the maps (the first 6) and the walls to this .png file."""
 
 
 def check(command: Command) -> None:
-    """Raises a `UserError` for a command line that asks for nothing, or for what cannot be."""
+    """Raises a `UserError` for an invalid command line, or one without an output."""
     if not (command.out or command.picture):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
     check_suffixes(command, {"out": (".npz",), "picture": (".png",)})
     if not (np.isfinite(command.step) and command.step > 0):
-        raise UserError(f"--step {command.step:g} is no distance; give metres, such as --step 0.25")
+        raise UserError(f"--step {command.step:g} is not a distance; give metres, such as --step 0.25")
     if command.height is not None and not np.isfinite(command.height):
-        raise UserError(f"--height {command.height:g} is no height; give metres, such as --height 1.5")
+        raise UserError(f"--height {command.height:g} is not a height; give metres, such as --height 1.5")
 
 
 def plane_of(command: Command, dataset: Any) -> Any:
-    """Returns the `radio_map.Plane` that is asked for; one that is empty or has too many places is a `UserError`."""
+    """Returns the plane (`radio_map.Plane`) of the command line; an empty area or too many positions are a `UserError`."""
     from wbgs_jax.data.scene import DatasetScene
     from wbgs_jax.inference.radio_map import plane_over
 
@@ -80,16 +80,18 @@ def plane_of(command: Command, dataset: Any) -> Any:
         except ValueError:
             corners = np.zeros(0)
         if corners.shape != (2, 2) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
-            raise UserError(f"--area {command.area} is no rectangle; give x0,y0:x1,y1 in metres, the lower corner first")
+            raise UserError(f"--area {command.area} is not a rectangle; give x0,y0:x1,y1 in metres, the lower corner first")
         low, high = corners
     if np.prod((high - low) / command.step) > MOST_PLACES:
-        raise UserError(f"--step {command.step:g} makes more than {MOST_PLACES:,} places; give a larger one, or an --area")
+        raise UserError(
+            f"--step {command.step:g} gives more than {MOST_PLACES:,} positions; give a larger one, or a smaller --area"
+        )
     height = float(np.median(dataset.tx_positions[:, 2])) if command.height is None else command.height
     return plane_over(low, high, height, command.step)
 
 
 def make_maps(command: Command) -> None:
-    """Evaluates the maps, and writes what is wanted."""
+    """Predicts the maps and writes the requested files."""
     from wbgs_jax.inference.radio_map import cut_at, evaluate_plane, pieces
     from wbgs_jax.inference.results_file import write_arrays
 
@@ -104,7 +106,7 @@ def make_maps(command: Command) -> None:
     for name in answer.keys() & set(INTERVALS):
         answer[name] = np.where(outside, np.nan, answer[name])
     answer["no_confidence"] = outside
-    size = f"{len(plane.xs)} x {len(plane.ys)} places at {len(frequencies_hz)} frequencies"
+    size = f"{len(plane.xs)} x {len(plane.ys)} positions at {len(frequencies_hz)} frequencies"
     if command.out:
         write_arrays(command.out, answer, field.source | {"what": command.what})
         say(f"map: {command.out} ({size})")

@@ -1,4 +1,4 @@
-"""Learn a map of received power from readings, and say how well it holds:
+"""Fit a map of received power to measured powers (readings), and validate it on held-out readings:
 
 wbgs-jax measure --data FOLDER [--out scores.json] [--picture maps.png]
 wbgs-jax measure --data FOLDER --tx x,y,z [x,y,z ...] [--answers powers.csv]
@@ -40,43 +40,44 @@ from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_p
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 BEYOND_M = 2.0
-"""How far from readings, receivers and walls an answer still has an interval: the next room, not the next building."""
+"""Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
+the next building."""
 SUFFIXES = {"out": (".json",), "picture": (".png",), "answers": (".csv",), "mesh": (".ply",)}
 
 
 @dataclass(frozen=True)
 class Command:
-    """Learn a map of received power from readings at many places, and say how well it holds where it was not told."""
+    """Fit a map of received power to readings at many positions, and validate it on held-out rooms and squares."""
 
     data: Path | None = None
-    """Folder with readings.csv, receivers.csv and, if there is a floor plan, walls.csv (docs/measured.md)."""
+    """Folder with readings.csv, receivers.csv and, optionally, the floor plan walls.csv (docs/measured.md)."""
     floor_plan: Path | None = None
-    """Walls: a CSV file of segments x1,y1,x2,y2 or of the corners x,y of an outline; by default the one of the folder."""
+    """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
     height: float = 1.3
-    """Height of the transmitters above the floor (metres), where readings have no z."""
+    """Height of the transmitters above the floor (metres), if the readings have no z."""
     cell: float = 0.25
-    """Size of the cells (metres) over which readings are averaged."""
+    """Side of the cells (metres) over which readings are averaged."""
     out: Path | None = None
     """Write the scores to this .json file."""
     picture: Path | None = None
-    """Draw the maps of all receivers into this .png file."""
+    """Draw the maps of all receivers to this .png file."""
     tx: tuple[str, ...] = ()
-    """Transmitters, each as x,y,z in metres: what do the receivers hear?"""
+    """Transmitters, each as x,y,z in metres, for which to predict the received powers."""
     answers: Path | None = None
-    """Write what they hear to this .csv file."""
+    """Write these received powers to this .csv file."""
     ceiling: float = 2.6
-    """Height of the walls of a mesh, metres."""
+    """Height of the walls in --mesh, metres."""
     mesh: Path | None = None
     """Write the walls of the floor plan, with floor and ceiling, to this .ply file."""
 
 
 def check(command: Command) -> None:
-    """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
+    """Raises a `UserError` for an invalid or incomplete command line."""
     check_suffixes(command, SUFFIXES)
     if command.data is None and (command.floor_plan is None or command.mesh is None):
         raise UserError("give --data FOLDER with readings, or --floor-plan walls.csv --mesh walls.ply")
     if command.data is None and (command.tx or command.out or command.picture):
-        raise UserError("powers follow from readings: give --data FOLDER")
+        raise UserError("predicted powers need readings: give --data FOLDER")
     if command.answers and not command.tx:
         raise UserError("--answers needs --tx x,y,z")
     for name in ("height", "cell", "ceiling"):
@@ -86,22 +87,22 @@ def check(command: Command) -> None:
 
 
 def walls_of(command: Command) -> Walls:
-    """Returns the walls of the file that is named, else of the folder; without any, none."""
+    """Returns the walls of --floor-plan, otherwise those of the folder; none if there is no floor plan."""
     named = [command.floor_plan] if command.floor_plan else [command.data / name for name in FILES if command.data]
     path = next((path for path in named if path.exists()), None)
     if path is None and command.floor_plan:
-        raise UserError(f"there is no floor plan {command.floor_plan}")
+        raise UserError(f"floor plan {command.floor_plan} does not exist")
     return NO_WALLS if path is None else load_walls(path)
 
 
 def means(readings: Readings, size: float) -> tuple[Readings, float]:
-    """Returns means over cells, and the size of the cells: doubled until there are no more than a map can hold."""
+    """Returns means over cells and the size of the cells, which is doubled until their number is within the limit of a map."""
     cells = cell_means(readings, size)
     return (cells, size) if len(cells.places) <= MAX_PLACES else means(readings, 2 * size)
 
 
 def table(found: list[Score]) -> Table:
-    """Returns the scores for people."""
+    """Returns the scores as a table for the terminal."""
     columns = ["held out", "means", "this map", "90 % hold", *COMPARED]
     shown = Table(*columns, title="mean absolute error of the means of cells, dB")
     for score in found:
@@ -111,8 +112,8 @@ def table(found: list[Score]) -> Table:
 
 
 def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain) -> list[list[str]]:
-    """Returns a header and a row a transmitter: its place, then mean and half of the 90 % interval at every receiver; NaN for
-    an interval outside of what was measured."""
+    """Returns a header, then one row per transmitter: its position, then mean power and half width of the 90 % interval
+    for every receiver; the latter is NaN outside of the measured domain."""
     mean, std = (np.asarray(a) for a in received_power(learned, jnp.asarray(places, jnp.float32)))
     std = np.where(where.outside(places)[:, None], np.nan, std)
     names = [f"{name}_{r + 1}" for r in range(mean.shape[1]) for name in ("dbm", "within_db")]
@@ -122,7 +123,7 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain)
 
 
 def measured_domain(cells: Readings, walls: Walls) -> Domain:
-    """Returns the box around readings, receivers and walls."""
+    """Returns the measured domain: the box around readings, receivers and walls."""
     points = np.concatenate([cells.places, cells.receivers])
     low, high = points.min(0), points.max(0)
     ends = np.asarray(walls.ends).reshape(-1, 2)
@@ -132,7 +133,7 @@ def measured_domain(cells: Readings, walls: Walls) -> Domain:
 
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
-    """Returns what a results file holds."""
+    """Returns the content of a results file."""
     law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
     assert command.data is not None, "checked"
     return {

@@ -1,6 +1,6 @@
-"""Options that several commands share: words of a command line become receivers, frequencies and trained fields.
+"""Options shared by several commands: parsing of receivers and frequencies, and loading of trained fields.
 
-Free of JAX until a run is opened: `--help` and mistakes on the command line do not wait for it.
+JAX is not loaded before a run is opened, so that `--help` and errors of the command line appear at once.
 """
 
 import dataclasses
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from wbgs_jax.types import Receiver
 
 SHORTEST = 1e-3
-"""Quaternions that are shorter, or longer than its inverse, are mistakes."""
+"""Minimum length of a quaternion; the maximum is its inverse. Others are mistakes."""
 SHOWN = 12
-"""Warnings."""
+"""Maximum number of warnings printed."""
 
 
 def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:
-    """Raises a `UserError` for a file of a command line whose name ends in none of the suffixes of its option."""
+    """Raises a `UserError` if the name of an output file has none of the suffixes that its option allows."""
     for name, allowed in suffixes.items():
         path = getattr(command, name)
         if path is not None and path.suffix not in allowed:
@@ -36,7 +36,7 @@ def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:
 
 
 def parse_frequencies(ghz: Iterable[float], source: str = "--ghz") -> Float[np.ndarray, " freq"]:
-    """Returns hertz; what no field answers is a `UserError` that names where it was read."""
+    """Returns hertz; frequencies outside the band of all fields are a `UserError` whose message starts with `source`."""
     from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
     ghz = tuple(ghz)
@@ -47,8 +47,8 @@ def parse_frequencies(ghz: Iterable[float], source: str = "--ghz") -> Float[np.n
 
 
 def parse_receiver(word: str, dataset: "Dataset") -> "Receiver":
-    """Returns a receiver of the data by its number (none: the first), or another one from "x,y,z" or "x,y,z,w,i,j,k", otherwise
-    like the first; anything else is a `UserError`."""
+    """Returns a receiver of the data by its index (the first if `word` is empty), or one at "x,y,z" or "x,y,z,w,i,j,k" that
+    otherwise equals the first; anything else is a `UserError`."""
     import jax.numpy as jnp
 
     from wbgs_jax.types import LARGEST_COORDINATE_M
@@ -63,7 +63,9 @@ def parse_receiver(word: str, dataset: "Dataset") -> "Receiver":
     turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
     rotated = SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST
     if len(values) not in (3, 7) or not (np.abs(values) <= LARGEST_COORDINATE_M).all() or not rotated:
-        raise UserError(f"--rx {word[:60]} is no receiver; give a number, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion")
+        raise UserError(
+            f"--rx {word[:60]} is not a receiver; give its index, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion"
+        )
     unit = np.asarray(turn / np.linalg.norm(turn), np.float32)
     return dataclasses.replace(like, position=jnp.asarray(values[:3], jnp.float32), orientation=jnp.asarray(unit))
 
@@ -72,13 +74,13 @@ def load_field(run: Path, rx: str, lowest_hz: float | None = None, options: "Opt
     """Returns the trained field of a run folder at a receiver.
 
     Args:
-        run: the folder.
+        run: the run folder.
         rx: the receiver, as on the command line (`parse_receiver`).
-        lowest_hz: the lowest frequency of the queries, if they are known.
-        options: of some quantities.
+        lowest_hz: the lowest frequency of the queries, if available.
+        options: options of some quantities.
 
     Raises:
-        UserError: the run cannot be read, or does not hold at this receiver or frequency.
+        UserError: the run cannot be read, or the field cannot be queried at this receiver or frequency.
     """
     from wbgs_jax.inference.evaluate_quantities import LoadedField
     from wbgs_jax.inference.quantities import Options
@@ -103,8 +105,8 @@ def _check_frequency(loaded: "LoadedField", lowest_hz: float) -> None:
     if lowest_hz < (lowest := lowest_frequency(field, loaded.dataset)) * (1 - ROUNDED):
         able = " or ".join(name for name in field_names() if "paths" in get_field(name).outputs)
         raise UserError(
-            f"the {field.name} field of this run answers from {lowest / 1e9:g} GHz on, not at {lowest_hz / 1e9:g} GHz; "
-            f"below, only fields with paths do: train --field {able} on data with a mesh"
+            f"the {field.name} field of this run can be queried from {lowest / 1e9:g} GHz upwards, not at "
+            f"{lowest_hz / 1e9:g} GHz; only fields with paths extend below: train --field {able} on data with a mesh"
         )
 
 
@@ -115,9 +117,9 @@ def warn(
     frequencies_hz: Float[np.ndarray, " freq"],
     most: int = SHOWN,
 ) -> None:
-    """Prints why some answers should not be trusted, at most so many lines."""
+    """Prints at most `most` warnings about unreliable predictions."""
     lines = domain.warnings(np.asarray(rx), tx_positions, frequencies_hz)
     for line in lines[:most]:
         say(f"warning: {line}")
     if len(lines) > most:
-        say(f"warning: and {len(lines) - most} more like these")
+        say(f"warning: and {len(lines) - most} more of this kind")

@@ -1,4 +1,4 @@
-"""Ask a trained field for spectra or channels, or export it:
+"""Predict spectra or channel quantities with a trained field, or export it:
 
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
 wbgs-jax predict --run RUN --line 0,0,1.5:4,0,1.5:41 --ghz 28 --what power --out line.csv --picture line.png
@@ -31,7 +31,7 @@ from wbgs_jax.inference.quantities import QUANTITIES, Options, names_for
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.inference.results_file import Answers, open_parts
 
-# What takes JAX is imported where it is wanted: `--help` and mistakes on the command line should not wait for it.
+# Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
 
 if TYPE_CHECKING:
     from wbgs_jax.inference.cached_field import CachedField
@@ -43,54 +43,55 @@ else:
 
 MOST_POINTS = 4096
 BLOCK = 256
-"""Queries that are answered, and kept, at a time."""
+"""Number of queries predicted and stored at a time."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Ask a trained field for the spectra of transmitters, or export it."""
+    """Predict spectra or channel quantities with a trained field, or export it."""
 
     run: Path
     """Run folder."""
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
     line: str = ""
-    """Transmitters on a line: 0,0,1.5:4,0,1.5:41 (from:to:number)."""
+    """Transmitters on a line from:to:number, 0,0,1.5:4,0,1.5:41."""
     grid: str = ""
-    """Transmitters on a grid: -2,-2,1.5:2,2,1.5:9x9x1."""
+    """Transmitters on a grid, such as -2,-2,1.5:2,2,1.5:9x9x1."""
     ghz: tuple[float, ...] = ()
-    """Frequencies, 1 to 100 (from 0.3 with paths), all for each."""
+    """Frequencies for every transmitter, 1 to 100; from 0.3 for fields that predict paths."""
     sweep: str = ""
-    """Frequencies at equal ratios: 1:100:50."""
+    """Frequencies with equal ratios from:to:number, 1:100:50."""
     queries: Path | None = None
-    """A CSV file instead, columns x,y,z,ghz."""
+    """Instead: a CSV file of queries with columns x,y,z,ghz."""
     rx: str = ""
-    """Another receiver than the first of the data: the number of one; x,y,z in metres; or x,y,z,w,i,j,k with the quaternion
-    that turns its array into the world frame. Only fields with paths know places that the data do not have."""
+    """Receiver, by default the first of the data: its index; x,y,z in metres; or
+    x,y,z,w,i,j,k with a quaternion (wxyz) that rotates its array into the
+    world frame. New receivers need a field with paths."""
     what: What = "spectra"
-    """What to ask for: power angular spectra, or quantities of the channel, which only some fields know."""
+    """Quantity to predict: power angular spectra, or one that only some fields provide."""
     tx_velocity: str = "0,0,0"
-    """Of transmitters, metres a second: Doppler shifts of paths follow from it."""
+    """Velocity of the transmitters, metres per second, for Doppler shifts of paths."""
     rx_velocity: str = "0,0,0"
-    """Of the receiver."""
+    """Velocity of the receiver."""
     band_mhz: float = 100.0
-    """Width of the band of a frequency response ..."""
+    """Bandwidth of a frequency response ..."""
     points: int = 64
-    """... and frequencies in it."""
+    """... and its number of frequencies."""
     tx_array: str = "1x1"
-    """Of a MIMO matrix: ROWSxCOLUMNS elements half a wavelength apart, in the y-z plane of the world."""
+    """Transmitter array of a MIMO matrix, ROWSxCOLUMNS, half-wavelength spacing, in the world's y-z plane."""
     out: Path | None = None
-    """Write the answers to this .npz file, or to a .csv file: what is a number a query, and tables of paths."""
+    """Write the predictions to this .npz file or, if they are single numbers or paths, .csv file."""
     resume: bool = False
-    """Go on where the same command was interrupted."""
+    """Continue the same command after an interruption."""
     picture: Path | None = None
-    """Draw them into this .png file: 12 spectra, or curves."""
+    """Draw them to this .png file: up to 12 spectra, or curves."""
     export: Path | None = None
-    """Write the field to this .zip file, which runs without its training code (docs/inference.md)."""
+    """Write the field to this .zip file, which runs without the model's code (docs/inference.md)."""
 
 
 def check(command: Command) -> None:
-    """Raises a `UserError` for a command line that asks for nothing, or for half of something."""
+    """Raises a `UserError` for an invalid or incomplete command line."""
     form = QUANTITIES[command.what].form
     out = (".npz",) if form == "array" else (".npz", ".csv")
     check_suffixes(command, {"out": out, "picture": (".png",), "export": (".zip",)})
@@ -100,7 +101,7 @@ def check(command: Command) -> None:
     if not (asks or writes or command.export):
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
     if (asks or writes) and not (places and bands and writes):
-        raise UserError("answers need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
+        raise UserError("predictions need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
     for several in (places, bands):
         if len(several) > 1:
             raise UserError(f"--{several[0]} and --{several[1]} exclude each other; give one of them")
@@ -108,14 +109,16 @@ def check(command: Command) -> None:
         parse_vector(word, f"--{name}-velocity")
     parsing.parse_array(command.tx_array)
     if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
-        raise UserError(f"--band-mhz {command.band_mhz:g} --points {command.points} is no band; give 2 to {MOST_POINTS} points")
+        raise UserError(
+            f"--band-mhz {command.band_mhz:g} --points {command.points} is not a band; give 2 to {MOST_POINTS} points"
+        )
     drawn = command.what == "spectra" or form == "scalar"
     if not drawn and (command.picture or (asks and not command.out)):
-        raise UserError(f"--what {command.what} writes numbers: give --out channel.npz, and no --picture")
+        raise UserError(f"--what {command.what} cannot be drawn; give --out channel.npz, and no --picture")
 
 
 def queries_of(command: Command) -> Queries:
-    """Returns the queries; frequencies that no field answers are a `UserError`."""
+    """Returns the queries; frequencies outside the band of all fields are a `UserError`."""
     if command.queries:
         positions, ghz = parsing.read_queries(command.queries)
         return Queries(positions, parse_frequencies(ghz, str(command.queries)), paired=True)
@@ -130,7 +133,7 @@ def queries_of(command: Command) -> Queries:
 
 
 def lowest_queried(command: Command, queries: Queries) -> float:
-    """Returns the lowest frequency (hertz) that of the queries; a band that reaches beyond the model's is a `UserError`."""
+    """Returns the lowest frequency (hertz) of the queries with their band; a band beyond the valid range is a `UserError`."""
     from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
     half = 0.5e6 * command.band_mhz if command.what == "frequency-response" else 0.0
@@ -138,7 +141,7 @@ def lowest_queried(command: Command, queries: Queries) -> float:
     if lowest < LOWEST_OF_PATHS_HZ or highest > MAX_FREQUENCY_HZ:
         edge = lowest if lowest < LOWEST_OF_PATHS_HZ else highest
         span = f"{LOWEST_OF_PATHS_HZ / 1e9:g} to {MAX_FREQUENCY_HZ / 1e9:g} GHz"
-        raise UserError(f"--band-mhz {2e-6 * half:g} reaches {edge / 1e9:g} GHz; the model knows {span}")
+        raise UserError(f"--band-mhz {2e-6 * half:g} reaches {edge / 1e9:g} GHz; the valid range is {span}")
     return lowest
 
 
@@ -160,7 +163,7 @@ def _export(command: Command) -> None:
 
 
 def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField":
-    """Returns the field that answers the queries. The first command leaves it ready for those that follow."""
+    """Returns the field for the queries, from the cache if an earlier command stored it there."""
     from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
 
     lowest, few = lowest_queried(command, queries), len(queries) <= MOST
@@ -181,8 +184,8 @@ def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField
 
 
 def answer_blocks(command: Command, queries: Queries, field: "CachedField | LoadedField") -> Answers:
-    """Returns the answers to all queries, block by block; those of several blocks are kept in a folder until they are written.
-    Ctrl-C leaves them there."""
+    """Returns the predictions for all queries in blocks. Several blocks are stored in a folder until the result file is
+    written, and remain there after Ctrl-C."""
     blocks = queries.blocks(BLOCK)
     target = command.out or command.picture
     assert target is not None, "checked"
@@ -190,20 +193,20 @@ def answer_blocks(command: Command, queries: Queries, field: "CachedField | Load
         return Answers([field.answer(command.what, blocks[0])])
     parts = open_parts(target, _question(command, queries, field.source), command.resume)
     if len(parts):
-        say(f"going on after {len(parts)} of {len(blocks)} blocks of {BLOCK} queries")
+        say(f"continuing after {len(parts)} of {len(blocks)} blocks of {BLOCK} queries")
     try:
         with CountProgress(f"{command.what}, blocks of {BLOCK}", len(blocks), len(parts)) as progress:
             for block in blocks[len(parts) :]:
                 parts.add(field.answer(command.what, block))
                 progress.advance()
     except KeyboardInterrupt:
-        say(f"{len(parts)} of {len(blocks)} blocks are kept in {parts.folder}; the same command with --resume goes on")
+        say(f"{len(parts)} of {len(blocks)} blocks are kept in {parts.folder}; add --resume to the command to continue")
         raise
     return parts
 
 
 def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dict[str, Any]:
-    """Returns what a resumed command must have in common with the one that it resumes."""
+    """Returns the settings that must be the same in a resumed command."""
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
@@ -211,9 +214,9 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
 
 
 def answer(command: Command, queries: Queries) -> None:
-    """Answers the queries, and writes what is wanted."""
+    """Predicts for the queries and writes the requested files."""
     if command.what == "spectra" and command.out is None:
-        queries = queries.some(shown_rows(len(queries)))  # no others are drawn
+        queries = queries.some(shown_rows(len(queries)))  # only these are drawn
     field = open_field(command, queries)
     positions, frequencies = queries.tx_positions, queries.frequencies_hz
     if queries.paired:
@@ -226,7 +229,7 @@ def answer(command: Command, queries: Queries) -> None:
     if not queries.paired:
         count = f"{len(queries.tx_positions)} transmitters at {len(queries.frequencies_hz)} frequencies"
     if command.out:
-        replaced = ", in the place of another file" if command.out.exists() else ""
+        replaced = ", replacing the previous file" if command.out.exists() else ""
         results_file.write(command.out, command.what, answers, queries, field.source)
         say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
@@ -236,8 +239,8 @@ def answer(command: Command, queries: Queries) -> None:
 
 
 def write_picture(path: Path, what: str, answers: Answers, queries: Queries) -> None:
-    """Draws spectra, or curves of the quantity."""
-    from wbgs_jax.plotting import draw_answers, draw_sweeps  # here: Matplotlib takes a while to load
+    """Draws spectra, or curves of a scalar quantity."""
+    from wbgs_jax.plotting import draw_answers, draw_sweeps  # imported here because Matplotlib takes a while to load
 
     name = answers.names()[0]
     if what == "spectra":

@@ -1,4 +1,4 @@
-"""Train a field: `wbgs-jax train --scene 1`, `--data FOLDER`, `--preset smoke|cpu|gpu`, `--resume`, `--help`."""
+"""Train a field: `wbgs-jax train --scene 1|--data FOLDER [--preset smoke|cpu|gpu] [--resume]`."""
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
@@ -44,52 +44,52 @@ PROGRAM = "wbgs-jax train"
 
 @dataclass(frozen=True)
 class Command:
-    """Train a radiance field on the spectra of one scene, and leave it in a run folder."""
+    """Train a radiance field on the observations of one scene, and store it in a run folder."""
 
     scene: str | None = None
-    """Released scene (1, 2, ...) or a scene file (.npz); several of one room, seen by different receivers, as A,B."""
+    """Released scene (1, 2, ...) or scene file (.npz); several with different receivers in one room as A,B."""
     data: str | None = None
-    """Folder of the published layout, instead of --scene."""
+    """Instead: a folder of the published layout (docs/formats.md)."""
     out: Path | None = None
-    """Run folder; the default names scene, field, preset and seed under runs/."""
+    """Run folder; by default runs/SCENE-FIELD-PRESET-seedSEED."""
     field: str = dataclasses.field(default_factory=default_field)
-    """The model."""
+    """Model to train (docs/which_field.md)."""
     preset: str = "cpu"
-    """smoke (about a minute), cpu (the default without a GPU), gpu, or paper (of the wideband field: the paper's form)."""
+    """Size: smoke (about a minute), cpu (default without a GPU), gpu, or paper (wideband field only: as published)."""
     seed: int = 0
-    """Seed of everything that is drawn at random."""
+    """Seed of all random numbers."""
     resume: bool = False
-    """Go on from the run folder's newest checkpoint, if any."""
+    """Continue from the run folder's newest checkpoint, if any."""
     frequency_ghz: float | None = None
-    """Frequency of a folder that says none."""
+    """Frequency of a folder that does not record it."""
     convention: ConventionName | None = None
-    """Of a folder's rows, where it names none."""
+    """Order of the rows of a folder's images, if not recorded."""
     train_ghz: tuple[float, ...] = ()
-    """Train at these frequencies, test at the others."""
+    """Train only at these frequencies, and test at the others."""
     train_tx: int = 0
-    """Train with this number of transmitters; 0: all that are not held out."""
+    """Number of training transmitters; 0: all not held out."""
     validation: float = VALIDATION
-    """Share of the training transmitters by which choices are made; 0: none."""
+    """Fraction of the training transmitters held out for validation; 0: none."""
     test_box: tuple[float, ...] = ()
-    """Test at all transmitters in a box (lowest and highest corner, metres), train at the others."""
+    """Test on the transmitters in a box (lowest and highest corner, metres), and train on the others."""
     receiver: int | None = None
-    """Look at this receiver alone."""
+    """Use only the receiver with this index."""
     neighbours: bool = True
-    """Use known spectra nearby, where that gains."""
+    """Correct predictions by measured spectra nearby, if that improves the validation score."""
     devices: int = 0
-    """Devices that share every batch; 0: all (docs/scaling.md)."""
+    """Number of devices to use; 0: all (docs/scaling.md)."""
     distributed: bool = False
-    """One of several processes (docs/scaling.md)."""
+    """Run as one of several processes (docs/scaling.md)."""
 
 
 def default_preset() -> str:
-    """Returns `gpu` where JAX finds one, else `cpu`."""
+    """Returns `gpu` if JAX finds one, otherwise `cpu`."""
     return "gpu" if jax.default_backend() == "gpu" else "cpu"
 
 
 def parse(arguments: list[str]) -> tuple[Command, Settings]:
-    """Returns the command and its settings. Field and preset are looked at first: they say which settings there are, and their
-    defaults. `--help` lists the command's options, `--help-settings` those of the field too."""
+    """Returns the command and its settings. Field and preset are read first, because they determine the settings and their
+    defaults. `--help` lists the options of the command, `--help-settings` also those of the field."""
     field = option_value(arguments, "--field", default_field())
     preset = option_value(arguments, "--preset", default_preset())
     kind = get_field(field)
@@ -113,7 +113,7 @@ def parse(arguments: list[str]) -> tuple[Command, Settings]:
 
 
 def _with_settings(parts: dict[str, Any]) -> type[Command]:
-    """Returns the command's type with the sections of settings as further options, --SECTION.NAME."""
+    """Returns the type of the command with the sections of settings as additional options, --SECTION.NAME."""
     fields = [
         (name, Annotated[type(part), tyro.conf.arg(help="")], dataclasses.field(default=part)) for name, part in parts.items()
     ]
@@ -123,11 +123,13 @@ def _with_settings(parts: dict[str, Any]) -> type[Command]:
 
 
 def run_config(command: Command, settings: Settings) -> RunConfig:
-    """Returns what determines the run, checked before any work is done."""
+    """Returns the configuration of the run, checked before any work is done."""
     if (command.scene is None) == (command.data is None):
         raise UserError("give either --scene (1, 2, ... or a .npz file) or --data (a folder of spectra)")
     if not 0 <= command.validation < 1:
-        raise UserError(f"--validation is {command.validation}; it is a share of the training transmitters, 0 to 1")
+        raise UserError(
+            f"--validation is {command.validation}; give a fraction of the training transmitters, at least 0 and below 1"
+        )
     if len(command.test_box) not in (0, 6):
         raise UserError(
             f"--test-box has {len(command.test_box)} numbers; give six: x y z of the lowest corner, then of the highest"
@@ -138,9 +140,9 @@ def run_config(command: Command, settings: Settings) -> RunConfig:
     words, released = source_names(str(source)), released_scenes() if command.data is None else {}
     names = [str(Path(word).resolve()) if word not in released and Path(word).exists() else word for word in words]
     if command.frequency_ghz is not None and not any(Path(name).is_dir() for name in names):
-        raise UserError(f"--frequency-ghz is for folders that do not say; {source} does, or does not exist")
+        raise UserError(f"--frequency-ghz is for folders that do not record it; {source} is not a folder, or does not exist")
     if command.convention is not None and not any(Path(name).is_dir() for name in names):
-        raise UserError(f"--convention is for folders of spectra; {source} is none")
+        raise UserError(f"--convention is for folders of spectra, and {source} is not one")
     return RunConfig(
         source=",".join(names),
         field=command.field,
@@ -167,7 +169,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     use_compilation_cache()
     arguments = sys.argv[1:] if arguments is None else arguments
-    if "--distributed" in arguments:  # before JAX looks for devices, for which `parse` asks
+    if "--distributed" in arguments:  # before `parse`, which makes JAX look for devices
         connect()
     command, settings = parse(arguments)
     config = run_config(command, settings)
@@ -183,38 +185,38 @@ def main(arguments: list[str] | None = None) -> None:
         by_first(lambda: stack.enter_context(locked(folder)))
         steps = checkpoint_steps(folder / "checkpoints")
         if steps:
-            tell(f"going on from the checkpoint of step {steps[-1]}")
+            tell(f"continuing from the checkpoint of step {steps[-1]}")
         total = limited(config.settings, dataset, get_field(config.field)).optim.steps
         for line in opening_lines(folder, config, total, steps[-1] if steps else 0):
             tell(line)
         try:
             result = train(dataset, config.field, config.settings, config.seed, folder, command.resume, command.devices)
             by_first(lambda: learn_beside(result, dataset, config, folder, command.devices))
-        except KeyboardInterrupt:  # in the last epoch or behind it, or a second time
-            raise Interrupted("stopped; run the same command with --resume to go on") from None
+        except KeyboardInterrupt:  # in the last epoch, after it, or for the second time
+            raise Interrupted("stopped; run the same command with --resume to continue") from None
         by_first(lambda: write_manifest(folder, load_trained(folder)))
     tell(summary(result, folder))
-    tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and pictures)")
+    tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and figures)")
 
 
 def _nothing(line: str) -> None:
-    """Keeps a line to itself."""
+    """Ignores a line, on all processes but the first."""
 
 
 def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> list[str]:
-    """Returns how long it will take if so many of the steps are done, and where the results go."""
+    """Returns lines with the expected duration of the remaining steps, `done` being complete, and the results folder."""
     field = get_field(config.field)
     share = max(steps - done, 0) / field.presets[config.preset].optim.steps
     seconds = expected_seconds(field, config.preset, share)
-    lasts = "how long it takes stands in the lines below" if seconds is None else f"{duration_words(seconds)} on this machine"
+    lasts = "the lines below show the remaining time" if seconds is None else f"{duration_words(seconds)} on this machine"
     return [
-        f"{max(steps - done, 0)} steps, {lasts}; Ctrl-C stops it, and the same command with --resume goes on",
+        f"{max(steps - done, 0)} steps, {lasts}; Ctrl-C stops it, and the same command with --resume continues it",
         f"results: {folder} (checkpoints, curves in metrics.jsonl)",
     ]
 
 
 def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folder: Path, devices: int) -> None:
-    """Leaves what goes with a trained field: known spectra beside it, and how sure it is."""
+    """Fits and writes the corrections by measured spectra and the prediction intervals of a trained field."""
     trained = result.field, result.params, dataset
     if config.neighbours and is_few(dataset):
         few = learn_few(*trained, Training(config.field, config.settings, result.steps, config.seed, folder, devices), say)
@@ -231,7 +233,7 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
 
 
 def summary(result: TrainResult, folder: Path) -> str:
-    """Returns one line for the end."""
+    """Returns the last line of a training."""
     sizes = ", ".join(f"{count} {name}" for name, count in result.sizes.items())
     return f"trained {result.steps} steps in {result.seconds:.0f} s, {sizes}, {result.compilations} compilations: {folder}"
 

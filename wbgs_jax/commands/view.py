@@ -1,4 +1,4 @@
-"""Look at a trained field in a browser:
+"""Show a trained field in a browser:
 
 wbgs-jax view --run RUN [--port 8080]
 wbgs-jax view --run RUN --html scene.html --tx x,y,z --ghz 28      a page that opens without Python
@@ -29,32 +29,32 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 @dataclass(frozen=True)
 class Command:
-    """Look at a trained field in a browser: the room, a transmitter to drag, what the receiver sees, paths, maps, materials."""
+    """Show a trained field in a browser: room, movable transmitter, received spectrum, paths, power maps and materials."""
 
     run: Path
     """Run folder."""
     host: str = "localhost"
-    """Address to listen on; localhost is this machine alone. Whoever reaches another one sees the field, without a password."""
+    """Address to listen on; localhost: this machine only. There is no password: everyone who reaches the address has access."""
     port: int = 8080
-    """Port to listen on; another one is taken where it is in use."""
+    """Port to listen on; if it is in use, another one is chosen."""
     rx: str = ""
-    """Another receiver than the first of the data: the number of one of them, x,y,z in metres, or x,y,z,w,i,j,k with the
-    quaternion that turns its array into the world frame."""
+    """Receiver, by default the first of the data: its index, x,y,z in metres, or
+    x,y,z,w,i,j,k with a quaternion (wxyz) that rotates its array into the world frame."""
     tx: str = ""
-    """Where the transmitter stands at first, x,y,z in metres."""
+    """Initial position of the transmitter, x,y,z in metres."""
     ghz: float | None = None
-    """The frequency at first."""
+    """Initial frequency."""
     up: Literal["x", "y", "z"] = "z"
-    """Which axis of the data points upwards; the published layout has y."""
+    """Axis of the data that points upwards; y in the published layout."""
     html: Path | None = None
-    """Write what is seen to this .html file, which opens without Python, and end."""
+    """Write the view to this .html file, which opens without Python, and exit."""
 
 
 def check(command: Command) -> None:
-    """Raises a `UserError` for a command line that cannot work."""
+    """Raises a `UserError` for an invalid command line, or if viser is not installed."""
     check_suffixes(command, {"html": (".html",)})
     if not 0 <= command.port <= 65535:
-        raise UserError(f"--port {command.port} is no port; give a number from 1 to 65535")
+        raise UserError(f"--port {command.port} is not a port; give a number from 1 to 65535")
     try:
         import viser  # noqa: F401
     except ImportError as error:
@@ -62,7 +62,7 @@ def check(command: Command) -> None:
 
 
 def start(command: Command) -> "Viewer":
-    """Returns the viewer that a command line asks for."""
+    """Returns the running viewer, set up as on the command line."""
     from wbgs_jax.viewer.app import Viewer
     from wbgs_jax.viewer.session import Asker
 
@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     check(command)
     check_writable(command.html)
     if command.html:
-        say(f"drawing what {command.run} sees ...")
+        say(f"drawing the predictions of {command.run} ...")
     viewer = start(command)
     if command.html:
         viewer.wait()
@@ -92,9 +92,11 @@ def main(arguments: list[str] | None = None) -> None:
         viewer.stop()
         return
     where = "localhost" if command.host in LOCAL else command.host
-    say(f"viewer: http://{where}:{viewer.port} (Ctrl-C ends it)")
+    say(f"viewer: http://{where}:{viewer.port} (Ctrl-C stops it)")
     if command.host not in LOCAL:
-        say(f"note: whoever reaches {command.host} can look at this field; --host localhost keeps it on this machine")
+        say(
+            f"note: everyone who reaches {command.host} has access to the viewer; --host localhost restricts it to this machine"
+        )
     try:
         while True:
             time.sleep(3600)

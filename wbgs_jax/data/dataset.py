@@ -56,7 +56,7 @@ class Dataset(Observed):
     """Indices of the links used to choose between settings; may be empty."""
     test: Int[np.ndarray, " n_test"]
     observations: HostObservations
-    """What was observed, of exactly one kind: `{"snapshots": ...}`, `{"pas": ...}` or `{"power_db": ...}`, say."""
+    """Observations of exactly one kind, such as `{"snapshots": ...}`, `{"pas": ...}` or `{"power_db": ...}`."""
     vertices: Float[np.ndarray, "vertices 3"] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     """The scene's surfaces in the world frame, metres, float32; empty without a mesh."""
     faces: Int[np.ndarray, "faces 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
@@ -81,7 +81,7 @@ class Dataset(Observed):
 
     @property
     def observed(self) -> Kind:
-        """The kind of its observations."""
+        """Kind of the observations."""
         return only_kind(self.observations, self.name)
 
     @property
@@ -112,11 +112,13 @@ class Dataset(Observed):
         """Returns the observed power angular spectra (float32, maximum 1) of links.
 
         Raises:
-            UserError: what was observed has no spectrum, as received powers have none.
+            UserError: the observations have no spectrum, such as received powers.
         """
         kind = self.observed
         if kind.to_spectra is None:
-            raise UserError(f"{self.name} holds {kind.words}, which have no angular spectrum; give a scene that has one")
+            raise UserError(
+                f"{self.name} contains {kind.words}, which have no angular spectrum; give a scene with spectra or snapshots"
+            )
         values = self.observations[kind.name][index]
         if not kind.needs_array:
             return kind.to_spectra(values, None, None)
@@ -130,7 +132,7 @@ class Dataset(Observed):
         return jnp.asarray(spectra)
 
     def eight_bit(self, index: Int[np.ndarray, " b"]) -> UInt8[np.ndarray, "b 90 360"]:
-        """Returns the observed spectra of some links in bytes, as published data have them; raises what `pas` raises."""
+        """Returns the observed spectra of links as bytes, as in published data; raises the same errors as `pas`."""
         if self.has("pas"):
             return self.observations["pas"][index]
         blocks = [index[start : start + AT_ONCE] for start in range(0, len(index), AT_ONCE)]
@@ -142,8 +144,8 @@ class Dataset(Observed):
         return np.asarray(self.receivers.position, np.float64)[self.receiver_index[index]]
 
     def received_db(self, index: Int[np.ndarray, " b"]) -> Float[np.ndarray, " b"] | None:
-        """Returns the received power of some links (dB, relative to the transmitted power), observed or of the snapshots; None
-        where spectra alone are known, which have no scale."""
+        """Returns the received power of links (dB, relative to the transmitted power), observed or computed from snapshots;
+        None for spectra, which have no scale."""
         kind = self.observed
         return None if kind.to_power is None else np.asarray(kind.to_power(self.observations[kind.name][index]))
 
@@ -157,7 +159,7 @@ class Dataset(Observed):
 
 NAMES = ("name", "convention")
 RENAMED = {"pas": "images"}
-"""Kinds of observation that checksums call otherwise: those of old run folders stay valid."""
+"""Kinds of observation with another name in checksums, so that those of old run folders remain valid."""
 
 
 def checksum(dataset: Dataset) -> str:

@@ -70,7 +70,7 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
 def _check_compatible(first: Dataset, other: Dataset) -> None:
     where = f"{first.name} and {other.name} cannot be joined"
     if first.observed != other.observed:
-        raise UserError(f"{where}: one holds {first.observed.words} and the other {other.observed.words}")
+        raise UserError(f"{where}: one contains {first.observed.words}, the other {other.observed.words}")
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
         raise UserError(f"{where}: their arrays differ in the number or unit of their elements")

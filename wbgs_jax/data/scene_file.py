@@ -57,7 +57,7 @@ def check_arrays(arrays: dict[str, np.ndarray], where: str) -> dict[str, np.ndar
         kind = _kind(arrays)
         specs = {kind.name: (kind.dtype, ("tx", "rx", "freq", *kind.axes)), **ARRAYS}
         sizes = _sizes(arrays, specs)
-        _demand(all(sizes[axis] > 0 for axis in ("tx", "rx", "freq", "elements")), "there is no link in it")
+        _demand(all(sizes[axis] > 0 for axis in ("tx", "rx", "freq", "elements")), "it contains no links")
         _check_values(arrays, kind, sizes["vertices"])
         _check_texts(arrays, sizes["rx"])
         cast = _cast(arrays, specs)
@@ -99,9 +99,9 @@ def _demand(ok: bool | np.bool_, what: str) -> None:
 
 
 def _kind(arrays: dict[str, np.ndarray]) -> Kind:
-    """Returns the kind of the observations; nothing that a scene needs is missing."""
+    """Returns the kind of the observations, after checking that all required arrays exist."""
     missing = [key for key in (*ARRAYS, *TEXTS) if key not in arrays]
-    _demand(not missing, f"it is no scene, it lacks {', '.join(missing)}")
+    _demand(not missing, f"it is not a scene: it lacks {', '.join(missing)}")
     try:
         return only_kind(arrays, "it")
     except ValueError as error:
@@ -171,7 +171,7 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The content of a scene file; observations are of one kind alone: `snapshots`, `pas`, `power_db`, or one of `others`."""
+    """The content of a scene file. It has observations of one kind: `snapshots`, `pas`, `power_db`, or one of `others`."""
 
     name: str
     tx_positions: Float[np.ndarray, "tx 3"]
@@ -194,9 +194,9 @@ class SceneFile:
     pas: UInt8[np.ndarray, "tx rx freq 90 360"] | None = None
     """Power angular spectra times 255."""
     power_db: Float[np.ndarray, "tx rx freq"] | None = None
-    """float32: received power relative to the transmitted power, dB; NaN where a receiver does not hear a transmitter."""
+    """float32: received power relative to the transmitted power, dB; NaN if nothing was received."""
     others: HostObservations = field(default_factory=dict)
-    """Observations (tx, rx, freq, ...) of a kind that has no field here, by its name."""
+    """Observations (tx, rx, freq, ...) of a kind without an attribute here, by its name."""
     element_unit: ElementUnit = "wavelengths"
     """Unit of `element_positions`: "metres" for an array of fixed size."""
     element_pattern: str | tuple[str, ...] = ""
@@ -205,7 +205,7 @@ class SceneFile:
 
     @property
     def observations(self) -> HostObservations:
-        """What was observed, by kind: arrays (tx, rx, freq, ...)."""
+        """Observations by kind: arrays (tx, rx, freq, ...)."""
         named = {name: getattr(self, name) for name in BY_KEYWORD}
         return {name: values for name, values in named.items() if values is not None} | self.others
 

@@ -38,7 +38,7 @@ def _commit() -> str | None:
 
 
 def provenance(trained: TrainedField) -> dict[str, Any]:
-    """Returns where the figures of a trained field come from."""
+    """Returns the provenance of the figures of a trained field."""
     return environment() | {
         "command": "wbgs-jax train " + shlex.join(_training_arguments(trained.config)),
         "preset": trained.config.preset,

@@ -1,13 +1,12 @@
-"""How good a trained field is on held-out links: figures of every kind that field and data have, beside the baselines.
+"""Scores of a trained field on held-out links, compared with baselines, for every kind of output that field and data have.
 
-How well the tracer of the released scenes repeats itself: beyond that no score can be told from the truth.
+Besides the accuracy of spectra, snapshots and received powers, the report has
 
-Spectra of some transmitters, traced again with three times the rays (`python -m data_gen.repeatability`).
-
-Whether a field knows how good it is: intervals that hold what they promise, and scores that rise when doubtful answers are
-left out.
-
-How good predicted received powers are, beside what free space and the nearest transmitter say.
+* the repeatability of the released scenes: spectra of some transmitters, traced again with three times the rays
+  (`python -m data_gen.repeatability`). It is the highest meaningful score;
+* the calibration of the prediction intervals: their coverage, and scores as a function of the fraction of predictions kept, the
+  most certain ones first;
+* received powers compared with free space and the nearest training transmitter.
 """
 
 import dataclasses
@@ -43,30 +42,42 @@ FILE = "repeatability.json"
 
 
 def repeatability(scene: str, ghz: Iterable[float]) -> float | None:
-    """Returns the truth's median SSIM to itself in a released scene (`scene4`), averaged over frequencies (GHz); None where it
-    is not known for all of them."""
-    known = read_json(RELEASED / FILE).get(scene, {}).get("median_ssim", {})
+    """Returns the median SSIM of a released scene (`scene4`) with itself, averaged over frequencies (GHz); None unless it is
+    available for all of them."""
+    recorded = read_json(RELEASED / FILE).get(scene, {}).get("median_ssim", {})
     names = [f"{f:g}" for f in ghz]
-    return float(np.mean([known[name] for name in names])) if names and all(name in known for name in names) else None
+    return float(np.mean([recorded[name] for name in names])) if names and all(name in recorded for name in names) else None
 
 
 COVERAGES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.1)
-"""Shares of the answers, the surest ones, whose mean score is reported."""
+"""Fractions of the predictions, the most certain ones first, whose mean score is reported."""
 
 
 def calibration(expected: Expected, scores: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
-    """Returns how the expected SSIM of answers compares with what they scored: `coverage` of the intervals and their mean
-    `width`, the mean `expected` and true `scored` SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the
-    mean SSIM of the surest share."""
+    """Returns a comparison of expected and actual SSIM: `coverage` of the intervals and their mean `width`, the mean `expected`
+    and actual (`scored`) SSIM, their rank `correlation` (Spearman), and the `risk_coverage` curve: the mean SSIM of the most
+    certain fractions.
+
+    Args:
+        expected: expectation and interval of every prediction.
+        scores: actual SSIM.
+        level: nominal coverage of the intervals.
+    """
     expectation, low, high = (np.asarray(values, np.float64) for values in expected)
-    held = (low <= scores) & (scores <= high)
-    return _figures(expectation, scores, -expectation, held, level) | {"width": float(np.mean(np.minimum(high, 1) - low))}
+    covered = (low <= scores) & (scores <= high)
+    return _figures(expectation, scores, -expectation, covered, level) | {"width": float(np.mean(np.minimum(high, 1) - low))}
 
 
 def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"], level: float) -> dict[str, Any]:
-    """Returns how the expected errors of received powers compare with the true absolute ones (dB): `coverage` of what they were
-    to stay within, its mean `within_db`, the mean `expected` and true `scored` error, their rank `correlation`, and the
-    `risk_coverage` curve: the mean error of the surest share."""
+    """Returns a comparison of expected and actual absolute errors of received powers (dB): `coverage` of the error bounds and
+    their mean `within_db`, the mean `expected` and actual (`scored`) error, their rank `correlation`, and the `risk_coverage`
+    curve: the mean error of the most certain fractions.
+
+    Args:
+        expected: expected error and error bound of every prediction.
+        errors_db: actual absolute errors.
+        level: nominal coverage of the bounds.
+    """
     expectation, within = (np.asarray(values, np.float64) for values in expected)
     return _figures(expectation, errors_db, expectation, errors_db <= within, level) | {"within_db": float(within.mean())}
 
@@ -74,27 +85,27 @@ def power_calibration(expected: ExpectedPower, errors_db: Float[np.ndarray, " n"
 def _figures(
     expectation: Float[np.ndarray, " n"],
     truth: Float[np.ndarray, " n"],
-    doubt: Float[np.ndarray, " n"],
-    held: Bool[np.ndarray, " n"],
+    uncertainty: Float[np.ndarray, " n"],
+    covered: Bool[np.ndarray, " n"],
     level: float,
 ) -> dict[str, Any]:
-    """Returns what both have in common; `doubt` orders the answers, the surest first, and those of equal doubt count as their
-    mean."""
-    ranks, equal = np.unique(doubt, return_inverse=True)
+    """Returns the figures common to both. `uncertainty` orders the predictions; scores of predictions with equal uncertainty
+    are replaced by their mean."""
+    ranks, equal = np.unique(uncertainty, return_inverse=True)
     means = np.bincount(equal, truth, len(ranks)) / np.bincount(equal, minlength=len(ranks))
-    surest = means[np.sort(equal)]
+    most_certain = means[np.sort(equal)]
     return {
         "level": round(level, 4),
-        "coverage": float(held.mean()),
+        "coverage": float(covered.mean()),
         "expected": float(expectation.mean()),
         "scored": float(truth.mean()),
         "correlation": _rank_correlation(expectation, truth),
-        "risk_coverage": {f"{share:g}": float(surest[: max(1, round(share * len(truth)))].mean()) for share in COVERAGES},
+        "risk_coverage": {f"{share:g}": float(most_certain[: max(1, round(share * len(truth)))].mean()) for share in COVERAGES},
     }
 
 
 def _rank_correlation(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> float:
-    """Returns Spearman's; 0 where one of both is constant."""
+    """Returns Spearman's rank correlation; 0 if one of the arguments is constant."""
     ranks = [rankdata(values) for values in (a, b)]
     return float(np.corrcoef(*ranks)[0, 1]) if min(map(np.ptp, ranks)) > 0 else 0.0
 
@@ -106,23 +117,23 @@ def score_power(
     and the same in per_frequency, a list by ascending frequency_ghz.
 
     Raises:
-        UserError: there is no link, or a prediction is NaN or infinite.
+        UserError: there are no links, or a prediction is NaN or infinite.
     """
     if len(predicted) == 0:
-        raise UserError("there is no link to score; choose a split or frequencies with at least one test link")
+        raise UserError("there are no links to score; choose a split or frequencies with at least one test link")
     error = np.abs(predicted.astype(np.float64) - truth)
     if not np.isfinite(error).all():
         raise UserError(
-            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are no numbers; the model diverged"
+            f"{int((~np.isfinite(error)).sum())} of {len(error)} predicted powers are not finite; the model diverged"
         )
     rows = [{"frequency_ghz": float(f / 1e9)} | _summary(error[frequencies_hz == f]) for f in np.unique(frequencies_hz)]
     return _summary(error) | {"per_frequency": rows}
 
 
 def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
-    """Returns the report of predicted powers of some links, and that of the baselines: free_space (Friis over the straight
-    line) and, where there is training data of the receivers, nearest_tx (the power of the nearest training transmitter at the
-    same frequency). None where the data know no power.
+    """Returns the report of predicted powers, and that of the baselines: free_space (Friis over the straight line) and, if the
+    receivers have training data, nearest_tx (the power of the nearest training transmitter at the same frequency). None if the
+    data contain no powers.
 
     Raises:
         UserError: as `score_power`.
@@ -137,48 +148,52 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
 
 
 def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
-    """Returns the report of predicted powers of some links, those without any power left out; None where the data know none, or
-    are snapshots in which nothing was heard."""
+    """Returns the report of predicted powers of links, omitting those without received power; None if the data contain no
+    powers, or only snapshots in which nothing was received."""
     truth = dataset.received_db(index)
     if truth is None:
         return None
-    heard = truth > NOT_HEARD_DB
-    if dataset.has_spectra and not heard.any():
+    received = truth > NOT_HEARD_DB
+    if dataset.has_spectra and not received.any():
         return None
-    return score_power(predicted[heard], truth[heard], dataset.frequencies_hz[index[heard]])
+    return score_power(predicted[received], truth[received], dataset.frequencies_hz[index[received]])
 
 
 def calibrate_power(
     confidence: PowerConfidence, predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]
 ) -> dict[str, Any] | None:
-    """Returns how sure predicted powers of some links were, and should have been (`calibration.power_calibration`); None where
-    the data know no power."""
+    """Returns the calibration of the error bounds of predicted powers (`power_calibration`); None if the data contain no
+    powers."""
     truth = dataset.received_db(index)
     if truth is None:
         return None
-    heard = truth > NOT_HEARD_DB
-    receivers = jnp.asarray(dataset.rx_positions(index[heard]), jnp.float32)
-    expected = _expected_power(confidence, jnp.asarray(predicted[heard], jnp.float32), dataset.query(index[heard]), receivers)
-    return power_calibration(expected, np.abs(predicted[heard].astype(np.float64) - truth[heard]), float(confidence.level))
+    received = truth > NOT_HEARD_DB
+    receivers = jnp.asarray(dataset.rx_positions(index[received]), jnp.float32)
+    expected = _expected_power(
+        confidence, jnp.asarray(predicted[received], jnp.float32), dataset.query(index[received]), receivers
+    )
+    return power_calibration(
+        expected, np.abs(predicted[received].astype(np.float64) - truth[received]), float(confidence.level)
+    )
 
 
 _expected_power = jax.jit(expected_power)
 
 
 def free_space(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB) over the straight line, whatever stands in its way."""
+    """Returns the power (dB) over the unobstructed straight line."""
     distance = np.linalg.norm(dataset.tx_positions[index] - dataset.rx_positions(index), axis=-1)
     return np.asarray(free_space_db(jnp.asarray(np.maximum(distance, 1e-3)), jnp.asarray(dataset.frequencies_hz[index])))
 
 
 def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns the power (dB) of the nearest training transmitter that is heard at the same frequency and receiver; where a
-    receiver heard none, of the nearest one."""
+    """Returns the power (dB) of the nearest training transmitter that was received at the same frequency and receiver; if a
+    receiver received none, simply of the nearest one."""
     everything = dataset.received_db(np.arange(len(dataset)))
     assert everything is not None
-    heard = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
-    all_hear = np.isin(dataset.receiver_index[index], dataset.receiver_index[heard]).all()
-    return everything[nearest_links(dataset, index, heard if all_hear else dataset.train)]
+    received = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
+    all_received = np.isin(dataset.receiver_index[index], dataset.receiver_index[received]).all()
+    return everything[nearest_links(dataset, index, received if all_received else dataset.train)]
 
 
 def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
@@ -186,7 +201,7 @@ def _summary(error: Float[np.ndarray, " n"]) -> dict[str, Any]:
 
 
 Part = Literal["test", "validation"]
-"""What is held out: for the final figures, or for choices."""
+"""Held-out part: "test" for the final figures, "validation" for choices."""
 
 
 def evaluate(
@@ -195,43 +210,47 @@ def evaluate(
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
     Raises:
-        UserError: nothing is held out, or the field knows nothing of what was observed.
+        UserError: nothing is held out, or the field does not predict the kind of observation in the data.
     """
     index = held_out(dataset, part)
     tested = part == "test"
-    if not tested and trained.neighbours is not None:  # they know the validation part
-        asked = without_asked(trained.neighbours, dataset.query(index))
-        trained = dataclasses.replace(trained, neighbours=asked)
-    others_know = with_validation_trained(dataset) if tested else dataset
-    seen = observe(trained, dataset, index)
+    if not tested and trained.neighbours is not None:  # residual kriging uses the validation part
+        left = without_asked(trained.neighbours, dataset.query(index))
+        trained = dataclasses.replace(trained, neighbours=left)
+    reference = with_validation_trained(dataset) if tested else dataset
+    predictions = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
-    said = power_of(seen, dataset)
-    power = None if said is None else power_figures(said, others_know, index)
-    if said is not None and power and trained.power_confidence and tested:  # how sure it is, the validation part has told
-        power |= {"confidence_db": calibrate_power(trained.power_confidence, said, dataset, index)}
-    own = own_scores(seen, dataset, index)
+    power_db = power_of(predictions, dataset)
+    power = None if power_db is None else power_figures(power_db, reference, index)
+    if power_db is not None and power and trained.power_confidence and tested:  # fitted to the validation part
+        power |= {"confidence_db": calibrate_power(trained.power_confidence, power_db, dataset, index)}
+    own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
-        return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(seen.pas)
-    truth, known = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
+        return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
+    truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
     normal = plane_normal(np.asarray(dataset.receiver().element_positions))
-    figures = metrics.figures(np.asarray(seen.pas), truth, normal)
-    report |= metrics.summarise(figures, *known, dataset.receiver_index[index])
-    noisy, alike = as_observed(trained.field, trained.params, np.asarray(seen.pas)), figures["ssim"]
-    if not np.array_equal(noisy, seen.pas):
-        alike = metrics.ssim(noisy, truth)
-        report["as_observed"] = {"median_ssim": float(np.median(alike)), "mean_ssim": float(np.mean(alike))}
-    repeats = repeatability(dataset.name, np.unique(known[0]) / 1e9)
+    figures = metrics.figures(np.asarray(predictions.pas), truth, normal)
+    report |= metrics.summarise(figures, *groups, dataset.receiver_index[index])
+    noisy, ssim = as_observed(trained.field, trained.params, np.asarray(predictions.pas)), figures["ssim"]
+    if not np.array_equal(noisy, predictions.pas):
+        ssim = metrics.ssim(noisy, truth)
+        report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
+    repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
     report |= own | ({"power": power} if power else {})
-    sure = trained.confidence
-    if tested and sure is not None and (expected := expectations(sure, dataset, index, np.asarray(seen.pas), said)):
-        report["confidence"] = calibration(expected, alike, float(sure.level))  # as it was learned
+    intervals = trained.confidence
+    if (
+        tested
+        and intervals is not None
+        and (expected := expectations(intervals, dataset, index, np.asarray(predictions.pas), power_db))
+    ):
+        report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
     report |= time_queries(trained, dataset)
-    beside = baselines(others_know) if can_lend(others_know, index) else {}
+    beside = baselines(reference) if can_lend(reference, index) else {}
     report["baselines"] = {
-        name: metrics.score(np.asarray(predict(index)), truth, *known, normal) for name, predict in beside.items()
+        name: metrics.score(np.asarray(predict(index)), truth, *groups, normal) for name, predict in beside.items()
     }
-    return report, np.asarray(seen.pas)
+    return report, np.asarray(predictions.pas)
 
 
 def expectations(
@@ -241,7 +260,8 @@ def expectations(
     pas: Float[np.ndarray, "n 90 360"],
     power_db: Float[np.ndarray, " n"] | None,
 ) -> Expected | None:
-    """Returns what is expected of the answers to some links; None where nothing was learned of one of their receivers."""
+    """Returns expected scores and intervals of the predictions for links; None if none were fitted for one of their
+    receivers."""
     receiver = dataset.receiver_index[index]
     learned = {number: for_receiver(confidence, dataset.receiver(number)) for number in np.unique(receiver).tolist()}
     if any(own is None for own in learned.values()):
@@ -249,41 +269,45 @@ def expectations(
     expected = Expected(*np.empty((3, len(index)), np.float32))
     for number, of_one in learned.items():
         own = np.flatnonzero(receiver == number)
-        asked = dataset.tx_positions[index[own]], dataset.frequencies_hz[index[own]]
-        found = expect_many(of_one, pas[own], *asked, None if power_db is None else power_db[own])
+        queries = dataset.tx_positions[index[own]], dataset.frequencies_hz[index[own]]
+        found = expect_many(of_one, pas[own], *queries, None if power_db is None else power_db[own])
         for column, values in zip(expected, found, strict=True):
             column[own] = values
     return expected
 
 
 def held_out(dataset: Dataset, part: Part) -> Int[np.ndarray, " n"]:
-    """Returns the indices of the held-out links; none at all is a `UserError`."""
+    """Returns the indices of the held-out links.
+
+    Raises:
+        UserError: there are none.
+    """
     index = getattr(dataset, part)
     if not len(index):
         raise UserError(f"{dataset.name} has no {part} spectra; choose another split")
     return index
 
 
-def power_of(seen: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | None:
-    """Returns the received powers that a field says; None where it knows none.
+def power_of(predictions: Observation, dataset: Dataset) -> Float[np.ndarray, " n"] | None:
+    """Returns the received powers predicted by a field; None if it predicts none.
 
     Raises:
-        UserError: the data know power alone, and the field nothing of it.
+        UserError: the data contain only powers, which the field does not predict.
     """
-    if seen.power_db is None and not dataset.has_spectra:
+    if predictions.power_db is None and not dataset.has_spectra:
         raise UserError(
-            f"{dataset.name} holds {dataset.observed.words}, of which this field knows nothing; choose another field"
+            f"{dataset.name} contains {dataset.observed.words}, which this field does not predict; choose another field"
         )
-    return None if seen.power_db is None else np.asarray(seen.power_db)
+    return None if predictions.power_db is None else np.asarray(predictions.power_db)
 
 
 def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex[np.ndarray, "n elements"]) -> dict[str, float]:
-    """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB) over the links on which something
-    was heard; nothing, if there is none."""
-    heard = truth.any(-1)
-    if not heard.any():
+    """Returns medians of the correlation |y^H y'| / (|y| |y'|) and of the power error (dB) over links with a received signal;
+    empty if there are none."""
+    received = truth.any(-1)
+    if not received.any():
         return {}
-    a, b = (jnp.asarray(snapshots[heard]) for snapshots in (truth, predicted))
+    a, b = (jnp.asarray(snapshots[received]) for snapshots in (truth, predicted))
     error = jnp.abs(channel.received_power_db(b) - channel.received_power_db(a))
     return {
         "snapshot_correlation": float(jnp.median(channel.correlation(a, b))),
@@ -294,28 +318,28 @@ def score_snapshots(predicted: Complex[np.ndarray, "n elements"], truth: Complex
 SCORES: dict[str, Callable[[Observation, np.ndarray], dict[str, float]]] = {
     "snapshots": lambda seen, truth: {} if seen.snapshots is None else score_snapshots(np.asarray(seen.snapshots), truth),
 }
-"""Figures of some kinds of observation, beside those of spectra and of received power: (what a field says of n links, what was
-observed on them) -> figures, none if it says nothing that could be compared."""
+"""Additional scores for some kinds of observation, besides those of spectra and received power: (predictions for n links, what
+was observed on them) -> scores; empty if the predictions contain nothing comparable."""
 
 
 def own_scores(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
-    """Returns the figures (`SCORES`) of what was observed on some links."""
+    """Returns the additional scores (`SCORES`) for the observations of links."""
     kinds = [name for name in dataset.observations if name in SCORES]
     return {key: value for name in kinds for key, value in SCORES[name](seen, dataset.observations[name][index]).items()}
 
 
 def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, float]:
-    """Returns the figure that the curves of a training show of some held-out links."""
-    seen = observe_links(field, params, dataset, index)
-    said = power_of(seen, dataset)
-    if not dataset.has_spectra and said is not None and (report := score_heard(said, dataset, index)):
+    """Returns the figure of held-out links shown in the training curves."""
+    predictions = observe_links(field, params, dataset, index)
+    power_db = power_of(predictions, dataset)
+    if not dataset.has_spectra and power_db is not None and (report := score_heard(power_db, dataset, index)):
         return {"held_out_power_error_db": report["power_error_db"]}
-    noisy = as_observed(field, params, np.asarray(seen.pas))
+    noisy = as_observed(field, params, np.asarray(predictions.pas))
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
 
 
 def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
-    """Returns milliseconds a PAS, for single queries and in blocks: medians over repeats after compilation."""
+    """Returns milliseconds per PAS, for single queries and in blocks: medians over repeats after compilation."""
     plan = trained.field.plan(trained.params, dataset.receiver())
     neighbours = for_receiver(trained.neighbours, dataset.receiver())
     result = {}
@@ -326,5 +350,5 @@ def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> d
             begin = time.perf_counter()
             jax.block_until_ready(render_pas(trained.field, trained.params, plan, query, neighbours))
             seconds.append(time.perf_counter() - begin)
-        result[name] = round(1e3 * float(np.median(seconds[1:])) / size, 3)  # the first call compiles
+        result[name] = round(1e3 * float(np.median(seconds[1:])) / size, 3)  # the first call includes compilation
     return result

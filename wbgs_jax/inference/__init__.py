@@ -1,1 +1,1 @@
-"""A trained field as a function, over maps, and as a file."""
+"""Use of a trained field: queries, maps, prediction intervals and export."""

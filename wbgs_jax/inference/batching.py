@@ -1,4 +1,4 @@
-"""Many queries at once: lists and maps of transmitters, in blocks of one compiled shape."""
+"""Evaluates many queries, lists or maps of transmitters, in blocks of one compiled shape."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,26 +13,26 @@ from wbgs_jax.inference.predictor import BLOCK, Predictor
 def predict_blocks(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
 ) -> Iterator[Float[np.ndarray, " k *answer"]]:
-    """Returns spectra or powers (float32) of n queries, at most `block` at a time and in order: for more than memory holds.
+    """Yields the spectra or powers (float32) of n queries in order, in blocks, so that the results need not fit in memory.
 
-    Positions (n, 3) in metres; frequencies (n,), or one, in hertz. All blocks have the same shape: one compilation. Where there
-    are several devices a block is for each of them, and `predictor` divides it.
+    Positions are (n, 3) in metres; frequencies are (n,) or a single one in hertz. All blocks are evaluated with the same shape,
+    so that one compilation suffices. A block has `block` queries per device; `predictor` divides it among the devices.
     """
     positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
     n, block = len(positions), block * own_devices().count
 
     def part(start: int) -> Float[np.ndarray, " k *answer"]:
-        index = np.minimum(np.arange(start, start + block), n - 1)  # the last query fills the last block up
+        index = np.minimum(np.arange(start, start + block), n - 1)  # the last block is filled up with copies of the last query
         return np.asarray(predict(positions[index], frequencies[index]))[: n - start]
 
-    return map(part, range(0, n, block))  # lazy; wrong arguments raise here
+    return map(part, range(0, n, block))  # lazy, but invalid arguments raise an error here
 
 
 def predict_many(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
 ) -> Float[np.ndarray, " n *answer"]:
-    """Returns all blocks of `predict_blocks` in one array."""
+    """Returns the blocks of `predict_blocks` as one array."""
     n, done = len(np.atleast_2d(tx_positions)), 0
     answers = None
     for part in predict_blocks(predict, tx_positions, frequencies_hz, block):
@@ -45,9 +45,9 @@ def predict_many(
 def map_queries(
     xs: Any, ys: Any, height: float, frequencies_hz: Any
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Returns positions and frequencies of a map at one height: the x of the grid runs fastest, then y, then the frequency.
+    """Returns the positions (metres) and frequencies (hertz) of a map at one height, with x fastest, then y, then frequency.
 
-    Metres and hertz; results of n = frequencies * ys * xs queries reshape to (frequencies, ys, xs, ...).
+    The results of the n = frequencies * ys * xs queries can be reshaped to (frequencies, ys, xs, ...).
     """
     frequency, y, x = np.meshgrid(np.atleast_1d(frequencies_hz), np.atleast_1d(ys), np.atleast_1d(xs), indexing="ij")
     return np.stack([x, y, np.full(x.shape, height)], -1).reshape(-1, 3).astype(float), frequency.reshape(-1).astype(float)
@@ -56,5 +56,5 @@ def map_queries(
 def predict_map(
     predict: Predictor, xs: Any, ys: Any, height: float, frequencies_hz: Any, block: int = BLOCK
 ) -> Float[np.ndarray, " n *answer"]:
-    """Returns the spectra (float32, 130 kB each) or powers of a map of transmitters, in the order of `map_queries`."""
+    """Returns the spectra (float32, 130 kB each) or powers for a map of transmitters, in the order of `map_queries`."""
     return predict_many(predict, *map_queries(xs, ys, height, frequencies_hz), block)

@@ -1,8 +1,8 @@
-"""A trained field at one receiver as the commands keep it: the next one answers at once.
+"""Disk cache of a trained field at one receiver, so that repeated commands start quickly.
 
-Reading a run, planning its receiver and tracing its model takes many times as long as one answer. The first command leaves what
-came of it in the folder of compiled programs: the program (`export.answer_all`), which runs of equal shapes share, and the
-arrays that it takes. The next one needs neither the run's data nor the model's code, as long as none of the files has changed.
+Reading a run, preparing its receiver and tracing its model take many times as long as one prediction. The first command stores
+the results in the folder of compiled programs: the program (`export.answer_all`), which runs with equal shapes share, and its
+input arrays. Later commands need neither the run's data nor the model's code, as long as no file has changed.
 """
 
 import hashlib
@@ -29,39 +29,41 @@ if TYPE_CHECKING:
     from wbgs_jax.inference.evaluate_quantities import LoadedField
 
 MOST = 16
-"""Queries of an answer."""
+"""Maximum number of queries per call."""
 LARGEST = 200e6
-"""Bytes of arrays that are kept: reading more takes as long as planning does."""
+"""Maximum size of the stored arrays, bytes; reading more takes as long as preparing the receiver."""
 FOLDER = "ready"
 META = "meta"
 
 
 @dataclass(frozen=True)
 class CachedField:
-    """A field that answers up to `MOST` queries at a time."""
+    """A cached field; it evaluates up to `MOST` queries at a time."""
 
     meta: dict[str, Any]
-    """`source` and `domain` (of `LoadedField`, as JSON), `what` (names of quantities), `lowest_hz`."""
+    """`source` and `domain` of the `LoadedField` as JSON, `what` (names of the quantities), `lowest_hz`."""
     arrays: tuple[np.ndarray, ...]
     program: Callable[..., dict[str, Any]]
 
     @property
     def source(self) -> dict[str, Any]:
-        """Where its answers come from (`LoadedField.source`)."""
+        """Provenance of the predictions (`LoadedField.source`)."""
         return dict(self.meta["source"])
 
     @cached_property
     def domain(self) -> Domain:
-        """Where it was trained."""
+        """Positions and frequencies that the training covered."""
         return Domain.from_json(self.meta["domain"])
 
     def answer(self, what: str, block: list[Product]) -> dict[str, np.ndarray]:
-        """Returns what `LoadedField.answer` does, for at most `MOST` queries."""
+        """Returns the same as `LoadedField.answer`, for at most `MOST` queries."""
         rows = np.concatenate([product.rows for product in block])
         order = np.argsort(rows)
         positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])[order]
         frequencies = np.concatenate([np.tile(one.frequencies_hz, len(one.tx_positions)) for one in block])[order]
-        chosen = np.minimum(np.arange(size_for(len(rows))), len(rows) - 1)  # the last query fills the block up
+        chosen = np.minimum(
+            np.arange(size_for(len(rows))), len(rows) - 1
+        )  # the block is filled up with copies of the last query
         query = np.asarray(positions, np.float32)[chosen], np.asarray(frequencies, np.float32)[chosen]
         found = self.program(*self.arrays, *query)
         answers = {name: np.asarray(found[name])[: len(rows)] for name in QUANTITIES[what].outputs if name in found}
@@ -69,20 +71,20 @@ class CachedField:
 
 
 def size_for(count: int) -> int:
-    """Returns how many queries the program for this many of them takes."""
+    """Returns the number of queries of the compiled program that serves `count` queries."""
     return 1 if count == 1 else MOST
 
 
 def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> CachedField | None:
-    """Returns a run's field as `make_cached` left it; None where it did not, where a file has changed since, or where it cannot
-    answer.
+    """Returns the field that `make_cached` stored for a run; None if there is none, if a file has changed since then, or if it
+    does not cover the queries.
 
     Args:
         run: the run folder.
         rx: the receiver, as on the command line.
         what: a name of `QUANTITIES`.
-        count: of the queries.
-        lowest_hz: the lowest frequency among them.
+        count: number of queries.
+        lowest_hz: their lowest frequency.
     """
     path = _place(run, rx, count)
     if count > MOST or path is None or not path.exists():
@@ -95,24 +97,24 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
         return CachedField(meta, arrays, load_program(path.parents[1], meta["program"]))
     except Exception:
-        return None  # damaged, in whatever way: it is made again
+        return None  # damaged in some way: it is created again
 
 
 def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: Sequence[Path]) -> CachedField | None:
-    """Returns a trained field at one receiver for few queries, and leaves it for `load_cached`; None where nothing can be kept.
+    """Stores a trained field at one receiver for `load_cached`, and returns it; None if it cannot be stored.
 
     Args:
-        run: its folder.
+        run: the run folder.
         rx: the receiver, as on the command line.
-        count: of the queries.
+        count: number of queries.
         loaded: the field at that receiver.
-        watched: files and folders that it follows from.
+        watched: files and folders from which it is derived; a change invalidates the stored field.
     """
     from wbgs_jax.inference.evaluate_quantities import known_quantities, lowest_frequency
     from wbgs_jax.inference.export import FROZEN, answer_all, freeze, frozen_outputs
 
     path, trained = _place(run, rx, count), loaded.trained
-    if path is None or not type(trained.field).__module__.startswith("wbgs_jax."):  # `source_digest` knows no others
+    if path is None or not type(trained.field).__module__.startswith("wbgs_jax."):  # `source_digest` covers only this package
         return None
     names = frozen_outputs(trained, loaded.dataset)
     leaves, structure = jax.tree.flatten(freeze(trained, loaded.receiver))
@@ -125,7 +127,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
 
     size = size_for(count)
     shapes = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]
-    asked = [jax.ShapeDtypeStruct(shape, np.float32) for shape in ((size, 3), (size,))]
+    queried = [jax.ShapeDtypeStruct(shape, np.float32) for shape in ((size, 3), (size,))]
     meta = {
         "source": loaded.source,
         "domain": loaded.domain.as_json(),
@@ -136,11 +138,11 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         "arrays": len(arrays),
     }
     try:
-        program = trace_program(path.parents[1], answer, [*shapes, *asked], f"{structure} {names}")
+        program = trace_program(path.parents[1], answer, [*shapes, *queried], f"{structure} {names}")
         with atomic_write(path) as stream:
             named: dict[str, Any] = {str(i): array for i, array in enumerate(arrays)}
             np.savez(stream, **named, meta=np.array(json.dumps(meta | {"program": program})))
-    except UserError:  # a cache that cannot be written costs time, and no answer
+    except UserError:  # without a cache, commands are slower but still work
         return None
     return CachedField(meta, arrays, load_program(path.parents[1], program))
 
@@ -152,7 +154,7 @@ def _place(run: Path, rx: str, count: int) -> Path | None:
 
 
 def _state(watched: Sequence[Path | str]) -> str:
-    """Returns a checksum that changes where this package, JAX or one of the files does (by size and time)."""
+    """Returns a checksum that changes with this package, JAX and the files (their sizes and modification times)."""
     words = [source_digest(), jax.__version__, jax.default_backend(), os.environ.get("XLA_FLAGS", "")]
     for root in map(Path, watched):
         for path in sorted(root.rglob("*")) if root.is_dir() else [root]:

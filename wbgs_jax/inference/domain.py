@@ -1,4 +1,4 @@
-"""Where a field was trained, and what is doubtful elsewhere."""
+"""The positions and frequencies that a training covered, and warnings about queries outside of them."""
 
 from typing import Any, NamedTuple
 
@@ -11,39 +11,39 @@ from wbgs_jax.mesh.solids import ClosedBody, inside
 from wbgs_jax.types import MIN_FREQUENCY_HZ
 
 NEAR = 1e-3
-"""Metres outside of a box that do not count."""
+"""Tolerance of the box, metres."""
 ROUNDED = 1e-6
-"""By what share a frequency in gigahertz may miss that of the data."""
+"""Relative tolerance of frequencies, which users give in rounded gigahertz."""
 
 
 class Domain(NamedTuple):
-    """The places and frequencies of a training."""
+    """Positions and frequencies that the training covered."""
 
     name: str
-    """Of the data."""
+    """Name of the dataset."""
     box: Float[np.ndarray, "2 3"]
-    """Lowest and highest corner, metres."""
+    """Lowest and highest corner of the scene, metres."""
     band: tuple[float, float]
-    """Hertz."""
+    """Lowest and highest training frequency, hertz."""
     beyond: float = 0.0
-    """How far (metres) outside of the box prediction intervals hold: nothing where surfaces close it."""
+    """Distance (metres) from the box up to which prediction intervals are valid; 0 if surfaces enclose the scene."""
     bodies: tuple[ClosedBody, ...] = ()
-    """In which no antenna can stand."""
+    """Closed bodies, in which no antenna can be placed."""
 
     def as_json(self) -> list[Any]:
-        """Returns what `Domain.from_json` reads."""
+        """Returns a JSON representation, for `Domain.from_json`."""
         bodies = [[body.name, np.round(body.triangles, 5).tolist()] for body in self.bodies]
         return [self.name, np.asarray(self.box).tolist(), list(self.band), self.beyond, bodies]
 
     @classmethod
     def from_json(cls, values: list[Any]) -> "Domain":
-        """Returns what `as_json` wrote."""
+        """Returns the domain that `as_json` represents."""
         name, box, (low, high), beyond, bodies = values
         solids = tuple(ClosedBody(own, np.array(triangles)) for own, triangles in bodies)
         return cls(name, np.array(box), (low, high), beyond, solids)
 
     def outside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Returns at which places (metres) no prediction interval holds: in a body, or outside of the training."""
+        """Returns which positions (metres) have no valid prediction interval: inside a body, or outside the training domain."""
         low, high = self.box
         away = np.linalg.norm(np.maximum(np.maximum(low - positions, positions - high), 0), axis=-1)
         result = away > self.beyond + NEAR
@@ -52,7 +52,7 @@ class Domain(NamedTuple):
         return result
 
     def without_intervals(self, answer: dict[str, np.ndarray], positions: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """Returns the answers to n queries, their intervals NaN where none holds."""
+        """Returns the predictions for n queries, with NaN in place of invalid intervals."""
         if not set(INTERVALS) & set(answer):
             return answer
         nowhere = self.outside(positions)
@@ -66,7 +66,7 @@ class Domain(NamedTuple):
     def warnings(
         self, rx: Float[np.ndarray, "3"], tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
     ) -> list[str]:
-        """Returns why some answers should not be trusted: one line each."""
+        """Returns warnings about queries with unreliable predictions, one line each."""
         (low, high), band = self.box, self.band
         box = f"the box of {self.name}, {point_words(low)} to {point_words(high)}"
         places = [("RX", rx), *(("TX", tx) for tx in tx_positions)]
@@ -88,8 +88,8 @@ class Domain(NamedTuple):
                 continue
             if f < MIN_FREQUENCY_HZ:
                 lines.append(
-                    f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: rays stand for short waves, and describe "
-                    "badly what is not many wavelengths large"
+                    f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: ray methods assume short waves and are "
+                    "inaccurate for objects that are not many wavelengths large"
                 )
             else:
                 trained = f"the trained {band[0] / 1e9:g} to {band[1] / 1e9:g} GHz"

@@ -1,4 +1,4 @@
-"""The functions of `quantities.QUANTITIES`: a trained field at one receiver, queried for transmitters at frequencies."""
+"""Computes the quantities of `quantities.QUANTITIES` from a trained field at one receiver, for transmitters at frequencies."""
 
 import contextlib
 from collections.abc import Callable
@@ -34,10 +34,10 @@ from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Query, Receiver, make_query
 
 Answer = dict[str, np.ndarray]
-"""Arrays by name: leading axes (tx, freq), or the columns of a table."""
+"""Arrays by name, with leading axes (tx, freq), or the columns of a table."""
 DEFAULTS = Options()
 OfArrivals = Callable[[Arrivals, Receiver, Any], Array]
-"""(arrivals of one link, receiver, frequency_hz) -> a quantity of it."""
+"""(paths of one link, receiver, frequency_hz) -> a quantity of the link."""
 
 
 @dataclass(frozen=True)
@@ -45,30 +45,30 @@ class LoadedField:
     """A trained field at one receiver."""
 
     trained: TrainedField
-    """At that receiver (`trained_field.at_receiver`)."""
+    """The field for this receiver (`trained_field.at_receiver`)."""
     dataset: Dataset
-    """On which it was trained."""
+    """The data that it was trained on."""
     receiver: Receiver
     options: Options = DEFAULTS
 
     @cached_property
     def plan(self) -> Any:
-        """What does not depend on the query."""
+        """The part of the computation that does not depend on the query."""
         return self.trained.field.plan(self.trained.params, self.receiver)
 
     @cached_property
     def domain(self) -> Domain:
-        """Where it was trained."""
+        """Positions and frequencies that the training covered."""
         return domain_of(self.dataset)
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Names of the materials of the data; none where these have none."""
+        """Names of the materials of the data; empty if unknown."""
         return () if self.dataset.materials is None else self.dataset.materials.names
 
     @property
     def source(self) -> dict[str, Any]:
-        """Where its answers come from: scene, field, step, version, receiver, and the levels of its prediction intervals."""
+        """Provenance of the predictions: scene, field, step, version, receiver, and levels of the prediction intervals."""
         receiver = {name: np.asarray(getattr(self.receiver, name)).tolist() for name in ("position", "orientation")}
         origin = {name: value for name, value in self.trained.origin().items() if name in ("field", "step")}
         learned = {"interval_level": self.trained.confidence, "power_interval_level": self.trained.power_confidence}
@@ -78,23 +78,23 @@ class LoadedField:
     def evaluate(
         self, what: str, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
     ) -> Answer:
-        """Returns a quantity of every transmitter at every frequency: {name with unit: values (tx, freq, ...)}, and arrays of
-        `results_file.SHARED`; of paths the columns of a table.
+        """Returns a quantity for every transmitter at every frequency: {name with unit: values (tx, freq, ...)} and the
+        arrays of `results_file.SHARED`; for paths, the columns of a table.
 
         Args:
             what: a name of `QUANTITIES`.
             tx_positions: world frame, metres.
-            frequencies_hz: of the carrier.
+            frequencies_hz: carrier frequencies.
 
         Raises:
-            UserError: the field has no such quantity.
+            UserError: the field does not provide this quantity.
         """
         check_quantity(what, self.trained.field, self.dataset)
         return EVALUATE[what](self, np.asarray(tx_positions), np.asarray(frequencies_hz))
 
     def answer(self, what: str, block: list[Product]) -> Answer:
-        """Returns the answers to a block of queries, their leading axis the queries in order, intervals NaN where none holds; a
-        table in the order of the queries, whose `tx` is the number of the transmitter."""
+        """Returns the predictions for a block of queries: arrays whose leading axis is the queries in order, with NaN for
+        invalid intervals; or a table in the order of the queries, whose column `tx` is the index of the transmitter."""
         found = [self.evaluate(what, product.tx_positions, product.frequencies_hz) for product in block]
         if QUANTITIES[what].form == "table":
             for product, table in zip(block, found, strict=True):
@@ -113,29 +113,31 @@ class LoadedField:
 
 
 def domain_of(dataset: Dataset) -> Domain:
-    """Returns where a field is trained by a data set."""
+    """Returns the positions and frequencies that a training on a dataset covers."""
     box = np.asarray(DatasetScene(dataset).box, np.float64)
     beyond = 0.0 if len(dataset.faces) else 0.5 * float(np.linalg.norm(box[1] - box[0]))
     return Domain(dataset.name, box, trained_band(dataset), beyond, closed_bodies(dataset))
 
 
 def lowest_frequency(field: Field, dataset: Dataset) -> float:
-    """Returns the lowest frequency (hertz) at which a field can be queried: that of the model's band, or of its training; paths
-    hold below, too."""
+    """Returns the lowest frequency (hertz) at which a field can be queried: the lower of the model's band edge and the lowest
+    training frequency; fields with paths can be queried down to `LOWEST_OF_PATHS_HZ`."""
     if "paths" in outputs_of(field):
         return LOWEST_OF_PATHS_HZ
     return min(MIN_FREQUENCY_HZ, trained_band(dataset)[0])
 
 
 def check_quantity(what: str, field: Field, dataset: Dataset | None = None) -> None:
-    """Raises a `UserError` where a field has no such quantity, or learned nothing of it from the data."""
+    """Raises a `UserError` if a field does not provide a quantity or could not learn it from the data."""
     needs = set(QUANTITIES[what].needs)
     if not needs & set(outputs_of(field)):
         able = " or ".join(name for name in field_names() if needs & set(get_field(name).outputs))
         if needs == {"paths"}:
-            lacks = "knows no paths" if what == "paths" else f"has no {what}: it knows no paths"
+            lacks = (
+                "does not predict paths" if what == "paths" else f"does not provide {what}, because it does not predict paths"
+            )
             raise UserError(f"the {field.name} field {lacks}; train --field {able} on data with a mesh")
-        raise UserError(f"the {field.name} field has no {what}, only spectra; train --field {able}")
+        raise UserError(f"the {field.name} field does not provide {what}, only spectra; train --field {able}")
     if dataset is not None and "pas" in needs:
         check_spectra(field, dataset)
     if dataset is not None and "power" in needs:
@@ -143,7 +145,7 @@ def check_quantity(what: str, field: Field, dataset: Dataset | None = None) -> N
 
 
 def known_quantities(field: Field, dataset: Dataset) -> list[str]:
-    """Returns the names of the quantities that a field has."""
+    """Returns the names of the quantities that a field provides."""
     found = []
     for what in QUANTITIES:
         with contextlib.suppress(UserError):
@@ -153,7 +155,7 @@ def known_quantities(field: Field, dataset: Dataset) -> list[str]:
 
 
 def _queries(tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
-    """Returns every transmitter at every frequency, the frequency fastest."""
+    """Returns queries for every transmitter at every frequency; the frequency varies fastest."""
     return make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
 
 
@@ -163,7 +165,7 @@ def _shaped(found: Any, tx_positions: np.ndarray, frequencies_hz: np.ndarray) ->
 
 
 def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """Spectra `pas` (tx, freq, 90, 360); with prediction intervals also `expected` (tx, freq, 3): the expected SSIM, and
+    """Returns spectra `pas` (tx, freq, 90, 360) and, with prediction intervals, `expected` (tx, freq, 3): the expected SSIM and
     the ends of its interval."""
     query = _queries(tx_positions, frequencies_hz)
     seen = observe_queries(at.trained, at.receiver, query)
@@ -184,18 +186,18 @@ def _snapshots(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.nda
 
 
 def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """Received powers, dB relative to the transmitted power, and their prediction intervals where the run has any."""
+    """Returns received powers, dB relative to the transmitted power, and their prediction intervals if the run has them."""
     query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_confidence
     power = observe_queries(at.trained, at.receiver, query, "power_db")
     answer = {"power_db": power}
     if learned is not None:
-        sure = expected_power(learned, jnp.asarray(power, jnp.float32), query, at.receiver.position)
-        answer |= {"expected_error_db": np.asarray(sure.error_db), "within_db": np.asarray(sure.within_db)}
+        interval = expected_power(learned, jnp.asarray(power, jnp.float32), query, at.receiver.position)
+        answer |= {"expected_error_db": np.asarray(interval.error_db), "within_db": np.asarray(interval.within_db)}
     return {name: _shaped(values, tx_positions, frequencies_hz) for name, values in answer.items()}
 
 
 def _best_beams(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """Numbers of the beams of `radio.array.codebook` that receive most."""
+    """Returns the indices of the beams of `radio.array.codebook` with the highest received power."""
     spectra = observe_queries(at.trained, at.receiver, _queries(tx_positions, frequencies_hz), "pas")
     return {"best_beam": _shaped(best_beams(spectra), tx_positions, frequencies_hz)}
 
@@ -203,7 +205,7 @@ def _best_beams(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.nd
 def _from_arrivals(
     name: str, function: OfArrivals, at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
 ) -> Answer:
-    """A number, or two, that follow from the arrivals of single links."""
+    """Returns a quantity that is computed from the paths of each link."""
     found = map_blocks(
         lambda block: _measure(at.trained.field, at.trained.params, at.plan, at.receiver, block, function),
         _queries(tx_positions, frequencies_hz),
@@ -238,16 +240,16 @@ def _delay_spread(arrivals: Arrivals, *_: Any) -> Array:
 
 
 def _paths(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """A table (`path_table`)."""
+    """Returns a table (`path_table`)."""
     velocities = at.options.tx_velocity, at.options.rx_velocity
     field, params = at.trained.field, at.trained.params
     return path_table(field, params, at.plan, tx_positions, frequencies_hz, velocities, at.materials)
 
 
 def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """The response of every element over a band around each carrier, (tx, freq, points, elements), and its inverse Fourier
-    transform over the delays that the band resolves (no window). Every frequency of the band is a query by itself, so that
-    materials may change over it."""
+    """Returns the response of every element over a band around each carrier, (tx, freq, points, elements), and its inverse
+    Fourier transform over the delays that the band resolves (no window). Every frequency of the band is a separate query, so
+    that material properties may vary over the band."""
     band_hz, points = at.options.band_hz, at.options.points
     offsets = (np.arange(points) - points // 2) * band_hz / points
     bands = frequencies_hz[:, None] + offsets
@@ -262,8 +264,9 @@ def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_h
 
 
 def _mimo(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    """The matrix between all elements of the receiver and those of a planar array at each transmitter, (tx, freq, elements, m).
-    `tx_elements` are in wavelengths around the transmitter's position, world frame; each is like the antenna it replaces."""
+    """Returns the matrices between the receiver's elements and those of a planar array at each transmitter, (tx, freq,
+    elements, m). `tx_elements` are in wavelengths relative to the transmitter's position, world frame; each element has the
+    properties of the transmitter's antenna."""
     elements = planar_array(*at.options.tx_array)
     return {"mimo": mimo_matrices(at, tx_positions, frequencies_hz, elements), "tx_elements": elements}
 
@@ -274,7 +277,7 @@ def mimo_matrices(
     frequencies_hz: Float[np.ndarray, " freq"],
     tx_elements: Float[np.ndarray, "m 3"],
 ) -> Complex[np.ndarray, "tx freq elements m"]:
-    """Returns the matrices between the receiver's elements and M elements, in wavelengths around each transmitter."""
+    """Returns the matrices between the receiver's elements and M elements, in wavelengths relative to each transmitter."""
     elements = jnp.asarray(tx_elements, jnp.float32)
     found = map_blocks(
         lambda block: _matrices(at.trained.field, at.trained.params, at.plan, block, at.receiver, elements),
@@ -303,16 +306,16 @@ EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
     "frequency-response": _frequency_response,
     "mimo": _mimo,
 }
-"""A function for each of `quantities.QUANTITIES`: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> answer."""
+"""Functions of `quantities.QUANTITIES` by name: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> `Answer`."""
 
 
 def arrivals_of(
     trained: TrainedField, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float
 ) -> Arrivals:
-    """Returns what arrives over every path from transmitters at one frequency, as NumPy arrays with a leading axis for them.
+    """Returns the paths from transmitters at one frequency, as NumPy arrays with a leading axis of transmitters.
 
     Raises:
-        UserError: the field has no paths.
+        UserError: the field does not predict paths.
     """
     check_quantity("paths", trained.field)
     plan = trained.field.plan(trained.params, receiver)

@@ -1,15 +1,15 @@
-"""A trained field as one file that runs without its training code, and back.
+"""Exports a trained field to one file that runs without its training code, and loads such files.
 
-The file is a zip archive of `metadata.json` (scene, receiver, what it was trained on, versions) and `field.bin`: the field as
-a function (tx_position (n, 3), frequency_hz (n,)) -> {"pas": (n, 90, 360), ...} in StableHLO, parameters included, written by
-`jax.export` for any n >= 1 with one reverse-mode derivative. The dictionary holds what the field outputs (`pas`, `power_db`,
-`snapshots`) with its prediction intervals (`expected`, `expected_error_db`, `within_db`). JAX and NumPy read it alone
-(docs/inference.md):
+The file is a zip archive of `metadata.json` (scene, receiver, training domain, versions) and `field.bin`: the field as a
+function (tx_position (n, 3), frequency_hz (n,)) -> {"pas": (n, 90, 360), ...} in StableHLO, including its parameters, written
+by `jax.export` for any n >= 1 with the first reverse-mode derivative. The dictionary contains the outputs of the field (`pas`,
+`power_db`, `snapshots`) and their prediction intervals (`expected`, `expected_error_db`, `within_db`). Only JAX and NumPy are
+needed to run it (docs/inference.md):
 
     with zipfile.ZipFile(path) as archive:
         predict = jax.export.deserialize(bytearray(archive.read("field.bin"))).call
 
-Files of format 1 hold spectra alone, as an array.
+The function in files of format 1 returns only spectra, as an array.
 """
 
 import contextlib
@@ -45,13 +45,13 @@ from wbgs_jax.types import Query, Receiver
 FORMAT = 2
 METADATA, FIELD = "metadata.json", "field.bin"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-"""What `jax.export` can lower for, on any machine."""
+"""Platforms for which `jax.export` can lower on any machine."""
 FROZEN = ("spectra", "power", "snapshot")
-"""Quantities that `answer_all` gives."""
+"""Quantities that `answer_all` computes."""
 
 
 class FrozenField(NamedTuple):
-    """All that answers follow from at one receiver: a tree of arrays."""
+    """Everything needed to predict at one receiver, as a tree of arrays."""
 
     field: Field
     params: Any
@@ -63,19 +63,19 @@ class FrozenField(NamedTuple):
 
 
 def freeze(trained: TrainedField, receiver: Receiver) -> FrozenField:
-    """Returns a trained field at a receiver (`trained_field.at_receiver`), planned."""
+    """Returns a trained field (`trained_field.at_receiver`) with its plan for a receiver."""
     neighbours, confidence = (for_receiver(one, receiver) for one in (trained.neighbours, trained.confidence))
     plan = trained.field.plan(trained.params, receiver)
     return FrozenField(trained.field, trained.params, plan, neighbours, confidence, trained.power_confidence, receiver)
 
 
 def answer_all(frozen: FrozenField, query: Query, names: Sequence[str]) -> dict[str, Array]:
-    """Returns the outputs of a field and their prediction intervals for B queries, as far as there are any (pure, jittable).
+    """Returns those outputs of a field and prediction intervals that exist, for B queries (pure, jittable).
 
     Args:
         frozen: the field.
-        query: of B links.
-        names: of the arrays that are wanted (`quantities.Quantity.outputs`).
+        query: B queries.
+        names: names of the arrays to return (`quantities.Quantity.outputs`).
     """
     seen = frozen.field.render(frozen.params, frozen.plan, query)
     pas = correct(frozen.neighbours, seen.pas, query)
@@ -89,21 +89,21 @@ def answer_all(frozen: FrozenField, query: Query, names: Sequence[str]) -> dict[
 
 
 def frozen_outputs(trained: TrainedField, dataset: Dataset) -> tuple[str, ...]:
-    """Returns the names of the arrays that `answer_all` can give of a field."""
+    """Returns the names of the arrays that `answer_all` can compute for a field."""
     known = [what for what in FROZEN if what in known_quantities(trained.field, dataset)]
     return tuple(name for what in known for name in QUANTITIES[what].outputs)
 
 
 @dataclass(frozen=True)
 class ExportedField:
-    """A field read by `load_exported`. Calling it is like calling a `predictor`, but `jax.vmap` is not possible: give it
-    batches. One reverse-mode `jax.grad` is."""
+    """A field read by `load_exported`. It is called like a `predictor`, with batches: `jax.vmap` is not supported. It can be
+    differentiated once with reverse-mode `jax.grad`."""
 
     metadata: dict[str, Any]
     """The content of `metadata.json`."""
     predict: Predictor
     observe: Callable[[Any, Any], dict[str, Array]]
-    """(tx_position, frequency_hz), as for a `predictor`, -> all outputs by name."""
+    """Function (tx_position, frequency_hz) -> all outputs by name; the arguments are those of a `predictor`."""
 
     def __call__(self, tx_position: Any, frequency_hz: Any) -> Float[Array, "*b 90 360"]:
         return self.predict(tx_position, frequency_hz)
@@ -112,12 +112,12 @@ class ExportedField:
 def export_field(
     trained: TrainedField, path: Path | str, platforms: Sequence[str] = ("cpu", "cuda"), dataset: Dataset | None = None
 ) -> None:
-    """Writes a trained field to one file (a zip archive) for all of `platforms`: any of `PLATFORMS`.
+    """Writes a trained field to one file (a zip archive) that runs on all of `platforms`, a selection of `PLATFORMS`.
 
-    `dataset` is what the field was trained on; it is loaded where it is not given.
+    `dataset` is the training data; it is loaded if it is not passed.
 
     Raises:
-        UserError: an unknown platform, a file that cannot be written, or the run's data are gone.
+        UserError: a platform is unknown, the file cannot be written, or the run's data are missing.
     """
     if not platforms or set(platforms) - set(PLATFORMS):
         raise UserError(f"cannot export for {', '.join(platforms) or 'no platform'}; choose from: {', '.join(PLATFORMS)}")
@@ -129,7 +129,7 @@ def export_field(
     }
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in content.items():
-            info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))  # equal fields, equal files
+            info = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))  # equal fields give equal files
             info.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(info, data)
 
@@ -150,7 +150,7 @@ def _metadata(trained: TrainedField, dataset: Dataset, platforms: Sequence[str])
 
 
 def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]) -> tuple[list[str], bytes]:
-    """Returns the names of the outputs, and the field with its parameters and plan as constants, for any number of queries."""
+    """Returns the names of the outputs, and the field with constant parameters and plan, for any number of queries."""
     frozen, names = freeze(trained, dataset.receiver()), frozen_outputs(trained, dataset)
     frozen = frozen._replace(plan=portable(frozen.plan))
 
@@ -167,7 +167,7 @@ def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Keeps the paths of this machine's source files out of what is lowered."""
+    """Keeps the paths of this machine's source files out of the lowered code."""
     name = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, name)
     jax.config.update(name, 0)
@@ -178,19 +178,19 @@ def _no_source_locations() -> Iterator[None]:
 
 
 def load_exported(path: Path | str) -> ExportedField:
-    """Returns a field that `export_field` wrote; uses nothing of the model's code.
+    """Returns a field that `export_field` wrote. The model's code is not needed.
 
     Raises:
-        UserError: the file is missing, damaged, no exported field, or of a version that cannot be read.
+        UserError: the file is missing, damaged, not an exported field, or of an unsupported version.
     """
     metadata, data = _read(Path(path))
     try:
         exported = jax.export.deserialize(bytearray(data))
-        exported.mlir_module()  # parses the code, which `deserialize` leaves to the first call
-    except Exception as error:  # of many kinds: it is a parser of binary data
+        exported.mlir_module()  # parses the code, which `deserialize` would defer to the first call
+    except Exception as error:  # the parser of binary data raises many kinds of errors
         made, reason = metadata.get("versions", {}).get("jax"), (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(
-            f"{path} was exported by jax {made} and jax {jax.__version__} cannot read it ({reason}); export it again"
+            f"{path} was exported by jax {made}, but jax {jax.__version__} cannot read it ({reason}); export it again"
         ) from error
 
     @jax.jit
@@ -200,23 +200,23 @@ def load_exported(path: Path | str) -> ExportedField:
 
     @jax.jit
     def predict(query: Query) -> Float[Array, "n 90 360"]:
-        return observe(query)["pas"]  # nothing else is computed then
+        return observe(query)["pas"]  # the other outputs are not computed
 
     return ExportedField(metadata, OnAnyShape(predict), OnAnyShape(observe))
 
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes]:
-    """Returns the two members of the archive, of a format that is known."""
+    """Returns the two members of the archive, if its format is supported."""
     try:
         with zipfile.ZipFile(path) as archive:
             metadata, data = json.loads(archive.read(METADATA)), archive.read(FIELD)
     except OSError as error:
         raise UserError(f"cannot read exported field {path}: {error.strerror or error}; check the path") from error
     except (ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged or no exported field ({error}); copy it or export it again") from error
+        raise UserError(f"{path} is damaged or not an exported field ({error}); copy it again or export it again") from error
     found = metadata.get("format") if isinstance(metadata, dict) else None
     if found not in (1, FORMAT):
         raise UserError(
-            f"{path} has export format {found}, this version reads 1 and {FORMAT}; export it again or update wbgs-jax"
+            f"{path} has export format {found}, but this version reads 1 and {FORMAT}; export it again or update wbgs-jax"
         )
     return metadata, data

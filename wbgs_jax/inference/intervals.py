@@ -1,12 +1,13 @@
-"""How sure an answer is: the SSIM that is expected of it, and an interval that holds the true one nine times out of ten; of a
-received power, how many decibels it is expected to be off, and within how many it is right nine times out of ten.
+"""Prediction intervals: for a spectrum, the expected SSIM and a 90 % interval of the true SSIM; for a received power, the
+expected absolute error and a 90 % bound on it, both in decibels.
 
-    log(1 + margin - SSIM) = w . x + r        x: of the answer alone (`features`),  r: what validation transmitters left
+    log(1 + margin - SSIM) = w . x + r        x: `features` of the prediction alone,  r: residual on validation transmitters
     log(margin + |error|)  = w . x + r        x: `power_features`
 
-Which features help is found on the validation part, and the interval's ends are quantiles of what is left there (split
-conformal prediction, Lei et al. 2018): it holds what it promises where transmitters are drawn as those were, not elsewhere. A
-hybrid field's shares, a few numbers, were learned on the same transmitters, for which its answers are a little better.
+The features are selected on the validation part, and the ends of the interval are quantiles of the residuals there (split
+conformal prediction, Lei et al. 2018). The coverage is therefore valid for transmitters drawn from the same distribution as
+those of the validation part, not for others. The few mixture weights of a hybrid field were learned on the same transmitters,
+for which its predictions are slightly too good.
 """
 
 from pathlib import Path
@@ -28,79 +29,79 @@ from wbgs_jax.types import Query
 MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
 LEVEL = 0.9
-"""Of the intervals."""
+"""Nominal coverage of the intervals."""
 AT_ONCE = 16
-"""Answers."""
+"""Number of predictions evaluated at a time."""
 POWER_MARGIN_DB = 0.1
-"""Keeps the logarithm of a perfect power finite."""
+"""Keeps the logarithm of a zero error finite."""
 FILE, POWER_FILE = "confidence.npz", "power_confidence.npz"
 FEATURES, POWER_FEATURES = 6, 4
 BEYOND_FREE_SPACE_DB = -100.0, 30.0
-"""What received powers beyond that of free space are cut to: without any path there is no telling how deep the shadow is."""
+"""Limits of the received power relative to free space: without any path, the depth of the shadow is undefined."""
 
 
 @pytree
 class Confidence:
-    """What has been learned about the scores of answers, over all receivers of the data alike."""
+    """Regression of the SSIM of predicted spectra, common to all receivers of the data."""
 
     rx_position: Float[Array, "*r 3"]
-    """Of the receivers, metres; of one alone where answers are asked for (`kriging.for_receiver`)."""
+    """Positions of the receivers, metres; of a single one for queries (`kriging.for_receiver`)."""
     tx_position: Float[Array, "m 3"]
-    """Of the transmitters that were trained, metres."""
+    """Positions of the training transmitters, metres."""
     mean: Float[Array, " k"]
-    """Of the features ..."""
+    """Means of the features ..."""
     scale: Float[Array, " k"]
     """... and their standard deviations."""
     weights: Float[Array, " k+1"]
-    """Of the scaled features and of 1; zero for those that do not help."""
+    """Weights of the scaled features, then the intercept; zero for features that do not improve the regression."""
     quantiles: Float[Array, "2"]
-    """Lowest and highest r of the interval."""
+    """Quantiles of r that bound the interval."""
     surplus: Float[Array, ""]
     """Mean of exp(r)."""
     level: Float[Array, ""]
-    """Chance that a score lies within the interval: `LEVEL`, or what exists of the transmitters that were held out."""
+    """Probability that a score lies within the interval: `LEVEL`, or the highest level that the held-out transmitters allow."""
 
 
 @pytree
 class PowerConfidence:
-    """What has been learned about the errors of received powers, over all receivers alike."""
+    """Regression of the errors of predicted received powers, common to all receivers of the data."""
 
     tx_position: Float[Array, "m 3"]
-    """Of the transmitters that were trained, metres."""
+    """Positions of the training transmitters, metres."""
     mean: Float[Array, " k"]
-    """Of the features ..."""
+    """Means of the features ..."""
     scale: Float[Array, " k"]
     """... and their standard deviations."""
     weights: Float[Array, " k+1"]
-    """Of the scaled features and of 1; zero for those that do not help."""
+    """Weights of the scaled features, then the intercept; zero for features that do not improve the regression."""
     highest: Float[Array, ""]
-    """What r is at most."""
+    """Quantile of r that is the upper bound."""
     surplus: Float[Array, ""]
     """Mean of exp(r)."""
     level: Float[Array, ""]
-    """Chance that it is: `LEVEL`, or what exists of the transmitters that were held out."""
+    """Probability that r is below it: `LEVEL`, or the highest level that the held-out transmitters allow."""
 
 
 C = TypeVar("C", Confidence, PowerConfidence)
 
 
 class ExpectedPower(NamedTuple):
-    """What is expected of B received powers."""
+    """Expected errors of B received powers."""
 
     error_db: Float[Array, " b"]
-    """Mean absolute error."""
+    """Expected absolute error."""
     within_db: Float[Array, " b"]
-    """What the absolute error stays below nine times out of ten."""
+    """Bound that 90 % of the absolute errors stay below (`PowerConfidence.level`)."""
 
 
 class Expected(NamedTuple):
-    """What is expected of B answers."""
+    """Expected SSIM of B predicted spectra."""
 
     ssim: Float[Array, " b"]
     low: Float[Array, " b"]
-    """The interval's lower ..."""
+    """Lower end of the interval, ..."""
     high: Float[Array, " b"]
-    """... and upper end."""
+    """... and its upper end."""
 
 
 def features(
@@ -110,9 +111,9 @@ def features(
     tx_position: Float[Array, "m 3"],
     power_db: Float[Array, " b"] | None = None,
 ) -> Float[Array, "b k"]:
-    """Returns what may tell how good answers are: the distance to the nearest trained transmitter, how much of the hemisphere
-    is bright, which it is where many paths interfere, the frequency, and the received power beyond that of free space, which
-    says how deep in the shadow a transmitter stands; 0 where it is not given."""
+    """Returns features that may be correlated with the quality of predicted spectra: the distance to the nearest training
+    transmitter; mean and standard deviation of the spectrum, more of which is bright where many paths interfere; the frequency;
+    and the received power relative to free space, which indicates how deep in the shadow a transmitter is (0 if not passed)."""
     distance, octave = _distance(query, tx_position), _octave(query)
     mean, spread = jnp.mean(pas, (-2, -1)), jnp.std(pas, (-2, -1))
     beyond = jnp.zeros_like(octave) if power_db is None else _beyond(power_db, query, rx_position)
@@ -122,15 +123,15 @@ def features(
 def power_features(
     power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"], tx_position: Float[Array, "m 3"]
 ) -> Float[Array, "b k"]:
-    """Returns what may tell how good received powers are: the distance to the nearest trained transmitter, the power beyond
-    that of free space, and the frequency."""
+    """Returns features that may be correlated with the errors of received powers: the distance to the nearest training
+    transmitter, the power relative to free space, and the frequency."""
     octave = _octave(query)
     beyond = _beyond(power_db, query, rx_position)
     return jnp.stack([jnp.log(_distance(query, tx_position)), beyond, octave, octave**2], -1)
 
 
 def _distance(query: Query, tx_position: Float[Array, "m 3"]) -> Float[Array, " b"]:
-    """Returns how far (metres) the nearest trained transmitter is, never nothing."""
+    """Returns the distance (metres) to the nearest training transmitter, which is always positive."""
     offset = query.tx_position[:, None] - tx_position[None]
     return jnp.sqrt(jnp.min(jnp.sum(offset**2, -1), -1) + 1e-4)
 
@@ -146,13 +147,13 @@ def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array
 def expected_ssim(
     confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
 ) -> Expected:
-    """Returns what is expected of answers `pas` to B queries.
+    """Returns the expected SSIM of predicted spectra, with intervals.
 
     Args:
-        confidence: what was learned, of the receiver that was asked.
-        pas: the answers.
-        query: what was asked.
-        power_db: the received power that the field says beside them; where it is not given it counts as the usual one.
+        confidence: the regression, for the queried receiver.
+        pas: the predicted spectra.
+        query: the queries.
+        power_db: the received powers predicted by the field; if omitted, the mean of the feature that depends on them is used.
     """
     known = features(pas, query, confidence.rx_position, confidence.tx_position, power_db)
     if power_db is None:
@@ -165,21 +166,21 @@ def expected_ssim(
 def expected_power(
     confidence: PowerConfidence, power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]
 ) -> ExpectedPower:
-    """Returns what is expected of the received powers (dB) that a field says of B queries.
+    """Returns the expected errors of received powers (dB) that a field predicts for B queries.
 
     Args:
-        confidence: what was learned.
-        power_db: the answers.
-        query: what was asked.
-        rx_position: of the receiver, or of every query's own, world frame, metres.
+        confidence: the regression.
+        power_db: the predicted powers.
+        query: the queries.
+        rx_position: position of the receiver, or one per query, world frame, metres.
     """
     error = _log_error(confidence, power_features(power_db, query, rx_position, confidence.tx_position))
-    said = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))
-    return ExpectedPower(*(jnp.maximum(decibels - POWER_MARGIN_DB, 0) for decibels in said))
+    bounds = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))
+    return ExpectedPower(*(jnp.maximum(decibels - POWER_MARGIN_DB, 0) for decibels in bounds))
 
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:
-    """Returns the logarithm of the error that features let expect."""
+    """Returns the logarithm of the error that the regression predicts."""
     scaled = (known - confidence.mean) / confidence.scale
     return jnp.matmul(scaled, confidence.weights[:-1], precision=EXACT) + confidence.weights[-1]
 
@@ -191,7 +192,7 @@ def expect_many(
     frequency_hz: Float[np.ndarray, " n"],
     power_db: Float[np.ndarray, " n"] | None = None,
 ) -> Expected:
-    """Returns what is expected of any number of answers, in blocks of one shape."""
+    """Returns the expected SSIM of any number of predicted spectra, in blocks of one shape."""
 
     def of_block(block: Any) -> Expected:
         spectra, tx, hertz, power = jax.tree.map(jnp.asarray, block)
@@ -206,23 +207,23 @@ _expected = jax.jit(expected_ssim)
 
 
 def write_confidence(folder: Path, confidence: Confidence | None, of_powers: PowerConfidence | None = None) -> None:
-    """Leaves it in a run folder, or nothing."""
+    """Writes the regressions to a run folder; None writes no file."""
     write_tree(folder / FILE, confidence)
     write_tree(folder / POWER_FILE, of_powers)
 
 
 def read_confidence(folder: Path) -> Confidence | None:
-    """Returns that of a run folder; None if it has none. A damaged file, or one of another version, is a `UserError`."""
+    """Returns the regression of a run folder, or None. A damaged file, or one of another version, is a `UserError`."""
     return _read(folder / FILE, Confidence, FEATURES)
 
 
 def read_power_confidence(folder: Path) -> PowerConfidence | None:
-    """Returns that of powers; otherwise as `read_confidence`."""
+    """Returns the regression for powers; otherwise as `read_confidence`."""
     return _read(folder / POWER_FILE, PowerConfidence, POWER_FEATURES)
 
 
 def _read(path: Path, cls: type[C], count: int) -> C | None:
     found = read_tree(path, (cls,), "do without", {"level": LEVEL})
     if found is not None and found.mean.shape != (count,):
-        raise UserError(f"{path} is of another version; remove it to do without, or train again")
+        raise UserError(f"{path} is of another version; remove it to work without prediction intervals, or train again")
     return found

@@ -1,13 +1,13 @@
-"""What known spectra nearby say about a spectrum, beside the field: simple kriging over the transmitter's position.
+"""Residual kriging: correction of predicted spectra by measured ones, with simple kriging over the transmitter's position.
 
-    k_j = exp(-|x - x_j| / L) over the nearest known transmitters at the same frequency,   a = (K + noise)^-1 k
+    k_j = exp(-|x - x_j| / L) over the nearest measured transmitters at the same frequency,   a = (K + noise)^-1 k
     residuals:  f(x) + w a . (y - f)
     spectra:    f(x) + w a . (y - f(x))
 
-The first adds what the field left unexplained at its neighbours; the second moves towards their spectra themselves, which helps
-where the field has learned them by heart and their residuals are zero. Which, how far (L) and how much (w) is found on the
-validation part (training/fit_kriging.py), nothing at all included. Only the nearest are asked: the others are behind them, and
-a data set may hold thousands.
+The first form interpolates the residuals of the field; the second interpolates the measured spectra themselves, which helps
+if the field is overfitted to them, so that their residuals are zero. The form, the correlation length L and the weight w are
+selected on the validation part (training/fit_kriging.py), where no correction at all is one of the options. Only the nearest
+measurements are used: they screen the others, and a dataset may have thousands.
 """
 
 import dataclasses
@@ -26,42 +26,42 @@ from wbgs_jax.radio.array import EXACT
 from wbgs_jax.types import Query, Receiver
 
 SAME_PLACE_M = 1e-3
-"""Distance of two receivers that are the same."""
+"""Distance below which two receivers count as the same, metres."""
 NOISE = 1e-2
-"""Variance of what is no function of the position, beside 1."""
+"""Variance of the part that is not a function of the position, relative to a variance of 1 of the other part."""
 FILE = "neighbours.npz"
 
 
 @pytree
 class Neighbours:
-    """M known spectra of one receiver, ready to be asked."""
+    """Residual kriging with M measured spectra of one receiver."""
 
     rx_position: Float[Array, "3"]
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
     images: Num[Array, "m 90 360"]
-    """y - f in half precision, or 255 y in bytes."""
+    """y - f in half precision, or 255 y as bytes."""
     scale: Float[Array, ""]
-    """What the images are multiplied by."""
+    """Factor of the images."""
     weight: Float[Array, ""]
-    """w."""
+    """Weight w."""
     own: Float[Array, ""]
-    """Whether the field's own spectrum gives way: 1 for spectra, 0 for residuals."""
+    """Form of the correction: 1 for spectra, 0 for residuals."""
     length: Float[Array, ""]
-    """L in metres."""
+    """Correlation length L, metres."""
 
 
 Beside = Neighbours | Mixture | None
-"""Known spectra beside a field: those of many data correct it, those of few share its answers."""
+"""Use of measured spectra together with a field: kriging with many measurements, a mixture with few; None: not used."""
 
 
 def without_asked(neighbours: Beside, query: Query) -> Beside:
-    """Returns neighbours that do not know the spectra that are asked for (host); None where nothing is left."""
+    """Returns the measurements without those of the queried links (host); None if none remain."""
     if neighbours is None:
         return None
-    known = nearness(neighbours.tx_position, neighbours.frequency_hz, query.tx_position, query.frequency_hz, SAME_PLACE_M)
-    kept = np.flatnonzero(np.asarray(known).max(1, initial=0) < np.exp(-1))
+    near = nearness(neighbours.tx_position, neighbours.frequency_hz, query.tx_position, query.frequency_hz, SAME_PLACE_M)
+    kept = np.flatnonzero(np.asarray(near).max(1, initial=0) < np.exp(-1))
     if not len(kept):
         return None
     taken = {name: getattr(neighbours, name)[kept] for name in ("tx_position", "frequency_hz", "images")}
@@ -79,19 +79,19 @@ def nearness(
 ) -> Float[Array, "b m"]:
     """Returns the kernel: exp(-distance / length) at equal frequencies, else 0."""
     offset = tx_position[:, None] - known_position[None]
-    distance = jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12)  # differentiable at a neighbour itself
+    distance = jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12)  # differentiable at a measured position
     same = jnp.abs(jnp.log(frequency_hz[:, None] / known_frequency[None])) < SAME_FREQUENCY
     return jnp.where(same, jnp.exp(-distance / length), 0)
 
 
 def correct(neighbours: Beside, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
-    """Returns a field's spectra with what known ones add to them; at frequencies or places far from all of them they stay."""
+    """Returns corrected spectra of a field; far from all measurements in position or frequency, they remain unchanged."""
     if neighbours is None:
         return pas
     if isinstance(neighbours, Mixture):
         return answer(neighbours, pas, query)
-    asked = query.tx_position, query.frequency_hz, pas
-    return jax.lax.map(lambda one: _corrected(neighbours, *one), asked)
+    queried = query.tx_position, query.frequency_hz, pas
+    return jax.lax.map(lambda one: _corrected(neighbours, *one), queried)
 
 
 def _corrected(
@@ -103,14 +103,14 @@ def _corrected(
     places = known[0][index], known[1][index]
     kernel = nearness(*places, *places, length) + NOISE * jnp.eye(len(k), dtype=k.dtype)
     shares = neighbours.weight * solve(kernel, k)
-    said = jnp.tensordot(shares, neighbours.scale * neighbours.images[index].astype(own.dtype), 1, precision=EXACT)
-    corrected = own + said - neighbours.own * jnp.sum(shares) * own
+    interpolated = jnp.tensordot(shares, neighbours.scale * neighbours.images[index].astype(own.dtype), 1, precision=EXACT)
+    corrected = own + interpolated - neighbours.own * jnp.sum(shares) * own
     return jnp.where(k[0] > 0, jnp.clip(corrected, 0, 1), own)
 
 
 def for_receiver(learned: Any, receiver: Receiver) -> Any:
-    """Returns what was learned of a receiver (`Neighbours`, `Confidence`), of several as of this one alone; None if it is none
-    of them (host)."""
+    """Returns what was learned (`Neighbours`, `Mixture`, `Confidence`) restricted to one receiver; None if it was learned
+    for other receivers (host)."""
     if learned is None:
         return None
     distance = np.linalg.norm(np.asarray(receiver.position) - np.atleast_2d(learned.rx_position), axis=-1)
@@ -121,11 +121,11 @@ def for_receiver(learned: Any, receiver: Receiver) -> Any:
 
 
 def write_neighbours(folder: Path, neighbours: Beside) -> None:
-    """Leaves them in a run folder, or nothing."""
+    """Writes the measurements to a run folder; None writes no file."""
     write_tree(folder / FILE, neighbours)
 
 
 def read_neighbours(folder: Path) -> Beside:
-    """Returns those of a run folder; None if it has none. A damaged file is a `UserError`."""
+    """Returns the measurements of a run folder; None if it has none. A damaged file is a `UserError`."""
     classes: tuple[type[Mixture | Neighbours], ...] = (Mixture, Neighbours)
-    return read_tree(folder / FILE, classes, "ask the field alone")
+    return read_tree(folder / FILE, classes, "use the field alone")

@@ -1,12 +1,12 @@
-"""What simple methods give for a spectrum, and their mixture with a trained field, by the distance to the data.
+"""Mixture of a trained field with simple interpolation methods, with weights that depend on the distance to the measurements.
 
     simple(x) = sum_m w_m(d) s_m(x)                  w = softmax(bias + slope u)
     answer(x) = share(d) f(x) + (1 - share(d)) simple(x),      share = sigmoid(bias + slope u)
 
-u is the logarithm of d, the distance to the nearest known transmitter, within what has been observed. The simple methods: the
-mean spectrum, the nearest one, inverse distances, ordinary kriging (Cressie 1993, section 3.2) with the kernel
-exp(-|x - x_j| / L), and line of sight. All but the mean and the last look at the same frequency alone. Weights and share are
-found by cross-validation (training/fit_mixture.py).
+u is the standardised logarithm of d, the distance to the nearest measured transmitter, clipped to the range of the data. The
+simple methods are the mean spectrum, the nearest spectrum, inverse distance weighting, ordinary kriging (Cressie 1993, section
+3.2) with the kernel exp(-|x - x_j| / L), and line of sight. All except the mean and the line of sight use only measurements at
+the same frequency. The weights are found by cross-validation (training/fit_mixture.py).
 """
 
 from typing import Any
@@ -24,49 +24,49 @@ from wbgs_jax.types import Query
 MEMBERS = ("mean", "nearest", "inverse_distance", "kriging", "line_of_sight")
 """The simple methods, in the order of the weights."""
 SAME_FREQUENCY = 1e-4
-"""Relative difference of two frequencies that are the same."""
+"""Relative difference below which two frequencies count as the same."""
 NEAREST = 32
-"""Known spectra that a query looks at."""
+"""Maximum number of measured spectra used for a query."""
 LOG_METRE = 1e-3
-"""Metres below which distances are alike."""
+"""Lower bound on distances, metres."""
 
 
 @pytree
 class Mixture:
-    """M known spectra of one receiver, and how simple methods and a field share an answer."""
+    """M measured spectra of one receiver, and the mixture weights of the simple methods and of the field."""
 
     rx_position: Float[Array, "3"]
     """Metres, world frame."""
     rx_orientation: Float[Array, "4"]
     """Quaternion (wxyz)."""
     elements: Float[Array, "e 3"]
-    """Of the array, in its local frame, in wavelengths or ... None at all where line of sight has no weight."""
+    """Element positions in the local frame, in wavelengths or metres; empty if the line of sight has no weight."""
     metres: Float[Array, ""]
-    """... metres: 1 if so, else 0."""
+    """Unit of `elements`: 1 for metres, 0 for wavelengths."""
     tx_position: Float[Array, "m 3"]
     """Metres, world frame."""
     frequency_hz: Float[Array, " m"]
     images: UInt8[Array, "m 90 360"]
     """255 times the spectra."""
     mean: Float[Array, "90 360"]
-    """Of all of them."""
+    """Mean of all measured spectra."""
     length: Float[Array, ""]
-    """L of the kriging, metres ..."""
+    """Correlation length L of the kriging, metres, ..."""
     nugget: Float[Array, ""]
-    """... and the variance of what is no function of the position, beside 1."""
+    """... and the variance of the part that is not a function of the position, relative to 1."""
     log_distance: Float[Array, "4"]
-    """Mean, standard deviation, lowest and highest value (logarithms of metres) at which weights were found."""
+    """Mean, standard deviation, minimum and maximum of log d (d in metres) in the fit of the weights."""
     members: Float[Array, "5 2"]
-    """Bias and slope of every member's logit."""
+    """Bias and slope of the logit of every simple method."""
     field: Float[Array, "2"]
-    """Bias and slope of the logit of the field's share."""
+    """Bias and slope of the logit of the field's weight."""
 
 
 def answer(mixture: Mixture, pas: Float[Array, "b 90 360"], query: Query) -> Float[Array, "b 90 360"]:
-    """Returns a field's spectra mixed with those of the simple methods; at frequencies that were never observed the field's."""
+    """Returns a field's spectra mixed with the simple methods; at frequencies without measurements, the field's alone."""
 
-    def one(asked: Any) -> Float[Array, "90 360"]:
-        position, frequency_hz, own = asked
+    def one(queried: Any) -> Float[Array, "90 360"]:
+        position, frequency_hz, own = queried
         everything = jnp.ones(len(mixture.frequency_hz), bool)
         spectra, distance = member_spectra(mixture, mixture.mean, position, frequency_hz, everything)
         simple = jnp.tensordot(member_weights(mixture, distance), spectra, 1, precision=EXACT)
@@ -77,17 +77,17 @@ def answer(mixture: Mixture, pas: Float[Array, "b 90 360"], query: Query) -> Flo
 
 
 def member_weights(mixture: Mixture, distance: Float[Array, "*b"]) -> Float[Array, "*b 5"]:
-    """Returns the weight of every simple method among them."""
+    """Returns the weights of the simple methods, which sum to 1."""
     return jax.nn.softmax(mixture.members[:, 0] + mixture.members[:, 1] * scaled(mixture, distance)[..., None], -1)
 
 
 def field_share(mixture: Mixture, distance: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the share of the field."""
+    """Returns the weight of the field, 0 to 1."""
     return jax.nn.sigmoid(mixture.field[0] + mixture.field[1] * scaled(mixture, distance))
 
 
 def scaled(mixture: Mixture, distance: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the scaled logarithm of distances (metres), held within those at which weights were found."""
+    """Returns the standardised logarithm of distances (metres), clipped to the range of the fit."""
     mean, scale, low, high = mixture.log_distance
     return (jnp.clip(jnp.log(jnp.maximum(distance, LOG_METRE)), low, high) - mean) / scale
 
@@ -99,19 +99,19 @@ def member_spectra(
     frequency_hz: Float[Array, ""],
     known: Bool[Array, " m"],
 ) -> tuple[Float[Array, "5 90 360"], Float[Array, ""]]:
-    """Returns what every simple method gives for one query, and its distance (metres) to the nearest known transmitter:
-    infinite where none is known at the frequency.
+    """Returns the spectra of the simple methods for one query, and its distance (metres) to the nearest measured transmitter,
+    which is infinite without measurements at the frequency.
 
     Args:
-        mixture: known spectra; weights and share do not matter.
-        mean: of those that may be used.
-        position: of the transmitter, world frame, metres.
-        frequency_hz: of the query.
-        known: which spectra may be used.
+        mixture: the measured spectra; its weights are not used.
+        mean: mean of the spectra that may be used.
+        position: position of the transmitter, world frame, metres.
+        frequency_hz: frequency of the query.
+        known: mask of the spectra that may be used.
     """
     known &= jnp.abs(jnp.log(mixture.frequency_hz / frequency_hz)) < SAME_FREQUENCY
     offset = position - mixture.tx_position
-    distance = jnp.where(known, jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12), jnp.inf)  # differentiable at a known transmitter
+    distance = jnp.where(known, jnp.sqrt(jnp.sum(offset**2, -1) + 1e-12), jnp.inf)  # differentiable at a measured position
     negative, index = jax.lax.top_k(-distance, min(NEAREST, len(distance)))
     near, there = -negative, jnp.isfinite(negative)
     near = jnp.where(there, near, 1.0)
@@ -136,16 +136,19 @@ def _kriging(
     kernel = jnp.where(both, jnp.exp(-apart / mixture.length), 0) + (mixture.nugget + ~there) * jnp.eye(
         len(near), dtype=near.dtype
     )
-    k = jnp.where(there, jnp.exp((near[0] - near) / mixture.length), 0)  # of the nearest 1: far away squares would vanish
+    k = jnp.where(
+        there, jnp.exp((near[0] - near) / mixture.length), 0
+    )  # relative to the nearest: far away, squares would underflow
     simple, ones = (solve(kernel, side) for side in (k, there.astype(k.dtype)))
     simple *= jnp.exp(-near[0] / mixture.length)
     return simple + (1 - jnp.sum(simple)) * _normalised(ones)
 
 
 def solve(kernel: Float[Array, "k k"], side: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Returns the solution of the equations of kriging from up to `NEAREST` spectra.
+    """Returns the solution of the kriging equations for up to `NEAREST` spectra.
 
-    Conjugate gradients: exported for any platform, unlike a factorisation; as many steps as there are unknowns are enough.
+    Conjugate gradients can be exported for all platforms, unlike a factorisation; they converge within as many steps as there
+    are unknowns, up to rounding.
     """
     solution, _ = cg(lambda v: jnp.matmul(kernel, v, precision=EXACT), side, tol=1e-7, maxiter=2 * NEAREST)
     return solution
@@ -157,7 +160,7 @@ def _normalised(weights: Float[Array, " k"]) -> Float[Array, " k"]:
 
 
 def _line_of_sight(mixture: Mixture, position: Float[Array, "3"], frequency_hz: Float[Array, ""]) -> Float[Array, "90 360"]:
-    """Returns the spectrum of one plane wave from the transmitter; nothing of an array without elements."""
+    """Returns the spectrum of a plane wave from the transmitter; zeros for an array without elements."""
     if not len(mixture.elements):
         return jnp.zeros_like(mixture.mean)
     offset = position - mixture.rx_position

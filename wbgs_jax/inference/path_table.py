@@ -1,4 +1,4 @@
-"""The paths of links as a table, and in words."""
+"""Tables and verbal descriptions of the paths of links."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
 from wbgs_jax.types import Query, make_query
 
 WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
-"""What a wave does: through a wall, off a floor, around a cabinet's edge."""
+"""Prepositions by type of interaction: through a wall, off a floor, around the edge of a cabinet."""
 SIGHT = "line of sight"
 
 
@@ -28,21 +28,21 @@ def path_table(
     velocities: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
     materials: tuple[str, ...],
 ) -> dict[str, np.ndarray]:
-    """Returns a table with a row a path, its columns by name: its link, what it meets, length, delay, angles, amplitudes
-     and Doppler shift; of each link the strongest path first.
+    """Returns a table with one row per path as columns by name: link, interactions, length, delay, angles, amplitudes and
+    Doppler shift. The paths of each link are sorted by power, the strongest first.
 
-    Angles of arrival are in the receiver's frame, those of departure in the world's, zenith 0 upwards. Amplitudes are relative
-    to the transmitted one, carrier phase included: at an element of the array, and at isotropic elements that are polarised
-    along theta-hat and phi-hat. They add up to the snapshot where waves are plane.
+    Angles of arrival are in the receiver's frame, angles of departure in the world frame; zenith 0 is upwards. Amplitudes are
+    relative to the transmitted amplitude and include the carrier phase: at an element of the array, and at isotropic elements
+    that are polarised along theta-hat and phi-hat. Their sum is the snapshot if the waves are plane.
 
     Args:
-        field: it must output paths.
+        field: a field that predicts paths.
         params: its parameters.
-        plan: of the receiver.
+        plan: its plan for the receiver.
         tx_positions: world frame, metres.
-        frequencies_hz: of the carrier.
-        velocities: of transmitter and receiver, metres a second, world frame.
-        materials: names by number; others are numbered.
+        frequencies_hz: carrier frequencies.
+        velocities: velocities of transmitter and receiver, metres per second, world frame.
+        materials: names of the materials by index; materials without a name are numbered.
     """
     moving, tables = [jnp.asarray(velocity, jnp.float32) for velocity in velocities], []
     for number, position in enumerate(tx_positions):
@@ -57,7 +57,7 @@ def path_table(
 def _link(
     field: Field, params: Any, plan: Any, query: Query, tx_velocity: Array, rx_velocity: Array
 ) -> tuple[Arrivals, Float[Array, " k"]]:
-    """Returns the paths of one query, and their Doppler shifts."""
+    """Returns the paths of one query and their Doppler shifts."""
     found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))
     return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)
 
@@ -86,7 +86,7 @@ def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], materials: tuple[
 def describe_interactions(
     kinds: Int[np.ndarray, " steps"], materials: Int[np.ndarray, " steps"], names: tuple[str, ...]
 ) -> str:
-    """Returns what a path meets: "off concrete, through glass"."""
+    """Returns a description of the interactions of a path, such as "off concrete, through glass"."""
     met = [
         f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"
         for kind, material in zip(kinds, materials, strict=True)

@@ -1,4 +1,4 @@
-"""Asking a trained field: as a pure function of (transmitter, frequency), or about the links of a dataset."""
+"""Predictions of a trained field: as a pure function of transmitter and frequency, or for the links of a dataset."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -23,22 +23,23 @@ from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver, check_query
 
 BLOCK = 16
-"""Queries rendered at a time: they share the footprints; more cost memory and, on a CPU, gain nothing."""
+"""Queries rendered at a time, with common footprints; larger blocks need more memory and are not faster on a CPU."""
 
 PREPARED = 8192
-"""Queries whose transmitters' paths are in memory at a time."""
+"""Queries whose paths are kept in memory at a time."""
 
 Predictor = Callable[[Any, Any], Array]
 """(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360) or power (*b,); leading axes broadcast like NumPy's."""
 
 
 def predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
-    """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, for `jit`, `vmap` and one reverse-mode
-    `grad`.
+    """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, which supports `jit`, `vmap` and one
+    reverse-mode `grad`.
 
-    What does not depend on the query is planned here, once, for the receiver (default: the first of the data the field was
-    trained on, which are read for it; for one that it was not trained on, `at_receiver` comes first). Compiles for every new
-    number of queries; `batching.predict_many` keeps that number fixed.
+    The part of the computation that does not depend on the query is done here, once for the receiver. The default is the first
+    receiver of the training data, which are read to obtain it; for a receiver that is not in the training data, call
+    `at_receiver` first. The function is compiled for every new number of queries; `batching.predict_many` keeps that number
+    fixed.
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
@@ -50,7 +51,7 @@ def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> 
     power (dB); otherwise as `predictor`.
 
     Raises:
-        UserError: the field knows nothing of power, or its data were spectra without a scale.
+        UserError: the field does not predict power, or was trained on spectra, which have no scale.
     """
     dataset = trained.dataset()
     check_power(trained.field, dataset)
@@ -59,29 +60,29 @@ def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> 
 
 
 def check_spectra(field: Field, dataset: Dataset) -> None:
-    """Raises a `UserError` where a field learned nothing of spectra."""
+    """Raises a `UserError` if a field could not learn spectra from the data."""
     if not dataset.has_spectra and "paths" not in outputs_of(field):
         raise UserError(
-            f"{dataset.name} holds {dataset.observed.words}, from which the {field.name} field learned no spectra; "
-            "ask for --what power"
+            f"{dataset.name} contains {dataset.observed.words}, from which the {field.name} field learned no spectra; "
+            "use --what power"
         )
 
 
 def check_power(field: Field, dataset: Dataset) -> None:
-    """Raises a `UserError` where a field cannot say what power a receiver gets."""
+    """Raises a `UserError` if a field cannot predict received power."""
     if "power" not in outputs_of(field):
-        raise UserError(f"the {field.name} field has no power, only spectra; train another field")
+        raise UserError(f"the {field.name} field does not predict power, only spectra; train another field")
     if not dataset.has_scale and "paths" not in outputs_of(field):
         raise UserError(
-            f"the spectra of {dataset.name} have no scale, so that the {field.name} field learned no power from them"
+            f"the spectra of {dataset.name} have no scale, so the {field.name} field could not learn power from them"
         )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Shared:
-    """A function of a query, which stands between other arguments of one of `RENDER`. Several devices divide more than `BLOCK`
-    queries, if that goes evenly and nobody differentiates, transforms or compiles them. It can be pickled, which neither
-    closures nor compiled functions can be."""
+    """One of the functions of `RENDER` with all arguments except the query bound. More than `BLOCK` queries are divided among
+    several devices if the division is even and the call is not being differentiated, transformed or compiled. Unlike closures
+    and compiled functions, it can be pickled."""
 
     quantity: str
     before: tuple[Any, ...]
@@ -92,8 +93,8 @@ class _Shared:
         count, traced = query.frequency_hz.shape[0], isinstance(query.tx_position, jax.core.Tracer)
         if devices.count == 1 or count <= BLOCK or count % devices.count or traced:
             return render(*self.before, query, *self.after)
-        *known, beside = devices.kept(*self.before, self.after)
-        return _divided(*known, query, beside, render, devices.mesh)
+        *first, last = devices.kept(*self.before, self.after)
+        return _divided(*first, query, last, render, devices.mesh)
 
 
 @partial(jax.jit, static_argnums=(5, 6))
@@ -120,7 +121,7 @@ def render_pas(field: Field, params: Any, plan: Any, query: Query, neighbours: B
 
 
 RENDER: dict[str, Callable[..., Any]] = {"pas": render_pas, "power_db": _render_power}
-"""Compiled functions of field, parameters, plan and query, by what they return."""
+"""Compiled functions of field, parameters, plan and query, by the quantity that they return."""
 
 
 @partial(jax.jit, static_argnames=("quantity", "mesh"))
@@ -143,8 +144,8 @@ def _observe(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OnAnyShape:
-    """Lets a function of a flat batch of queries, to a tree of arrays with a leading axis for them, take positions (*b, 3) and
-    frequencies (*b,) whose leading axes broadcast."""
+    """Wraps a function of a flat batch of queries, which returns a tree of arrays with a leading axis of queries, so that it
+    accepts positions (*b, 3) and frequencies (*b,) whose leading axes broadcast."""
 
     render: Callable[[Query], Any]
 
@@ -163,10 +164,10 @@ class OnAnyShape:
 
 
 def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
-    """Returns what a field says of some of a dataset's links, as NumPy arrays in their order.
+    """Returns the predictions of a field for links of a dataset, as NumPy arrays in their order.
 
-    What it can know of links beforehand is prepared once; links are rendered in blocks of one shape, receiver by receiver.
-    Several devices divide every block.
+    The field prepares the links once (`Field.prepare`); they are rendered in blocks of one shape, receiver by receiver. Every
+    block is divided among the devices.
     """
     links, devices = dataset.links(index), _devices(len(index))
     prepared = field.prepare(links, dataset.receivers)
@@ -183,11 +184,11 @@ def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.nda
 
 
 def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, quantity: str | None = None) -> Any:
-    """Returns what a trained field says of any number of queries, as NumPy arrays in their order: an `Observation`, its spectra
-    with what the neighbours say, or one of its quantities by name (nothing else is computed then).
+    """Returns the predictions of a trained field for any number of queries, as NumPy arrays in their order: an `Observation`
+    with corrected spectra (`kriging.correct`), or one of its quantities by name (the others are not computed then).
 
-    What is known of a transmitter serves all of its frequencies. Powers have no scale where the data had none (`check_power`).
-    Several devices divide the queries.
+    The preparation for a transmitter is shared by all of its frequencies. Powers have no scale if the training data had none
+    (`check_power`). The queries are divided among the devices.
     """
     field, params, neighbours = trained.field, trained.params, for_receiver(trained.neighbours, receiver)
     count = len(query.frequency_hz)
@@ -208,13 +209,13 @@ def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, qua
 
 
 def _devices(count: int) -> Devices:
-    """Returns the devices that divide so many queries: of a block's worth there is nothing to divide."""
+    """Returns the devices among which `count` queries are divided; a single block is not divided."""
     return own_devices() if count > BLOCK else Devices()
 
 
 def _gathered(answers: Iterator[tuple[Int[np.ndarray, " k"], Any]], count: int) -> Any:
-    """Returns blocks of answers, each with the places they belong to and perhaps filled beyond, as arrays in order; of no
-    queries, no spectra."""
+    """Returns blocks of predictions, each with its indices and possibly padded, as arrays in order; without queries, an
+    `Observation` of zero spectra."""
     total: Any = None
     for place, seen in answers:
         if total is None:
@@ -229,14 +230,14 @@ def _taken(links: Links, index: Int[np.ndarray, " k"]) -> Links:
 
 
 def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.ndarray, " k"], Int[np.ndarray, " size"]]]:
-    """Gives numbers block by block, and each filled up to one size with its last one: one compilation."""
+    """Yields blocks of numbers, each also padded to the same size with its last number, so that one compilation suffices."""
     for start in range(0, len(numbers), max(size, 1)):
         block = numbers[start : start + size]
         yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
 def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
-    """Returns what `observe_links` does, the spectra with what the neighbours say."""
+    """Returns the same as `observe_links`, with spectra corrected by residual kriging or a mixture (one receiver only)."""
     seen = observe_links(trained.field, trained.params, dataset, index)
     if dataset.n_receivers > 1:
         return seen
@@ -247,7 +248,7 @@ def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"
 def corrected(
     neighbours: Beside, pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 90 360"]:
-    """Returns predicted spectra of some of a dataset's links with what the neighbours say."""
+    """Returns the corrected spectra (`kriging.correct`) of links of a dataset, from the predicted ones."""
     if neighbours is None:
         return pas
     return np.concatenate([_correct(neighbours, pas[block], dataset.query(index[block])) for block in _slices(len(index))])
@@ -257,18 +258,18 @@ _correct = jax.jit(correct)
 
 
 def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns the predicted spectra (float32) of some of a dataset's links."""
+    """Returns the predicted spectra (float32) of links of a dataset."""
     return np.asarray(observe_links(field, params, dataset, index).pas)
 
 
 def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns what a field says as it would appear in its training data (host): what noise adds is no error of the field."""
+    """Returns predicted spectra as they would appear in the training data (host), so that noise does not count as an error."""
     seen = [np.asarray(base.as_observed(field, params, jnp.asarray(pas[block]))) for block in _slices(len(pas))]
     return np.concatenate(seen or [pas])
 
 
 def _slices(count: int) -> list[slice]:
-    """Returns blocks of so many spectra that are there already."""
+    """Returns slices of `BLOCK` rows that cover `count` rows."""
     return [slice(start, start + BLOCK) for start in range(0, count, BLOCK)]
 
 

@@ -1,6 +1,7 @@
-"""The quantities for which a trained field can be queried: the one table that commands, files, pictures and the viewer read.
+"""Table of the quantities for which a trained field can be queried, used by commands, files, figures and the viewer.
 
-Free of JAX: `--help` and mistakes on the command line do not wait for it. `evaluate_quantities` holds the functions.
+This module does not import JAX, so that `--help` and errors of the command line appear at once. `evaluate_quantities` contains
+the functions.
 """
 
 from typing import Literal, NamedTuple
@@ -9,40 +10,40 @@ import numpy as np
 from jaxtyping import Float
 
 Form = Literal["scalar", "array", "table"]
-"""Of an answer: a number or two a query, an array a query, or a table with several rows a query."""
+"""Form of the result: one or two numbers per query, an array per query, or a table with several rows per query."""
 
 
 class Quantity(NamedTuple):
-    """One of them."""
+    """A quantity that a field can predict."""
 
     name: str
-    """As `--what` has it."""
+    """Name as the value of `--what`."""
     outputs: tuple[str, ...]
-    """Names of the arrays that answer it, units included; the first is the quantity, the others its prediction intervals."""
+    """Names of the result arrays, including units; the first is the quantity, the others are its prediction intervals."""
     label: str
-    """Of an axis or a colour bar, with the unit in which it is drawn."""
+    """Label of an axis or a colour bar, with the unit of the figure."""
     needs: tuple[str, ...]
-    """Outputs of a field (`fields.base.Output`), one of which is enough."""
+    """Outputs of a field (`fields.base.Output`), at least one of which is required."""
     form: Form = "scalar"
     commands: tuple[str, ...] = ("predict", "map")
     scale: float = 1.0
-    """Drawn units in one unit of the answer."""
+    """Factor from the unit of the result to the unit of the figure."""
     colors: str = "viridis"
     """Name of a Matplotlib colormap."""
 
 
 class Options(NamedTuple):
-    """What some quantities depend on beside the link."""
+    """Options of some quantities, in addition to the link."""
 
     tx_velocity: Float[np.ndarray, "3"] = np.zeros(3)
-    """Metres a second, world frame."""
+    """Metres per second, world frame."""
     rx_velocity: Float[np.ndarray, "3"] = np.zeros(3)
     band_hz: float = 100e6
-    """Width of the band of frequency responses."""
+    """Bandwidth of frequency responses, hertz."""
     points: int = 64
-    """Frequencies in the band."""
+    """Number of frequencies in the band."""
     tx_array: tuple[int, int] = (1, 1)
-    """Rows and columns of a MIMO matrix's transmitters."""
+    """Rows and columns of the transmitter's array for MIMO matrices."""
 
 
 _ALL = (
@@ -64,9 +65,9 @@ _ALL = (
     Quantity("mimo", ("mimo",), "MIMO matrix", ("paths",), "array", ("predict",)),
 )
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _ALL}
-"""By name, in the order in which `--help` lists them."""
+"""Quantities by name, in the order of `--help`."""
 INTERVALS = tuple(name for quantity in _ALL for name in quantity.outputs[1:])
-"""Arrays that hold expected scores and prediction intervals: NaN where there are none."""
+"""Names of the arrays of expected scores and prediction intervals; NaN stands for an invalid one."""
 
 
 def names_for(command: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a trained field is asked, from words and files: transmitters at frequencies, every one at every other or row by row."""
+"""Queries from command lines and files: transmitters and frequencies, in all combinations or in pairs."""
 
 import csv
 import hashlib
@@ -17,22 +17,22 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text
 
 MOST = 1_000_000
-"""Queries."""
+"""Maximum number of queries."""
 COLUMNS = ("x", "y", "z", "ghz")
-"""Of a file of queries."""
+"""Columns of a file of queries."""
 AXES = "xyz"
 UNIT = "metres"
 SHOWN = 12
-"""Queries in a picture."""
+"""Maximum number of queries in a figure."""
 MOST_ELEMENTS = 1024
-"""Of an array."""
+"""Maximum number of elements of an array."""
 
 
 class Product(NamedTuple):
-    """Some transmitters at some frequencies, every one at every other."""
+    """All combinations of some transmitters and some frequencies."""
 
     rows: Int[np.ndarray, " n"]
-    """Numbers of the queries, the frequency fastest."""
+    """Indices of the queries; the frequency varies fastest."""
     tx_numbers: Int[np.ndarray, " tx"]
     tx_positions: Float[np.ndarray, "tx 3"]
     frequencies_hz: Float[np.ndarray, " freq"]
@@ -40,7 +40,7 @@ class Product(NamedTuple):
 
 @dataclass(frozen=True)
 class Queries:
-    """Every transmitter at every frequency, or (`paired`) the first transmitter at the first frequency, and so on."""
+    """Every transmitter at every frequency or, if `paired`, the i-th transmitter at the i-th frequency."""
 
     tx_positions: Float[np.ndarray, "tx 3"]
     """World frame, metres."""
@@ -52,24 +52,24 @@ class Queries:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Leading axes of an answer: (tx, freq), or (queries,)."""
+        """Leading axes of a result: (tx, freq), or (queries,) if paired."""
         return (len(self),) if self.paired else (len(self.tx_positions), len(self.frequencies_hz))
 
     def flat(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-        """Returns position and frequency of every query, the frequency fastest."""
+        """Returns the positions and frequencies of all queries, frequency fastest."""
         if self.paired:
             return self.tx_positions, self.frequencies_hz
         tx, freq = self.shape
         return np.repeat(self.tx_positions, freq, axis=0), np.tile(self.frequencies_hz, tx)
 
     def some(self, rows: Int[np.ndarray, " k"]) -> "Queries":
-        """Returns a few of the queries, paired."""
+        """Returns a selection of the queries, paired."""
         positions, frequencies = self.flat()
         return Queries(positions[rows], frequencies[rows], paired=True)
 
     def blocks(self, size: int) -> list[list[Product]]:
-        """Returns all queries in order, at most about `size` at a time. A block is a range of queries, in products: what is
-        known of a transmitter, or of a frequency, is found once for each."""
+        """Returns all queries in order, in blocks of at most about `size`. A block is a range of queries as a list of products,
+        so that work for a transmitter or a frequency is done once."""
         if self.paired:
             return [
                 list(self._by_frequency(np.arange(start, min(start + size, len(self))))) for start in range(0, len(self), size)
@@ -92,38 +92,38 @@ class Queries:
             yield Product(alike, alike, self.tx_positions[alike], np.array([frequency]))
 
     def digest(self) -> str:
-        """Returns a checksum."""
+        """Returns a checksum of all positions and frequencies."""
         positions, frequencies = (np.ascontiguousarray(part, np.float64) for part in self.flat())
         return hashlib.sha256(positions.tobytes() + frequencies.tobytes()).hexdigest()
 
 
 def shown_rows(count: int) -> Int[np.ndarray, " k"]:
-    """Returns the numbers of the queries that are drawn: all, or `SHOWN` that are spread evenly."""
+    """Returns the indices of the queries in a figure: all, or `SHOWN` evenly spaced ones."""
     return np.unique(np.linspace(0, count - 1, min(count, SHOWN)).round().astype(int))
 
 
 def check_count(count: int, source: str) -> None:
-    """Raises a `UserError` for more queries than anybody means."""
+    """Raises a `UserError` for more than `MOST` queries."""
     if count > MOST:
-        raise UserError(f"{source} makes {count:,} queries; ask at most {MOST:,} at a time")
+        raise UserError(f"{source} gives {count:,} queries; at most {MOST:,} are possible at a time")
 
 
 def parse_line(word: str) -> Float[np.ndarray, "tx 3"]:
-    """Returns positions (metres) at equal distances from "x,y,z:x,y,z:NUMBER", both ends included."""
+    """Returns equally spaced positions (metres), including both ends, parsed from "x,y,z:x,y,z:NUMBER"."""
     start, end, number = _three(word, "--line", "0,0,1.5:4,0,1.5:41")
     count = _number(number, "--line", word)
     return np.linspace(parse_vector(start, "--line", "position", UNIT), parse_vector(end, "--line", "position", UNIT), count)
 
 
 def parse_grid(word: str) -> Float[np.ndarray, "tx 3"]:
-    """Returns positions (metres), x fastest, from "x,y,z:x,y,z:NXxNYxNZ": lowest and highest corner, and how many along each
-    axis."""
+    """Returns the positions of a grid (metres), x fastest, parsed from "x,y,z:x,y,z:NXxNYxNZ": lowest corner, highest corner,
+    and the number of positions along each axis."""
     example = "-2,-2,1.5:2,2,1.5:9x9x1"
     low, high, number = _three(word, "--grid", example)
     counts = [_number(part, "--grid", word) for part in number.split("x")]
     if len(counts) != len(AXES):
         raise UserError(
-            f"--grid {word[:60]} has no three numbers of places after the corners; give x,y,z:x,y,z:NXxNYxNZ, such as {example}"
+            f"--grid {word[:60]} lacks three numbers of points after the corners; give x,y,z:x,y,z:NXxNYxNZ, such as {example}"
         )
     check_count(int(np.prod(counts)), "--grid")
     corners = [parse_vector(corner, "--grid", "position", UNIT) for corner in (low, high)]
@@ -133,29 +133,29 @@ def parse_grid(word: str) -> Float[np.ndarray, "tx 3"]:
 
 
 def parse_sweep(word: str) -> tuple[float, ...]:
-    """Returns frequencies (GHz) from "LOWEST:HIGHEST:NUMBER", each the same factor above the last, both ends included."""
+    """Returns logarithmically spaced frequencies (GHz), including both ends, parsed from "LOWEST:HIGHEST:NUMBER"."""
     low, high, number = _three(word, "--sweep", "1:100:50")
     try:
         ends = float(low), float(high)
     except ValueError:
         ends = np.nan, np.nan
     if not (0 < ends[0] < np.inf and 0 < ends[1] < np.inf):
-        raise UserError(f"--sweep {word[:60]} has no two frequencies; give LOWEST:HIGHEST:NUMBER in GHz, such as 1:100:50")
+        raise UserError(f"--sweep {word[:60]} lacks two frequencies; give LOWEST:HIGHEST:NUMBER in GHz, such as 1:100:50")
     swept = np.geomspace(*ends, _number(number, "--sweep", word))
-    return tuple(np.clip(swept, min(ends), max(ends)).tolist())  # rounding must not leave the band
+    return tuple(np.clip(swept, min(ends), max(ends)).tolist())  # rounding must not exceed the band
 
 
 def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
-    """Returns rows and columns of "4x2"; anything else is a `UserError`."""
+    """Returns the numbers of rows and columns, parsed from "4x2"; anything else is a `UserError`."""
     found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
     rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
     if not 0 < rows * columns <= MOST_ELEMENTS:
-        raise UserError(f"{option} {word} is no array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
+        raise UserError(f"{option} {word} is not an array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
     return rows, columns
 
 
 def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...]]:
-    """Returns positions (metres) and frequencies (GHz) of a CSV file with the columns x, y, z and ghz, a row a query."""
+    """Returns positions (metres) and frequencies (GHz) of a CSV file with the columns x, y, z and ghz, one row per query."""
     rows = csv.DictReader(io.StringIO(read_text(path)))
     names = [name.strip().lower() for name in rows.fieldnames or ()]
     if missing := [name for name in COLUMNS if name not in names]:
@@ -172,7 +172,7 @@ def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...
         found.append(values)
         check_count(len(found), str(path))
     if not found:
-        raise UserError(f"{path} has no queries; give a row each below x,y,z,ghz")
+        raise UserError(f"{path} has no queries; give one per row below the line x,y,z,ghz")
     table = np.array(found)
     for row in table:
         parse_vector(",".join(map(str, row[:3])), str(path), "position", UNIT)
@@ -182,12 +182,14 @@ def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...
 def _three(word: str, option: str, example: str) -> list[str]:
     parts = word.split(":")
     if len(parts) != 3:
-        raise UserError(f"{option} {word[:60]} has not three parts with : between them; give FROM:TO:NUMBER, such as {example}")
+        raise UserError(
+            f"{option} {word[:60]} does not have three parts separated by colons; give FROM:TO:NUMBER, such as {example}"
+        )
     return parts
 
 
 def _number(word: str, option: str, whole: str) -> int:
     if not (word.isdecimal() and len(word) < 8 and int(word) > 0):
-        raise UserError(f"{option} {whole[:60]} says no number of points; {word[:20]!r} must be 1, 2, ...")
+        raise UserError(f"{option} {whole[:60]} has no number of points; {word[:20]!r} must be 1, 2, ...")
     check_count(int(word), option)
     return int(word)

@@ -1,4 +1,4 @@
-"""Maps of a quantity of the channel over a level plane of transmitters, and the walls that the plane cuts."""
+"""Maps of a channel quantity over transmitters on a horizontal plane, and the cross-section of the walls with that plane."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from wbgs_jax.radio.geometry import direction_to_angles
 
 BEST_BEAM = "best-beam"
 AT_ONCE = 512
-"""Links: between two steps of the progress, and in memory."""
+"""Links evaluated, and kept in memory, per step of the progress bar."""
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Transmitters on a level grid, world frame, metres."""
+    """Transmitters on a horizontal grid, world frame, metres."""
 
     xs: Float[np.ndarray, " nx"]
     ys: Float[np.ndarray, " ny"]
     height: float
 
     def positions(self) -> Float[np.ndarray, "places 3"]:
-        """Returns all places, x fastest."""
+        """Returns all positions; x varies fastest."""
         y, x = np.meshgrid(self.ys, self.xs, indexing="ij")
         return np.stack([x, y, np.full(x.shape, self.height)], -1).reshape(-1, 3)
 
 
 def plane_over(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], height: float, step: float) -> Plane:
-    """Returns a grid of squares of about `step` metres that fill a rectangle; places are their centres."""
+    """Returns the centres of the squares of about `step` metres that fill a rectangle."""
     counts = np.maximum(np.round((high - low) / step), 1).astype(int)
     xs, ys = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True))
     return Plane(xs, ys, height)
@@ -46,17 +46,18 @@ def evaluate_plane(
     frequencies_hz: Float[np.ndarray, " freq"],
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, np.ndarray]:
-    """Returns {name with unit: values (freq, ny, nx)} of transmitters all over a plane, and `xs`, `ys`, `frequencies_hz`.
+    """Returns maps {name with unit: values (freq, ny, nx)} over the transmitters of a plane, and `xs`, `ys`, `height` and
+    `frequencies_hz`.
 
     Args:
-        what: a name of `quantities.QUANTITIES`, of which `wbgs-jax map` makes maps.
-        field: at the receiver.
-        plane: of the transmitters.
-        frequencies_hz: of the carrier.
-        advance: called `pieces(plane, frequencies)` times, as the work goes on.
+        what: a name of `quantities.QUANTITIES` that `wbgs-jax map` supports.
+        field: the trained field at the receiver.
+        plane: positions of the transmitters.
+        frequencies_hz: carrier frequencies.
+        advance: called after each of the `pieces(plane, frequencies_hz)` pieces of work.
 
     Raises:
-        UserError: the field has no such quantity.
+        UserError: the field does not provide this quantity.
     """
     parts = []
     for some in np.array_split(plane.positions(), pieces(plane, frequencies_hz)):
@@ -72,19 +73,19 @@ def evaluate_plane(
 
 
 def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:
-    """Returns how many pieces the work is done in."""
+    """Returns the number of pieces into which the work is divided."""
     places = len(plane.xs) * len(plane.ys)
     return -(-places // max(AT_ONCE // len(frequencies_hz), 1))
 
 
 def beam_angles() -> dict[str, np.ndarray]:
-    """Returns where the codebook's beams point, degrees in the receiver's frame."""
+    """Returns the directions of the codebook's beams, degrees in the receiver's frame."""
     azimuth, zenith = direction_to_angles(jnp.asarray(pas_directions().reshape(-1, 3)[codebook()], jnp.float32))
     return {"beam_azimuth_deg": np.degrees(azimuth), "beam_zenith_deg": np.degrees(zenith)}
 
 
 def cut_at(dataset: Dataset, height: float) -> Float[np.ndarray, "n 2 2"]:
-    """Returns the lines (x and y of both ends, metres) in which surfaces meet a level plane; none where none are known."""
+    """Returns the line segments (x and y of both ends, metres) in which a horizontal plane cuts the surfaces; or none."""
     if not len(dataset.faces):
         return np.zeros((0, 2, 2))
     mesh = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)

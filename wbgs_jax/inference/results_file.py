@@ -1,7 +1,7 @@
-"""Answers to many queries, block by block: in a folder beside the file that they end in, so that nothing is lost and memory
-holds one block at a time.
+"""Storage of predictions, and their output as files and as lines of text.
 
-Answers as files, and as lines for people.
+The predictions for many queries are stored block by block in a folder next to the result file, so that an interruption loses
+at most one block and only one block is in memory at a time.
 """
 
 import contextlib
@@ -22,13 +22,13 @@ from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
 
 QUESTION = "question.json"
 QUICK = 1
-"""Level of compression: spectra are hardly smaller at higher ones."""
+"""Compression level; higher levels make spectra hardly smaller."""
 SHARED = ("offsets_hz", "delays_s", "tx_elements")
-"""Arrays that belong to all queries alike; all others have a row a query (or several: tables of paths)."""
+"""Arrays common to all queries; all others have one row per query (or several: tables of paths)."""
 
 
 class Answers:
-    """Blocks of answers in memory: arrays by name."""
+    """Blocks of predictions in memory: arrays by name."""
 
     def __init__(self, blocks: list[Mapping[str, np.ndarray]] | None = None):
         self._blocks = blocks or []
@@ -37,26 +37,26 @@ class Answers:
         return len(self._blocks)
 
     def add(self, block: Mapping[str, np.ndarray]) -> None:
-        """Keeps one more block."""
+        """Appends a block."""
         self._blocks.append(block)
 
     @contextlib.contextmanager
     def opened(self, number: int) -> Iterator[Mapping[str, np.ndarray]]:
-        """Gives a block."""
+        """Yields a block."""
         yield self._blocks[number]
 
     def names(self) -> list[str]:
-        """Returns the names of arrays with a row a query."""
+        """Returns the names of the arrays with rows for queries."""
         with self.opened(0) as block:
             return [name for name in block if name not in SHARED]
 
     def shared(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that belong to all queries alike."""
+        """Returns the arrays common to all queries."""
         with self.opened(0) as block:
             return {name: block[name] for name in block if name in SHARED}
 
     def pieces(self, name: str) -> Iterator[np.ndarray]:
-        """Gives an array block by block."""
+        """Yields an array block by block."""
         for number in range(len(self)):
             with self.opened(number) as block:
                 yield block[name]
@@ -71,7 +71,7 @@ class Answers:
         return _joined(parts)[:most]
 
     def rows(self, name: str, wanted: np.ndarray) -> np.ndarray:
-        """Returns some rows of an array, by their numbers in ascending order."""
+        """Returns rows of an array by their indices, which must be ascending."""
         found, start = [], 0
         for piece in self.pieces(name):
             inside = wanted[(wanted >= start) & (wanted < start + len(piece))]
@@ -80,11 +80,11 @@ class Answers:
         return _joined(found)
 
     def remove(self) -> None:
-        """Forgets what is no longer needed."""
+        """Removes temporary data."""
 
 
 class PartFiles(Answers):
-    """Blocks of answers in a folder."""
+    """Blocks of predictions in a folder."""
 
     def __init__(self, folder: Path, done: int):
         super().__init__()
@@ -94,7 +94,7 @@ class PartFiles(Answers):
         return self.done
 
     def add(self, block: Mapping[str, np.ndarray]) -> None:
-        """Writes one more block, whole or not at all."""
+        """Writes one more block, either completely or not at all."""
         with atomic_write(_file(self.folder, self.done)) as stream:
             arrays: dict[str, Any] = dict(block)
             np.savez(stream, **arrays)
@@ -102,9 +102,9 @@ class PartFiles(Answers):
 
     @contextlib.contextmanager
     def opened(self, number: int) -> Iterator[Mapping[str, np.ndarray]]:
-        """Gives a block; its arrays are read when they are asked for."""
+        """Yields a block; its arrays are read when they are accessed."""
         path = _file(self.folder, number)
-        with opened_archive(path, "", "remove it and all after it, and go on with --resume") as block:
+        with opened_archive(path, "", "remove it and all later blocks, and continue with --resume") as block:
             yield block
 
     def remove(self) -> None:
@@ -113,15 +113,15 @@ class PartFiles(Answers):
 
 
 def part_folder(target: Path) -> Path:
-    """Returns where the blocks of a file's answers are kept until all are there."""
+    """Returns the folder of the blocks of an incomplete result file."""
     return target.with_name(f"{target.name}.part")
 
 
 def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFiles:
-    """Returns the blocks beside a file: none, or with `resume` those that an interrupted command left.
+    """Returns the blocks of a result file: none yet or, with `resume`, those of an interrupted command.
 
     Raises:
-        UserError: blocks are there and are not to be used, or answer another question.
+        UserError: there are blocks without `resume`, or the blocks belong to other queries.
     """
     folder = part_folder(target)
     done = 0
@@ -129,10 +129,12 @@ def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFile
         done += 1
     if done and not resume:
         raise UserError(
-            f"{folder} holds answers of an interrupted command; add --resume to go on with it, or remove the folder"
+            f"{folder} contains results of an interrupted command; add --resume to continue it, or remove the folder"
         )
     if done and (changed := _difference(read_json(folder / QUESTION), question)):
-        raise UserError(f"{folder} holds answers to another question ({changed}); remove the folder, or choose another --out")
+        raise UserError(
+            f"{folder} contains results of another command ({changed} changed); remove the folder, or choose another --out"
+        )
     if not done:
         write_json(folder / QUESTION, question)
     return PartFiles(folder, done)
@@ -141,14 +143,14 @@ def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFile
 def write_archive(
     path: Path, answers: Answers, shape: tuple[int, ...] | None, known: dict[str, Any], source: dict[str, Any]
 ) -> None:
-    """Writes answers as a compressed .npz file, block by block.
+    """Writes predictions to a compressed .npz file, block by block.
 
     Args:
-        path: of the file.
-        answers: all of them.
-        shape: leading axes in place of the queries' one; None for tables, whose rows are no queries.
+        path: the file.
+        answers: all blocks.
+        shape: leading axes that replace the axis of queries; None for tables, whose rows are not queries.
         known: further arrays.
-        source: where they come from, JSON text in `meta`.
+        source: provenance, stored as JSON text in `meta`.
     """
     single = {**answers.shared(), **known, "meta": np.array(json.dumps(source))}
     with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
@@ -167,13 +169,13 @@ def write_archive(
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], source: dict[str, Any]) -> None:
-    """Writes arrays as a compressed .npz file, and where they come from as JSON text in `meta`."""
+    """Writes arrays to a compressed .npz file, with their provenance as JSON text in `meta`."""
     with atomic_write(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays, meta=np.array(json.dumps(source)))
 
 
 def _joined(pieces: list[np.ndarray]) -> np.ndarray:
-    with told("a block of kept answers", "remove the folder of blocks, and ask again"):
+    with told("a stored block of results", "remove the folder of blocks, and run the command again"):
         return np.concatenate(pieces)
 
 
@@ -187,13 +189,13 @@ def _difference(before: Any, now: dict[str, Any]) -> str:
 
 
 TWO = ("azimuth", "zenith")
-"""What pairs of numbers are of."""
+"""Prefixes of the column names of pairs of angles."""
 DIGITS = ".7g"
 
 
 def write(path: Path, what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> None:
-    """Writes all answers: to a .csv file a row a query, or a path; to an .npz file arrays (tx, freq, ...), or (queries, ...)
-    where queries are paired."""
+    """Writes all predictions: to a .csv file with one row per query or path, or to an .npz file with arrays (tx, freq, ...), or
+    (queries, ...) if the queries are paired."""
     if path.suffix == ".csv":
         write_csv(path, table_rows(answers) if QUANTITIES[what].form == "table" else query_rows(answers, queries))
         return
@@ -204,7 +206,7 @@ def write(path: Path, what: str, answers: Answers, queries: Queries, source: dic
 
 
 def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
-    """Gives a header, and a row a query: its columns x, y, z, ghz, and the numbers that answer it."""
+    """Yields a header, then one row per query with x, y, z, ghz and the predicted numbers."""
     names = answers.names()
     columns = []
     for name in names:
@@ -221,7 +223,7 @@ def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
 
 
 def table_rows(answers: Answers) -> Iterator[list[Any]]:
-    """Gives a header, and the rows of a table."""
+    """Yields a header, then the rows of a table."""
     names = answers.names()
     yield names
     for number in range(len(answers)):
@@ -230,29 +232,29 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
                 yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
 
 
-NO_CONFIDENCE = "no confidence: it lies outside of what was trained, or where no antenna can stand"
+NO_CONFIDENCE = "no prediction interval (outside the training domain, or where no antenna can be placed)"
 
 
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
-    """Returns how good some of the answers are expected to be, where that is known: one line each. `source` holds the level of
-    their intervals (`LoadedField.source`)."""
+    """Returns lines with the expected quality of some of the predictions, if the run has prediction intervals. Their level is
+    in `source` (`LoadedField.source`)."""
     if QUANTITIES[what].form == "table" or not {"expected", "within_db"} & set(answers.names()):
         return []
     shown = shown_rows(len(queries))
     positions, frequencies = (part[shown] for part in queries.flat())
     where = [link_words(position, float(frequency)) for position, frequency in zip(positions, frequencies, strict=True)]
-    sure = f"{100 * source['interval_level' if what == 'spectra' else 'power_interval_level']:.0f} %"
+    level = f"{100 * source['interval_level' if what == 'spectra' else 'power_interval_level']:.0f} %"
     if what == "spectra":
         expected = zip(where, answers.rows("expected", shown), strict=True)
         return [
             f"{link}: {NO_CONFIDENCE}"
             if np.isnan(ssim)
-            else f"{link}: expected SSIM {ssim:.2f}, {sure} between {low:.2f} and {min(high, 1):.2f}"
+            else f"{link}: expected SSIM {ssim:.2f}, {level} between {low:.2f} and {min(high, 1):.2f}"
             for link, (ssim, low, high) in expected
         ]
     columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))
     return [
-        f"{link}: {power:.1f} dB of the transmitted power; "
-        + (NO_CONFIDENCE if np.isnan(error) else f"expected {error:.1f} dB off, {sure} within {within:.1f} dB")
+        f"{link}: {power:.1f} dB relative to the transmitted power; "
+        + (NO_CONFIDENCE if np.isnan(error) else f"expected error {error:.1f} dB, {level} within {within:.1f} dB")
         for link, power, error, within in zip(where, *columns, strict=True)
     ]

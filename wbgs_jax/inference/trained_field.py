@@ -1,4 +1,4 @@
-"""A trained field: how it was trained, its parameters, and what was learned beside it."""
+"""A trained field: the configuration of its run, its parameters, and the corrections and intervals learned afterwards."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -31,35 +31,35 @@ class RunConfig:
     """Everything that determines a run."""
 
     source: str
-    """Scene number, scene file or folder; several with commas between them."""
+    """Scene number, scene file or folder; several are separated by commas."""
     field: str
     preset: str
     seed: int
     frequency_ghz: float | None
-    """Frequency of a single-frequency folder that does not say."""
+    """Frequency of a single-frequency folder that does not record it."""
     settings: Settings
     train_ghz: tuple[float, ...] = ()
-    """Train at these frequencies and test at the others; none: train and test at all."""
+    """Frequencies for training, the others being for the test; empty: all frequencies are in both."""
     train_tx: int = 0
     """Number of training transmitters; 0: all."""
     validation: float = VALIDATION
-    """Share of the training transmitters that is held out for validation, where the data name none."""
+    """Fraction of the training transmitters held out for validation, if the data define no validation part."""
     test_box: tuple[float, ...] = ()
-    """Test at the transmitters in a box, lowest and highest corner (metres), and train elsewhere; none: as the data say."""
+    """Box of the test transmitters (lowest and highest corner, metres), others being for training; empty: split of the data."""
     receiver: int | None = None
-    """Number of the only receiver that is looked at; None: all."""
+    """Index of the only receiver that is used; None: all."""
     neighbours: bool = True
-    """Whether known spectra are asked beside the field, where that gains on validation."""
+    """Whether measured spectra correct the predictions, if that improves the validation score."""
     convention: ConventionName | None = None
-    """In which the pixels of a folder are ordered; None where there is no folder, or as it is not known yet."""
+    """Pixel order of a folder's images; None without a folder, or if not yet determined."""
 
     def other_data(self, source: str, convention: ConventionName | None = None) -> Dataset:
-        """Returns data of any name, read as those that the run was trained on."""
+        """Returns other data by name, read with the options of the training data."""
         frequency = None if self.frequency_ghz is None else self.frequency_ghz * 1e9
         return load_dataset(source, frequency_hz=frequency, seed=self.seed, convention=convention)
 
     def dataset(self) -> Dataset:
-        """Returns the data that the run was trained on."""
+        """Returns the training data of the run."""
         dataset = self.other_data(self.source, self.convention)
         if self.receiver is not None:
             dataset = select_receivers(dataset, [self.receiver])
@@ -83,31 +83,32 @@ class TrainedField:
     seconds: float
     """Training time."""
     neighbours: Beside = None
-    """Known spectra that are asked beside it."""
+    """Measured spectra that correct its predictions."""
     confidence: Confidence | None = None
-    """How sure its answers are."""
+    """Regression for the prediction intervals of spectra."""
     power_confidence: PowerConfidence | None = None
-    """How sure the received powers are that it says."""
+    """Regression for the prediction intervals of received powers."""
     data: str = ""
-    """Checksum of the data that it was trained on; empty where nobody has kept it."""
+    """Checksum of the training data; empty if it was not recorded."""
 
     def dataset(self) -> Dataset:
-        """Returns the data that it was trained on; others under the same name are a `UserError`."""
+        """Returns the training data; different data of the same name are a `UserError`."""
         return check_data(self.config.dataset(), self.data, f"this run ({self.config.source})")
 
     def origin(self) -> dict[str, Any]:
-        """Returns where it comes from: field, preset, seed and step."""
+        """Returns its provenance: field, preset, seed and step."""
         return {name: getattr(self.config, name) for name in ("field", "preset", "seed")} | {"step": self.step}
 
 
 def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | None = None) -> TrainedField:
-    """Returns a trained field for another receiver than those of its data: another place, orientation or array. At one of its
-    own receivers it is what it was; elsewhere it is the part that holds anywhere (the coherent field), without neighbours and
-    without a word on how sure it is, which nobody has measured there. `dataset` is what it was trained on, where it is read
-    already.
+    """Returns a trained field for a receiver that may differ from those of its data in position, orientation or array.
+
+    For a receiver of its data, the field is returned unchanged. For any other receiver, its receiver-independent part (the
+    coherent field) is returned, without residual kriging or mixture and without prediction intervals, for which there are no
+    measurements at that receiver. `dataset` is the training data, if they are already loaded.
 
     Raises:
-        UserError: nothing of the field holds elsewhere.
+        UserError: no part of the field is receiver-independent.
     """
     dataset = trained.dataset() if dataset is None else dataset
     if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
@@ -117,7 +118,7 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
 
 
 def at_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
-    """Returns a trained field for all receivers of other data (`at_receiver`): as it is if it was trained at every one."""
+    """Returns a trained field for all receivers of other data (`at_receiver`), unchanged if it was trained for all of them."""
     own = trained.dataset()
     for number in range(dataset.n_receivers):
         if (elsewhere := at_receiver(trained, dataset.receiver(number), own)) is not trained:
@@ -126,7 +127,7 @@ def at_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:
 
 
 def _same(a: Receiver, b: Receiver) -> bool:
-    if np.vdot(a.orientation, b.orientation) < 0:  # a quaternion and its negative are one turn
+    if np.vdot(a.orientation, b.orientation) < 0:  # a quaternion and its negative are the same rotation
         b = dataclasses.replace(b, orientation=-b.orientation)
     leaves = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return a.unit == b.unit and all(x.shape == y.shape and np.allclose(x, y, atol=SAME_PLACE_M) for x, y in leaves)

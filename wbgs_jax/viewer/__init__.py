@@ -1,4 +1,5 @@
-"""A trained field in a browser (viser): a room to look at, a transmitter to drag, and what its receiver sees.
+"""Viewer of a trained field in a browser (viser), with the room, a movable transmitter and the spectrum at the receiver.
 
-asking -> drawing -> scene, panel -> app. What is computed knows nothing of the browser, and what is drawn nothing of fields.
+Modules: session -> drawing -> surroundings, panel -> app. The computations (session) do not depend on the browser, and the
+drawing does not depend on fields.
 """

@@ -1,4 +1,4 @@
-"""The viewer itself: what is set is asked, and what is answered is drawn; always the newest, however fast things move."""
+"""The viewer application: changes of the controls are queried and the results drawn; outdated requests are skipped."""
 
 import contextlib
 import io
@@ -20,13 +20,13 @@ from wbgs_jax.viewer.session import Answer, Asker
 from wbgs_jax.viewer.surroundings import SceneView
 
 STEPS_A_SECOND = 20
-"""Of a walk."""
+"""Animation steps of a walk, per second."""
 HANDLE_SHARE = 0.06
-"""Size of the transmitter's arrows, as a share of the room's."""
+"""Size of the transmitter's arrows, relative to that of the room."""
 
 
 class Latest:
-    """Runs work in a thread of its own, always for the newest request: older ones that are still waiting are dropped."""
+    """Runs work in a separate thread for the newest request; older requests that are still waiting are dropped."""
 
     def __init__(self, work: Callable[[], None]):
         self._work, self._wanted, self._stopped, self._busy = work, threading.Event(), False, False
@@ -34,16 +34,16 @@ class Latest:
         self._thread.start()
 
     def request(self) -> None:
-        """Asks for the work to be done, or done once more."""
+        """Requests that the work be done (again)."""
         self._wanted.set()
 
     def wait(self) -> None:
-        """Waits until nothing is left to do."""
+        """Waits until all requested work is done."""
         while self._wanted.is_set() or self._busy:
             time.sleep(0.01)
 
     def stop(self) -> None:
-        """Ends the thread after what it is doing."""
+        """Stops the thread after its current work."""
         self._stopped = True
         self._wanted.set()
         self._thread.join()
@@ -57,7 +57,7 @@ class Latest:
                 return
             try:
                 self._work()
-            except Exception as error:  # the viewer goes on; whoever started it reads why nothing changed
+            except Exception as error:  # the viewer continues, and its terminal shows why nothing changed
                 say(f"viewer: {type(error).__name__}: {error}")
             self._busy = False
 
@@ -68,7 +68,7 @@ class Viewer:
     def __init__(self, asker: Asker, host: str = "localhost", port: int = 8080, html: Path = Path("scene.html"), up: str = "z"):
         self.asker, self.html, self.updates, self._ended = asker, html, 0, False
         data = asker.dataset
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table; the command says one line
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table; the command prints one line instead
             self.server = viser.ViserServer(host=host, port=port, label="wbgs-jax", verbose=False)
         self.view = SceneView(self.server, data, asker.receiver, up)
         self.start = np.median(data.tx_positions, axis=0)
@@ -87,17 +87,17 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """The port that it listens on."""
+        """The port of the server."""
         return self.server.get_port()
 
     @property
     def position(self) -> Float[np.ndarray, "3"]:
-        """Where the transmitter stands, metres."""
+        """Position of the transmitter, metres."""
         return np.array(self.controls.position.value, float)
 
     @property
     def frequency_hz(self) -> float:
-        """What is asked for."""
+        """The queried frequency, hertz."""
         return 1e9 * float(self.controls.ghz.value)
 
     @property
@@ -106,12 +106,12 @@ class Viewer:
         return HANDLE_SHARE * self.view.size
 
     def draw_map(self) -> None:
-        """Draws the received power over the plane that is set, and returns when it is drawn."""
+        """Draws the received power over the plane of the controls, and returns when it is drawn."""
         self._map.request()
         self._map.wait()
 
     def stop(self) -> None:
-        """Ends the server and its threads."""
+        """Stops the server and its threads."""
         self._ended = True
         self._spectrum.stop()
         self._map.stop()
@@ -119,7 +119,7 @@ class Viewer:
             self.server.stop()
 
     def move(self, position: Float[np.ndarray, "3"], drag: bool = True) -> None:
-        """Puts the transmitter somewhere."""
+        """Moves the transmitter to a position (metres); `drag` also moves its arrows."""
         x, y, z = (float(part) for part in position)
         self._quietly(self.controls.position, (x, y, z))
         if drag:
@@ -127,21 +127,21 @@ class Viewer:
         self._spectrum.request()
 
     def set_ghz(self, ghz: float) -> None:
-        """Sets the frequency."""
+        """Sets the frequency (GHz)."""
         self._quietly(self.controls.ghz, round(ghz, 4))
         self._quietly(self.controls.octave, round(float(np.log10(ghz)), 3))
         self._spectrum.request()
 
     def wait(self) -> None:
-        """Waits until what was asked for is drawn."""
+        """Waits until the requested prediction is drawn."""
         self._spectrum.wait()
 
     def set(self, control: Any, value: Any) -> None:
-        """Sets a control of the panel, as a person would."""
+        """Sets a control of the panel, with the same effect as in the browser."""
         control.value = value
 
     def save(self) -> Path:
-        """Writes what is seen as a page that opens without Python; returns its path."""
+        """Writes the current view as a page that opens without Python, and returns its path."""
         with atomic_write(self.html) as stream:
             stream.write(self.server.scene.as_html().encode())
         return self.html
@@ -163,7 +163,7 @@ class Viewer:
         self.server.initial_camera.look_at = tuple(middle)
 
     def _connect(self) -> None:
-        """Tells every control what follows from it."""
+        """Connects every control with its action."""
         c = self.controls
         self._drag.on_update(lambda _: self.move(np.array(self._drag.position), drag=False))
         c.position.on_update(lambda _: None if self._syncing else self.move(self.position))
@@ -185,7 +185,7 @@ class Viewer:
             m.reset.on_click(lambda _: self._as_trained(m))
 
     def _quietly(self, control: Any, value: Any) -> None:
-        """Sets a control without what follows from setting it."""
+        """Sets a control without triggering its action."""
         self._syncing = True
         try:
             control.value = value
@@ -193,7 +193,7 @@ class Viewer:
             self._syncing = False
 
     def _show(self) -> None:
-        """Asks the field, and draws the answer."""
+        """Queries the field and draws the prediction."""
         position, frequency, c, said = self.position, self.frequency_hz, self.controls, self.said
         answer = self.answer = self.asker.ask(position, frequency)
         with self.server.atomic():
@@ -233,8 +233,8 @@ class Viewer:
         first, last = self.view.draw_map(values, plane)
         m.progress.visible = False
         m.legend.content = (
-            f"Received power at {frequency / 1e9:.4g} GHz from transmitters {plane.height:.2f} m high: "
-            f"dark {first:.0f} dB to bright {last:.0f} dB of the transmitted power."
+            f"Received power at {frequency / 1e9:.4g} GHz from transmitters at z = {plane.height:.2f} m: "
+            f"dark {first:.0f} dB to bright {last:.0f} dB relative to the transmitted power."
         )
 
     def _remove_map(self) -> None:
@@ -243,7 +243,7 @@ class Viewer:
 
     def _show_material(self, m: panel.MaterialControls) -> None:
         found = self.asker.materials()
-        assert found is not None, "there are controls of materials where there are materials"
+        assert found is not None, "material controls exist only if there are materials"
         epsilon, sigma = (float(values[m.number]) for values in (found[1].permittivity, found[1].conductivity))
         self._quietly(m.permittivity, round(epsilon, 2))
         self._quietly(m.conductivity, round(float(np.log10(sigma)), 2))
@@ -263,7 +263,7 @@ class Viewer:
         self._spectrum.request()
 
     def _offer(self, client: viser.ClientHandle | None) -> None:
-        """Sends the page to whoever has pressed the button."""
+        """Sends the page to the browser in which the button was pressed."""
         if client is not None:
             client.send_file_download(self.html.name, self.server.scene.as_html().encode())
 

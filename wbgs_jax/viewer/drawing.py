@@ -1,4 +1,4 @@
-"""Numbers to what a browser shows: pictures, coloured points and lines. NumPy alone."""
+"""Conversion of numbers to images, coloured points and lines for the browser, with NumPy only."""
 
 import functools
 
@@ -11,20 +11,20 @@ from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 
 ZOOM = 2
-"""Screen pixels for one of a spectrum."""
+"""Screen pixels per pixel of a spectrum, along both axes."""
 DOME_STRIDE = 3
-"""Every third direction along both axes is drawn at the receiver."""
+"""Stride of the directions that are drawn at the receiver, along both axes."""
 PATH_RANGE_DB = 50.0
-"""Weaker paths than the strongest by more are drawn in the last colour."""
+"""Range of the colours of paths below the strongest one; weaker paths have the last colour."""
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
-"""Of paths without, with one, two and three reflections or diffractions (Okabe and Ito: told apart by the colour-blind)."""
+"""Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
 MATERIAL_COLORS = "tab20"
 MAP_MARGIN = 0.01
-"""Share of the extreme values that colours of a map leave out."""
+"""Fraction of the values at either end that lie beyond the colours of a map."""
 
 
 def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = "viridis") -> UInt8[np.ndarray, "*n 3"]:
-    """Returns colours of values; those beyond the ends have the ends' colours."""
+    """Returns the colours of values; values beyond the range have the colours of its ends."""
     share = (np.asarray(values, np.float64) - low) / max(high - low, 1e-12)
     return (255 * _table(name)[np.clip(share * 255, 0, 255).astype(int)]).astype(np.uint8)
 
@@ -35,27 +35,27 @@ def _table(name: str) -> Float[np.ndarray, "256 3"]:
 
 
 def spectrum_picture(pas: Float[np.ndarray, "90 360"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a spectrum as a picture: zenith on top, azimuth from -180 to 180 degrees."""
+    """Returns a spectrum as an image: zenith at the top, azimuth from -180 to 180 degrees."""
     return np.repeat(np.repeat(colored(pas, 0.0, 1.0), ZOOM, 0), ZOOM, 1)
 
 
 def dome(
     pas: Float[np.ndarray, "90 360"], rotation: Float[np.ndarray, "3 3"], radius: float
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Returns points around the receiver, the farther and brighter the more it hears from there (offsets in the world frame,
-    metres), and their colours. `rotation` turns its local frame into the world frame."""
-    heard = pas[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1)
+    """Returns points around the receiver (offsets in the world frame, metres), whose distance and brightness grow with the
+    amplitude from their direction, and their colours. `rotation` rotates the local frame into the world frame."""
+    amplitude = pas[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1)
     directions = pas_directions()[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1, 3) @ rotation.T
-    return (radius * (0.35 + 0.65 * heard))[:, None] * directions, colored(heard, 0.0, 1.0)
+    return (radius * (0.35 + 0.65 * amplitude))[:, None] * directions, colored(amplitude, 0.0, 1.0)
 
 
 def bounces(interaction: Int[np.ndarray, "k 5"]) -> Int[np.ndarray, " k"]:
-    """Returns how often paths are reflected or diffracted."""
+    """Returns the number of reflections and diffractions of paths."""
     return ((interaction != NONE) & (interaction != TRANSMITTED)).sum(-1)
 
 
 def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"], by_power: bool) -> UInt8[np.ndarray, "k 3"]:
-    """Returns a colour a path, by its power or by how often it is reflected."""
+    """Returns a colour per path, by its power or by its number of reflections and diffractions."""
     if by_power:
         top = float(power_db.max(initial=-300.0))
         return colored(power_db, top - PATH_RANGE_DB, top + PATH_RANGE_DB / 5, "plasma")  # its last colours are pale
@@ -63,13 +63,12 @@ def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"]
 
 
 def linear(colors: UInt8[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
-    """Returns colours as viser 1.1 wants them of lines and of many equal meshes: in proportion to light, not to how bright it
-    looks (sRGB)."""
+    """Returns sRGB colours as linear ones, which viser 1.1 expects for lines and for batches of equal meshes."""
     return (255 * (colors / 255.0) ** 2.2).round().astype(np.uint8)
 
 
 def path_segments(points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, "k 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the straight pieces of paths (n, 2, 3), and the colours of both ends of each (n, 2, 3)."""
+    """Returns the segments of paths (n, 2, 3) and the colours of their ends (n, 2, 3)."""
     pieces = np.stack([points[:, :-1], points[:, 1:]], 2)
     long = np.linalg.norm(pieces[:, :, 1] - pieces[:, :, 0], axis=-1) > 1e-6
     ends = np.repeat(np.repeat(colors[:, None], 4, 1)[:, :, None], 2, 2)
@@ -77,13 +76,13 @@ def path_segments(points: Float[np.ndarray, "k 5 3"], colors: UInt8[np.ndarray, 
 
 
 def path_handles(points: Float[np.ndarray, "k 5 3"]) -> Float[np.ndarray, "k 3"]:
-    """Returns a place on every path to click at: where it first changes its direction, or the middle of a straight one."""
+    """Returns a point to click on for every path: where it first changes its direction, or the middle of a straight path."""
     straight = np.linalg.norm(points[:, 1] - points[:, 2], axis=-1) < 1e-6
     return np.where(straight[:, None], (points[:, 0] + points[:, 1]) / 2, points[:, 1])
 
 
 def stems(delay_ns: Float[np.ndarray, " k"], power_db: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a line that shows an impulse response: along the floor, and up to every path's power at its delay."""
+    """Returns delays and powers of a line that shows an impulse response: a floor, with a stem at the delay of every path."""
     order = np.argsort(delay_ns)
     delay, power = delay_ns[order], power_db[order]
     floor = float(power.max(initial=-200.0)) - PATH_RANGE_DB
@@ -92,11 +91,11 @@ def stems(delay_ns: Float[np.ndarray, " k"], power_db: Float[np.ndarray, " k"]) 
 
 
 def map_picture(values: Float[np.ndarray, "ny nx"]) -> tuple[UInt8[np.ndarray, "ny nx 4"], float, float]:
-    """Returns a map as a picture, the largest y on top, clear where nothing is heard; and the values of the first and the last
-    colour."""
-    heard = values > NOT_HEARD_DB
-    low, high = np.quantile(values[heard], [MAP_MARGIN, 1 - MAP_MARGIN]) if heard.any() else (-100.0, 0.0)
-    picture = np.concatenate([colored(values, float(low), float(high)), 230 * heard[..., None].astype(np.uint8)], -1)
+    """Returns a map as an image, with the largest y at the top, transparent where nothing is received; and the values of the
+    first and the last colour."""
+    received = values > NOT_HEARD_DB
+    low, high = np.quantile(values[received], [MAP_MARGIN, 1 - MAP_MARGIN]) if received.any() else (-100.0, 0.0)
+    picture = np.concatenate([colored(values, float(low), float(high)), 230 * received[..., None].astype(np.uint8)], -1)
     return np.ascontiguousarray(picture[::-1]), float(low), float(high)
 
 

@@ -1,4 +1,4 @@
-"""The viewer's panel: what can be set, and what is said about the answer."""
+"""The viewer's panel: its controls, and the display of predictions."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,28 +17,28 @@ from wbgs_jax.viewer.session import Answer, Asker, PathList, Sample
 BLACK = np.zeros((90, 360))
 MOST_PATHS = 200
 PERMITTIVITY, LOG_CONDUCTIVITY = (1.01, 12.0), (-6.0, 7.0)
-"""Ends of the sliders; log10 of S/m."""
+"""Ranges of the sliders; the conductivity as log10 of S/m."""
 THICKNESS_MM = (0.5, 500.0)
 LABEL_ROOM = 0.27
-"""Decades between two frequencies that are written below the slider."""
+"""Minimum distance, in decades, of two frequencies that are labelled below the slider."""
 
 
 @dataclass
 class MapControls:
-    """Of the map."""
+    """Controls of the map."""
 
     height: viser.GuiSliderHandle
     step: viser.GuiNumberHandle
     draw: viser.GuiButtonHandle
     clear: viser.GuiButtonHandle
     progress: Any
-    """A progress bar, whose type viser does not name."""
+    """Progress bar; viser does not export its type."""
     legend: viser.GuiMarkdownHandle
 
 
 @dataclass
 class MaterialControls:
-    """Of a material."""
+    """Controls of the material."""
 
     chosen: viser.GuiDropdownHandle
     permittivity: viser.GuiSliderHandle
@@ -50,13 +50,13 @@ class MaterialControls:
 
     @property
     def number(self) -> int:
-        """Which material is chosen."""
+        """Index of the chosen material."""
         return int(str(self.chosen.value).split(":")[0])
 
 
 @dataclass
 class Controls:
-    """What a person sets."""
+    """Controls of the panel."""
 
     position: viser.GuiVector3Handle
     octave: viser.GuiSliderHandle
@@ -76,7 +76,7 @@ class Controls:
 
 @dataclass
 class Said:
-    """What is said about the answer."""
+    """Elements of the panel that display a prediction."""
 
     summary: viser.GuiMarkdownHandle
     spectrum: viser.GuiImageHandle
@@ -89,10 +89,11 @@ class Said:
 def make_panel(
     server: viser.ViserServer, asker: Asker, start: Float[np.ndarray, "3"], heights: tuple[float, float], top: float
 ) -> tuple[Controls, Said]:
-    """Returns the panel of a server for a field, with a transmitter at its start; heights of the room in metres."""
+    """Creates the panel of a field on a server. `start` is the initial position of the transmitter; `heights` is the initial
+    range of drawn heights, and `top` its upper limit (metres)."""
     gui, known = server.gui, np.unique(asker.dataset.frequencies_hz) / 1e9
-    summary = gui.add_markdown("*compiling the field, which takes a moment ...*")
-    spectrum = gui.add_image(drawing.spectrum_picture(BLACK), label="what the receiver sees", format="jpeg", jpeg_quality=85)
+    summary = gui.add_markdown("*compiling the field, which takes a while ...*")
+    spectrum = gui.add_image(drawing.spectrum_picture(BLACK), label="spectrum at the receiver", format="jpeg", jpeg_quality=85)
     with gui.add_folder("Transmitter"):
         position = gui.add_vector3("x, y, z [m]", (start[0], start[1], start[2]), step=0.05)
         low = lowest_frequency(asker.trained.field, asker.dataset)
@@ -101,7 +102,7 @@ def make_panel(
         octave = gui.add_slider("frequency", *ends, step=0.001, initial_value=float(np.log10(first)), marks=marks_at(known))
         ghz = gui.add_number("GHz", first, min=low / 1e9, max=MAX_FREQUENCY_HZ / 1e9, step=0.1)
         play = gui.add_checkbox("walk through the room", False)
-        speed = gui.add_slider("metres a second", 0.2, 3.0, step=0.1, initial_value=1.0)
+        speed = gui.add_slider("metres per second", 0.2, 3.0, step=0.1, initial_value=1.0)
     tabs = gui.add_tab_group()
     with tabs.add_tab("Truth"):
         truth_words = gui.add_markdown("")
@@ -111,7 +112,7 @@ def make_panel(
         most = MOST_PATHS if asker.knows_paths else 0
         paths = gui.add_slider("strongest", 0, MOST_PATHS, step=1, initial_value=min(30, most), disabled=not most)
         by_power = gui.add_dropdown("color", ("by power", "by reflections"), disabled=not most)
-        path = gui.add_markdown("Click a ball on a path." if most else "This field knows no paths.")
+        path = gui.add_markdown("Click on the ball of a path." if most else "This field does not predict paths.")
     with tabs.add_tab("Room"):
         cut = gui.add_multi_slider("heights [m]", heights[0], top, step=0.01, initial_value=heights)
         gaussians = _gaussians(gui, asker)
@@ -120,13 +121,13 @@ def make_panel(
         map_controls = _map_controls(gui, asker)
     with tabs.add_tab("Materials"):
         material = _material_controls(gui, asker)
-    impulse = _impulse_plot(gui) if most else None  # in a tab that is hidden at first it would have no width
+    impulse = _impulse_plot(gui) if most else None  # in an initially hidden tab it would have no width
     chosen = play, speed, cut, samples, paths, by_power, gaussians, map_controls, material, save
     return Controls(position, octave, ghz, *chosen), Said(summary, spectrum, truth, truth_words, impulse, path)
 
 
 def marks_at(ghz: Float[np.ndarray, " n"]) -> tuple:
-    """Returns the slider's marks: every frequency of the data, with its number where there is room for it."""
+    """Returns the marks of the slider: all frequencies of the data, labelled if there is enough space."""
     marks, last = [], -np.inf
     for f in ghz:
         place = float(np.log10(f))
@@ -146,7 +147,7 @@ def _impulse_plot(gui: viser.GuiApi) -> viser.GuiUplotHandle:
 
 
 def _gaussians(gui: viser.GuiApi, asker: Asker) -> viser.GuiDropdownHandle | None:
-    """Returns the choice of how Gaussians are drawn; None where the field has none."""
+    """Returns the menu of what the colours of Gaussians show; None if the field has no Gaussians."""
     if asker.splatted(asker.dataset.tx_positions[0], float(asker.dataset.frequencies_hz[0])) is None:
         return None
     return gui.add_dropdown("Gaussians", ("off", "signal", "attenuation"))
@@ -162,16 +163,16 @@ def _map_controls(gui: viser.GuiApi, asker: Asker) -> MapControls:
         gui.add_button("draw received power", disabled=off),
         gui.add_button("remove", disabled=off),
         gui.add_progress_bar(0.0, visible=False),
-        gui.add_markdown("This field knows no power." if off else ""),
+        gui.add_markdown("This field does not predict power." if off else ""),
     )
 
 
 def _material_controls(gui: viser.GuiApi, asker: Asker) -> MaterialControls | None:
-    """Returns the material that is chosen, its permittivity, conductivity and thickness, and a button that takes changes back;
-    None where the field knows no materials."""
+    """Returns the controls of a material: a menu, its permittivity, conductivity and thickness, and a button that undoes all
+    changes; None if the field has no materials."""
     found = asker.materials()
     if found is None:
-        gui.add_markdown("This field knows no materials.")
+        gui.add_markdown("This field has no materials.")
         return None
     names, properties = found
     epsilon = float(np.clip(properties.permittivity[0], *PERMITTIVITY))
@@ -187,7 +188,7 @@ def _material_controls(gui: viser.GuiApi, asker: Asker) -> MaterialControls | No
 
 
 def summary_words(answer: Answer, frequency_hz: float) -> str:
-    """Returns what stands above the spectrum."""
+    """Returns the text above the spectrum."""
     lines = [f"**{frequency_hz / 1e9:.4g} GHz**"]
     if answer.power_db is not None:
         lines[0] += f" · received {answer.power_db:.1f} dB"
@@ -201,21 +202,21 @@ def summary_words(answer: Answer, frequency_hz: float) -> str:
 
 
 def channel_words(paths: PathList) -> str:
-    """Returns K-factor and delay spread."""
+    """Returns a line with K-factor, delay spread and number of paths."""
     spread = f"delay spread {1e9 * paths.delay_spread_s:.1f} ns"
     return f"K-factor {paths.k_factor_db:.1f} dB · {spread} · {len(paths.power_db)} paths"
 
 
 def sample_words(sample: Sample | None) -> str:
-    """Returns what stands above the truth."""
+    """Returns the text above the observed spectrum."""
     if sample is None:
-        return "The data hold no spectra of this receiver."
+        return "The data contain no spectra of this receiver."
     place = f"{sample.distance_m:.2f} m away, {sample.frequency_hz / 1e9:g} GHz, {sample.part}"
     return f"Nearest transmitter of the data ({place}). **SSIM of the field there: {sample.ssim:.3f}**"
 
 
 def path_words(paths: PathList, number: int) -> str:
-    """Returns what is known of one path."""
+    """Returns a description of one path."""
     zenith = np.degrees(np.arccos(np.clip(paths.direction[number, 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(paths.direction[number, 1], paths.direction[number, 0]))
     return "  \n".join(

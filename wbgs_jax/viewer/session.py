@@ -1,4 +1,4 @@
-"""What the viewer asks of a trained field: everything about one transmitter at one frequency, compiled once."""
+"""Predictions for the viewer: all quantities for one transmitter at one frequency, compiled once."""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,20 +29,20 @@ from wbgs_jax.types import Query, make_query
 
 @dataclass(frozen=True)
 class PathList:
-    """The paths of one link, the strongest first."""
+    """Paths of one link, the strongest first."""
 
     points: Float[np.ndarray, "k 5 3"]
-    """Transmitter, where the wave is reflected or diffracted, receiver; the receiver fills the rest. World frame, metres."""
+    """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
     amplitude: Complex[np.ndarray, " k"]
     power_db: Float[np.ndarray, " k"]
     length: Float[np.ndarray, " k"]
     """Metres."""
     direction: Float[np.ndarray, "k 3"]
-    """Of arrival, unit vectors in the receiver's frame."""
+    """Directions of arrival, unit vectors in the receiver's frame."""
     interaction: Int[np.ndarray, "k 5"]
-    """Types, as `propagation.paths` has them."""
+    """Types of interaction (`propagation.paths`)."""
     words: tuple[str, ...]
-    """What each path meets: "off concrete, through glass"."""
+    """Descriptions of the interactions, such as "off concrete, through glass"."""
     k_factor_db: float
     delay_spread_s: float
 
@@ -54,18 +54,18 @@ class PathList:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a field says of one transmitter at one frequency."""
+    """Prediction of a field for one transmitter at one frequency."""
 
     pas: Float[np.ndarray, "90 360"]
     power_db: float | None
-    """Relative to the transmitted power; None where the field knows of none."""
+    """Received power relative to the transmitted power; None if the field does not predict it."""
     expected: tuple[float, float, float] | None
-    """Expected SSIM, and the ends of its interval ..."""
+    """Expected SSIM and the ends of its interval, ..."""
     level: float | None
-    """... in which the true one lies with this chance."""
+    """... and the probability of this interval."""
     paths: PathList | None
     doubts: tuple[str, ...]
-    """Why the answer should not be trusted, a line each."""
+    """Warnings that the prediction is unreliable, one line each."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,13 @@ class Sample:
     part: str
     """"training", "validation" or "test"."""
     ssim: float
-    """Of what the field says there."""
+    """SSIM of the prediction of the field for this link."""
 
 
 class Asker:
-    """A trained field, asked about single transmitters.
+    """A trained field that is queried for single transmitters.
 
-    Materials and thicknesses may be changed; everything else is as it was trained.
+    Material properties and thicknesses can be changed; everything else is as trained.
     """
 
     def __init__(self, loaded: LoadedField):
@@ -99,12 +99,12 @@ class Asker:
 
     @property
     def knows_paths(self) -> bool:
-        """Whether the field knows paths."""
+        """Whether the field predicts paths."""
         return "paths" in outputs_of(self.trained.field)
 
     @property
     def knows_power(self) -> bool:
-        """Whether the field knows received power."""
+        """Whether the field predicts received power."""
         try:
             check_power(self.trained.field, self.dataset)
         except UserError:
@@ -112,13 +112,13 @@ class Asker:
         return True
 
     def ask(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Answer:
-        """Returns what the field says of a transmitter (world frame, metres)."""
+        """Returns the prediction for a transmitter (world frame, metres)."""
         query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
         learned = self._neighbours, self._confidence
         found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
         pas, power, expected, paths = jax.tree.map(np.asarray, found)
         place = np.asarray(position, np.float64)[None]
-        unsure = self.loaded.domain.warnings(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
+        unreliable = self.loaded.domain.warnings(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
         expected = None if self.loaded.domain.outside(place)[0] else expected
         return Answer(
             pas,
@@ -126,11 +126,11 @@ class Asker:
             None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
             None if self._confidence is None or expected is None else float(self._confidence.level),
             None if paths is None else self._listed(*paths),
-            tuple(unsure),
+            tuple(unreliable),
         )
 
     def nearest_sample(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Sample | None:
-        """Returns the observed spectrum nearest to a transmitter and frequency; None where the data have no spectra."""
+        """Returns the observed spectrum nearest to a transmitter and frequency; None if the receiver has no spectra."""
         if not len(self._spectra):
             return None
         data, index = self.dataset, self._spectra
@@ -143,7 +143,7 @@ class Asker:
         return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
 
     def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> GaussianState | None:
-        """Returns the Gaussians with attenuation and signal (NumPy) of a field that splats."""
+        """Returns the Gaussians with attenuation and signal (NumPy); None if the field has none."""
         query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
         found = self.trained.field.inspect(self.trained.params, self.plan, query).gaussians
         return jax.tree.map(np.asarray, found)
@@ -151,7 +151,7 @@ class Asker:
     def power_plane(
         self, plane: Plane, frequency_hz: float, progress: Callable[[float], None] = lambda share: None
     ) -> Float[np.ndarray, "ny nx"]:
-        """Returns the received power (dB) from transmitters all over a plane; `progress` hears the share that is done."""
+        """Returns the received power (dB) from transmitters all over a plane; `progress` receives the completed fraction."""
         frequencies, done = np.array([frequency_hz]), 0
         total = pieces(plane, frequencies)
 
@@ -164,7 +164,7 @@ class Asker:
         return evaluate_plane("power", now, plane, frequencies, advance)["power_db"][0]
 
     def materials(self) -> tuple[tuple[str, ...], MaterialProperties] | None:
-        """Returns names and properties of the materials; None of a field that knows of none."""
+        """Returns the names and properties of the materials; None if the field has none."""
         found = self.trained.field.inspect(self.trained.params).materials
         if found is None:
             return None
@@ -172,7 +172,7 @@ class Asker:
         return tuple(name or f"material {number}" for number, name in enumerate(names[: len(found.permittivity)])), found
 
     def change_material(self, number: int, permittivity: float, conductivity: float) -> None:
-        """Gives a material another permittivity and conductivity at 1 GHz (S/m) from now on."""
+        """Changes the permittivity and conductivity of a material at 1 GHz (S/m) for later queries."""
         found = self._calibratable()
         own = found.field.with_material(found.of(self.trained.params), number, permittivity, conductivity)
         params = found.put(self.trained.params, own)
@@ -180,7 +180,7 @@ class Asker:
         self._samples.clear()
 
     def change_thickness(self, number: int, metres: float) -> None:
-        """Makes all walls of a material this thick from now on."""
+        """Changes the thickness of all walls of a material for later queries."""
         found = self._calibratable()
         own, planned = found.field.with_thickness(found.of(self.plan), number, metres)
         field, self.plan = found.put(self.trained.field, own), found.put(self.plan, planned)
@@ -189,16 +189,16 @@ class Asker:
 
     def _calibratable(self) -> Ability[Calibratable]:
         found = self.trained.field.ability(Calibratable)
-        assert found is not None, "asked of a field with `materials`"
+        assert found is not None, "only called for fields with `materials`"
         return found
 
     def restore(self, trained: TrainedField) -> None:
-        """Asks a field as it was trained from now on."""
+        """Uses `trained` for later queries, without changes of materials."""
         self.trained, self.plan = trained, self.loaded.plan
         self._samples.clear()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
-        """Returns the links of this receiver whose spectra are known."""
+        """Returns the indices of the links of this receiver with observed spectra."""
         if not self.dataset.has_spectra:
             return np.zeros(0, int)
         places = np.asarray(self.dataset.receivers.position)
@@ -209,10 +209,10 @@ class Asker:
         data, index = self.dataset, np.array([link])
         position, frequency = data.tx_positions[link], float(data.frequencies_hz[link])
         truth = np.asarray(data.pas(index))
-        said = as_observed(self.trained.field, self.trained.params, self.ask(position, frequency).pas[None])
+        predicted = as_observed(self.trained.field, self.trained.params, self.ask(position, frequency).pas[None])
         parts = {"training": data.train, "validation": data.validation, "test": data.test}
         part = next((name for name, links in parts.items() if link in links), "other")
-        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(said, truth)[0]))
+        return Sample(truth[0], position, frequency, 0.0, part, float(ssim(predicted, truth)[0]))
 
     def _listed(self, arrived: Arrivals, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
         power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
@@ -229,8 +229,8 @@ class Asker:
 def _answer(
     field: Field, params: Any, plan: Any, query: Query, neighbours: Any, confidence: Any, with_paths: bool
 ) -> tuple[Any, Any, Any, Any]:
-    """Returns spectrum, power, expected SSIM, and arrivals with K-factor and delay spread, of a batch of one query, without its
-    axis."""
+    """Returns spectrum, power, expected SSIM, and paths with K-factor and delay spread, for a batch of one query, without the
+    batch axis."""
     seen = field.render(params, plan, query)
     pas = correct(neighbours, seen.pas, query)
     expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)

@@ -1,4 +1,4 @@
-"""The three-dimensional part of the viewer: the room, the receiver and what it sees, paths, Gaussians, maps."""
+"""The three-dimensional part of the viewer: room, receiver with its spectrum, paths, Gaussians and maps."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -17,22 +17,22 @@ from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.session import PathList
 
 CEILING_CUT = 0.02
-"""Share of the room's height below its top that is cut away at the start, so that one can look in."""
+"""Fraction of the room's height that is initially cut off at the top, so that the interior is visible."""
 AXES_AWAY_M = 0.5
-"""Metres between the room and the axes."""
+"""Distance of the axes from the room, metres."""
 DOME_RADIUS = 0.4
-"""Of what the receiver hears, as a share of the room's shortest side."""
+"""Radius of the spectrum around the receiver, relative to the shortest side of the room."""
 HANDLE_RADIUS = 0.04
-"""Metres: of the balls on paths that are clicked at."""
+"""Radius of the clickable balls on paths, metres."""
 CHOSEN = np.array([[214, 39, 40]], np.uint8)
-"""Colour of the path that was clicked at."""
+"""Colour of the chosen path."""
 MOST_GAUSSIANS = 20_000
 SPHERE = 8
-"""Corners around the ball."""
+"""Number of corners around a ball."""
 
 
 class SceneView:
-    """Everything with a place in the room."""
+    """All objects with a position in the room."""
 
     def __init__(self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver, up: str = "z"):
         self.scene, self.dataset, self.up = server.scene, dataset, "xyz".index(up)
@@ -46,7 +46,7 @@ class SceneView:
         self.clip(*self.heights())
 
     def heights(self) -> tuple[float, float]:
-        """Returns from and up to which height the room is drawn at first: without its ceiling."""
+        """Returns the initial range of drawn heights, which excludes the ceiling."""
         low, high = self.box[:, self.up]
         return float(low), float(high - CEILING_CUT * (high - low))
 
@@ -71,7 +71,7 @@ class SceneView:
         )
 
     def clip(self, low: float, high: float) -> None:
-        """Draws the surfaces whose middle lies between two heights (metres), a colour a material."""
+        """Draws the triangles whose centroid lies between two heights (metres), with one colour per material."""
         shown = (self._centroids[:, self.up] >= low) & (self._centroids[:, self.up] <= high)
         materials = self.dataset.materials
         number = np.zeros(len(shown), int) if materials is None else materials.material
@@ -94,7 +94,7 @@ class SceneView:
             )
 
     def draw_dome(self, pas: Float[np.ndarray, "90 360"]) -> None:
-        """Draws what the receiver hears around it."""
+        """Draws the received spectrum around the receiver."""
         radius = DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
         points, colors = drawing.dome(pas, self._rotation, radius)
         self.scene.add_point_cloud(
@@ -108,7 +108,7 @@ class SceneView:
     def draw_paths(
         self, paths: PathList | None, count: int, by_power: bool, chosen: int | None, on_click: Callable[[int], None]
     ) -> None:
-        """Draws the strongest paths, with a ball on each to click at; a chosen one in red."""
+        """Draws the strongest paths, each with a clickable ball; the chosen path is red."""
         if paths is None or not count or not len(paths.power_db):
             for name in ("/paths", "/path_handles", "/chosen_path"):
                 self.scene.remove_by_name(name)
@@ -140,7 +140,7 @@ class SceneView:
             upright.astype(np.float32),
             places.astype(np.float32),
             batched_colors=drawing.linear(colors),
-            lod="off",  # simplified, its poles have no normals
+            lod="off",  # a simplified ball has no normals at its poles
             cast_shadow=False,
             receive_shadow=False,
         )
@@ -177,13 +177,13 @@ class SceneView:
         picture, low, high = drawing.map_picture(values)
         middle = np.array([(plane.xs[0] + plane.xs[-1]) / 2, (plane.ys[0] + plane.ys[-1]) / 2, plane.height])
         width, height = (float(np.ptp(a)) * len(a) / max(len(a) - 1, 1) for a in (plane.xs, plane.ys))
-        # The picture's upper edge is its first row: turned about x, so that rows run down y and it faces upwards.
+        # The first row of the image is its upper edge; it is rotated about x, so that y decreases along rows and it faces up.
         self.scene.add_image("/map", picture, width, height, position=middle, wxyz=(0.0, 1.0, 0.0, 0.0), format="png")
         return low, high
 
 
 def _ball(radius: float) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
-    """Returns a ball of few triangles."""
+    """Returns the vertices and faces of a ball with few triangles."""
     zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, SPHERE // 2 + 1), np.linspace(0, 2 * np.pi, SPHERE + 1), indexing="ij")
     vertices = radius * np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
     index = np.arange(zenith.size).reshape(zenith.shape)

@@ -1,11 +1,11 @@
-"""A walk through the room: a closed way along some of the data's transmitters, at a steady pace."""
+"""A walk through the room: a closed route along some of the transmitters of the data, at constant speed."""
 
 import numpy as np
 from jaxtyping import Float
 
 
 def stops(tx_positions: Float[np.ndarray, "n 3"], count: int = 8, seed: int = 0) -> Float[np.ndarray, "count 3"]:
-    """Returns transmitters far from each other, in an order that makes a short round trip."""
+    """Returns transmitters that are far apart, in the order of a short round trip."""
     places = np.unique(tx_positions, axis=0)
     chosen = [int(np.random.default_rng(seed).integers(len(places)))]
     away = np.linalg.norm(places - places[chosen[0]], axis=1)
@@ -22,7 +22,7 @@ def stops(tx_positions: Float[np.ndarray, "n 3"], count: int = 8, seed: int = 0)
 
 
 def place_on(way: Float[np.ndarray, "n 3"], distance_m: float) -> Float[np.ndarray, "3"]:
-    """Returns where one is after a distance along a closed way."""
+    """Returns the position after a distance along a closed route."""
     closed = np.concatenate([way, way[:1]])
     lengths = np.linalg.norm(np.diff(closed, axis=0), axis=1)
     total = lengths.sum()
