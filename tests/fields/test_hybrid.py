@@ -49,7 +49,7 @@ def trusting(params, spectra, power):
 def weighted(run, params, batches):
     """Parameters with the shares that some batches tell, and the report."""
     context = Context(run.data, run.prepared, run.dataset.train, validation=lambda: batches)
-    edit = ExpertWeights().apply(run.field, params, (), context, 4, None)
+    edit = ExpertWeights().apply(run.field, params, (), context, 4, np.random.default_rng(0))
     return edit.params, edit.report
 
 
