@@ -83,7 +83,8 @@ def spectra_of(
     elements: Float[Array, "elements 3"] | Float[Array, "n elements 3"],
     steering: Complex[Array, "90 360 elements"] | None = None,
 ) -> Spectra | None:
-    """Returns the power angular spectra of n links (`Kind.to_spectra`); None if the observations have none."""
+    """Returns the power angular spectra of n links (`Kind.to_spectra`), observed ones as data hold them (8 bits); None if the
+    observations have none."""
     for name, kind in KINDS.items():
         if name in observations and kind.to_spectra is not None:
             return kind.to_spectra(observations[name], elements, steering)

@@ -275,7 +275,8 @@ def _pas(of: Known) -> Callable[..., Any]:
 
 def _render(of: Known) -> Callable[..., Any]:
     plan = of.field.plan(of.params, of.dataset.receiver())
-    return lambda params, place: of.field.render(params, plan, wb.make_query(place, of.query.frequency_hz))
+    query = lambda place: wb.make_query(place, of.query.frequency_hz)  # noqa: E731
+    return lambda params, place: of.field.render(params, plan, query(place))._replace(paths=None)  # `wave.channels` has them
 
 
 def _of_waves(of: Known) -> list[Case]:

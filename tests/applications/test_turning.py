@@ -73,6 +73,12 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     np.testing.assert_allclose(turned[0], said, atol=0.05)
 
 
+def test_a_frequency_in_gigahertz_is_refused():
+    field, params, _ = field_of([rectangle((-5, 2, -5), (15, 0, 0), (0, 0, 15))], RX, conductivity=METAL, **SMALL)
+    with pytest.raises(ValueError, match="in hertz"):
+        arrivals_anywhere(field, params, RX, [[1.0, 0, 0]], 28.0)
+
+
 def test_a_field_without_paths_turns_nothing():
     field = Blind()
     with pytest.raises(UserError, match="predicts no paths"):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
-from wbgs_jax.observation_kinds import HostObservations, Kind, Observed, only_kind
+from wbgs_jax.observation_kinds import KINDS, HostObservations, Kind, Observed, only_kind
 from wbgs_jax.radio.array import PAS_SHAPE
 from wbgs_jax.types import Links, Query, Receiver
 
@@ -70,6 +70,8 @@ class Dataset(Observed):
 
     def __post_init__(self) -> None:
         only_kind(self.observations, self.name)
+        if unknown := self.observations.keys() - KINDS.keys():
+            raise ValueError(f"{self.name}: unknown kind of observation {min(unknown)!r}; register it in observation_kinds")
         columns = (self.tx_positions, self.receiver_index, self.tx_index, *self.observations.values())
         if any(len(column) != len(self) for column in columns):
             raise ValueError(f"{self.name}: arrays of links have lengths {[*map(len, columns)]}; all must be {len(self)}")

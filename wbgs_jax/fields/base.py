@@ -26,7 +26,7 @@ from wbgs_jax.config import PRESETS, Settings
 from wbgs_jax.fields.losses import LOSSES, image_loss
 from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
-from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene
+from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene, check_query
 
 T = TypeVar("T")
 Params = Any
@@ -381,13 +381,19 @@ def field_from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) 
     return cls(**parts, config=config)  # type: ignore[call-arg]
 
 
-@jax.jit
 def paths_of(field: Field, params: Params, plan: Any, links: Query | Links) -> Arrivals:
     """Returns all paths of B links, leading axis B, from a field whose `outputs` include "paths".
 
     Raises:
+        ValueError: positions or frequencies are invalid.
         UserError: the field predicts no paths.
     """
+    check_query(links.query)  # here: under `jit` there are no values to check
+    return _paths_of(field, params, plan, links)
+
+
+@jax.jit
+def _paths_of(field: Field, params: Params, plan: Any, links: Query | Links) -> Arrivals:
     paths = field.render(params, plan, links).paths
     if paths is None:
         raise UserError(f"the {field.name} field of this run predicts no paths; train the default one on data with a mesh")
@@ -467,8 +473,8 @@ def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity
         params: its parameters.
         receiver: one receiver.
         query: transmitter positions (metres) and frequencies (hertz).
-        capacity: static sizes, which a field with a capacity needs under `jit` or `grad` (`field.capacity(params, receiver)`,
-            on the host). A capacity that is too small gives NaN, never a wrong spectrum.
+        capacity: static sizes, which a field with a capacity needs under `jit` or `grad`, found on the host:
+            `field.capacity(params, stack_receivers([receiver]))`. One that is too small gives NaN, never a wrong spectrum.
     """
     return field.render(params, field.plan(params, receiver, None, capacity), query).pas
 

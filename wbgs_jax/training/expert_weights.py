@@ -53,9 +53,10 @@ class ExpertWeights(Hook):
         self, field: Field, params: Params, statistics: tuple[()], context: Context, step: int, rng: np.random.Generator
     ) -> Edit:
         """Returns the parameters with fitted weights, or unchanged if a component or the validation links are missing."""
-        batches, mixing = context.validation(), field.ability(Mixing)
-        same = Edit(params, (), lambda tree: tree, {})
-        if mixing is None or not batches or len(components_of(field)) < len(field.components):
+        mixing, same = field.ability(Mixing), Edit(params, (), lambda tree: tree, {})
+        if mixing is None or len(components_of(field)) < len(field.components):
+            return same
+        if not (batches := context.validation()):
             return same
         raw = mixing.put(params, mixing.field.with_shares(mixing.of(params)))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}

@@ -185,6 +185,7 @@ class Run:
         begin, length = time.perf_counter(), self.settings.loop.epoch_steps
         resized = not self._known
         if not self.launched:
+            _ = self.sizes  # before the device is busy: later they would wait for it
             self._launch(self.step)
         if go_on:
             self._launch(self.launched[-1].step + length)
@@ -274,6 +275,10 @@ class Run:
             UserError: the epoch has stopped for the only other reason, a loss or gradient that is not finite.
         """
         if report.overflow:
+            if self.capacity is None:
+                raise NotImplementedError(
+                    f"`loss` of the {self.field.name} field reports an overflow, but it has no `capacity`"
+                )
             needed = self.field.capacity(self.state.params, self.dataset.receivers, np.asarray(report.required))
             self.capacity = self.capacity.grown_to(needed)
             self.compilations += 1

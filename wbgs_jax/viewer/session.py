@@ -12,7 +12,7 @@ from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, outputs_of, paths_of
+from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, outputs_of
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.intervals import Expected, expected_ssim
@@ -236,7 +236,8 @@ def _answer(
     expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
     paths = None
     if with_paths:
-        arrived = paths_of(field, params, plan, query)
+        arrived = seen.paths
+        assert arrived is not None, "the field predicts paths"
         paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
     return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, paths))
 
