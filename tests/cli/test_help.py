@@ -16,7 +16,9 @@ print(json.dumps(sorted({"jax", "flax", "matplotlib", "orbax", "scipy", "trimesh
 """
 
 
-@pytest.mark.parametrize("words", [["--help"], ["predict", "--help"], ["map", "--help"], ["convert", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["predict", "--help"], ["map", "--help"], ["convert", "--help"], ["view", "--help"]]
+)
 def test_help_loads_nothing_large(words):
     done = subprocess.run([sys.executable, "-c", PROBE, *words], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == []

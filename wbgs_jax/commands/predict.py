@@ -27,7 +27,7 @@ from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
 from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference import results_file
-from wbgs_jax.inference.quantities import QUANTITIES, Options, names_for
+from wbgs_jax.inference.quantities import COMPILED, QUANTITIES, Options, names_for
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.inference.results_file import Answers, open_parts
 
@@ -170,14 +170,13 @@ def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField
     if cached := load_cached(command.run, command.rx, command.what, len(queries), lowest):
         return cached
     from wbgs_jax.inference.evaluate_quantities import check_quantity
-    from wbgs_jax.inference.export import FROZEN
     from wbgs_jax.training.run_folder import sources_of
 
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
     options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
     loaded = load_field(command.run, command.rx, lowest, options)
     check_quantity(command.what, loaded.trained.field, loaded.dataset)
-    if few and command.what in FROZEN:
+    if few and command.what in COMPILED:
         watched = sources_of(command.run, loaded.trained.config)
         return make_cached(command.run, command.rx, len(queries), loaded, watched) or loaded
     return loaded

@@ -79,10 +79,10 @@ def start(command: Command) -> "Viewer":
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
-    use_compilation_cache()
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax view")
     check(command)
     check_writable(command.html)
+    use_compilation_cache()
     if command.html:
         say(f"drawing the predictions of {command.run} ...")
     viewer = start(command)

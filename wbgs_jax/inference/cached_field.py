@@ -21,7 +21,7 @@ from wbgs_jax._util.compilation import cache_folder, load_program, source_digest
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, opened_archive
 from wbgs_jax.inference.domain import Domain
-from wbgs_jax.inference.quantities import QUANTITIES
+from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.queries import Product
 from wbgs_jax.types import Query
 
@@ -61,9 +61,8 @@ class CachedField:
         order = np.argsort(rows)
         positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])[order]
         frequencies = np.concatenate([np.tile(one.frequencies_hz, len(one.tx_positions)) for one in block])[order]
-        chosen = np.minimum(
-            np.arange(size_for(len(rows))), len(rows) - 1
-        )  # the block is filled up with copies of the last query
+        # The block is filled up with copies of the last query.
+        chosen = np.minimum(np.arange(size_for(len(rows))), len(rows) - 1)
         query = np.asarray(positions, np.float32)[chosen], np.asarray(frequencies, np.float32)[chosen]
         found = self.program(*self.arrays, *query)
         answers = {name: np.asarray(found[name])[: len(rows)] for name in QUANTITIES[what].outputs if name in found}
@@ -86,13 +85,15 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
         count: number of queries.
         lowest_hz: their lowest frequency.
     """
+    if count > MOST or what not in COMPILED:
+        return None
     path = _place(run, rx, count)
-    if count > MOST or path is None or not path.exists():
+    if path is None or not path.exists():
         return None
     try:
         with opened_archive(path, "", "") as archive:
             meta = json.loads(str(archive[META]))
-            if meta["state"] != _state(meta["watched"]) or what not in meta["what"] or lowest_hz < meta["lowest_hz"]:
+            if what not in meta["what"] or lowest_hz < meta["lowest_hz"] or meta["state"] != _state(meta["watched"]):
                 return None
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
         return CachedField(meta, arrays, load_program(path.parents[1], meta["program"]))
@@ -111,12 +112,12 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         watched: files and folders from which it is derived; a change invalidates the stored field.
     """
     from wbgs_jax.inference.evaluate_quantities import known_quantities, lowest_frequency
-    from wbgs_jax.inference.export import FROZEN, answer_all, freeze, frozen_outputs
+    from wbgs_jax.inference.export import answer_all, freeze, frozen_outputs
 
     path, trained = _place(run, rx, count), loaded.trained
     if path is None or not type(trained.field).__module__.startswith("wbgs_jax."):  # `source_digest` covers only this package
         return None
-    names = frozen_outputs(trained, loaded.dataset)
+    names, known = frozen_outputs(trained, loaded.dataset), known_quantities(trained.field, loaded.dataset)
     leaves, structure = jax.tree.flatten(freeze(trained, loaded.receiver))
     arrays = tuple(np.asarray(leaf) for leaf in leaves)
     if sum(array.nbytes for array in arrays) > LARGEST:
@@ -131,7 +132,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
     meta = {
         "source": loaded.source,
         "domain": loaded.domain.as_json(),
-        "what": [what for what in FROZEN if what in known_quantities(trained.field, loaded.dataset)],
+        "what": [what for what in COMPILED if what in known],
         "lowest_hz": lowest_frequency(trained.field, loaded.dataset),
         "watched": [str(place) for place in watched],
         "state": _state(watched),

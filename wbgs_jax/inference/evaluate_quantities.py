@@ -137,7 +137,9 @@ def check_quantity(what: str, field: Field, dataset: Dataset | None = None) -> N
                 "does not predict paths" if what == "paths" else f"does not provide {what}, because it does not predict paths"
             )
             raise UserError(f"the {field.name} field {lacks}; train --field {able} on data with a mesh")
-        raise UserError(f"the {field.name} field does not provide {what}, only spectra; train --field {able}")
+        has = ", ".join(outputs_of(field)).replace("pas", "spectra")
+        mesh = "" if "power" in needs else " on data with a mesh"
+        raise UserError(f"the {field.name} field does not provide {what}, only {has}; train --field {able}{mesh}")
     if dataset is not None and "pas" in needs:
         check_spectra(field, dataset)
     if dataset is not None and "power" in needs:

@@ -38,7 +38,7 @@ from wbgs_jax.inference.evaluate_quantities import known_quantities
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
-from wbgs_jax.inference.quantities import QUANTITIES
+from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.types import Query, Receiver
 
@@ -46,8 +46,6 @@ FORMAT = 2
 METADATA, FIELD = "metadata.json", "field.bin"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """Platforms for which `jax.export` can lower on any machine."""
-FROZEN = ("spectra", "power", "snapshot")
-"""Quantities that `answer_all` computes."""
 
 
 class FrozenField(NamedTuple):
@@ -90,8 +88,8 @@ def answer_all(frozen: FrozenField, query: Query, names: Sequence[str]) -> dict[
 
 def frozen_outputs(trained: TrainedField, dataset: Dataset) -> tuple[str, ...]:
     """Returns the names of the arrays that `answer_all` can compute for a field."""
-    known = [what for what in FROZEN if what in known_quantities(trained.field, dataset)]
-    return tuple(name for what in known for name in QUANTITIES[what].outputs)
+    known = known_quantities(trained.field, dataset)
+    return tuple(name for what in COMPILED if what in known for name in QUANTITIES[what].outputs)
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,8 @@ def expect_many(
         return _expected(confidence, spectra, Query(tx, hertz), power)
 
     rows = (pas, tx_position, frequency_hz, power_db)
-    found: Expected = map_blocks(of_block, jax.tree.map(lambda values: np.asarray(values, np.float32), rows), AT_ONCE)
+    rows = jax.tree.map(lambda values: np.asarray(values, np.float32), rows)
+    found: Expected = map_blocks(of_block, rows, AT_ONCE, full=True)
     return found
 
 

@@ -158,7 +158,7 @@ class OnAnyShape:
         query = Query(position.reshape(-1, 3), frequency.reshape(-1))
         check_query(query)
         if 0 in shape:
-            one = Query(jnp.zeros((1, 3)), jnp.ones(1))
+            one = Query(jnp.zeros((1, 3), jnp.float32), jnp.ones(1, jnp.float32))
             return jax.tree.map(lambda leaf: jnp.zeros((*shape, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.render, one))
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 

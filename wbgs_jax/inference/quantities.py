@@ -19,7 +19,8 @@ class Quantity(NamedTuple):
     name: str
     """Name as the value of `--what`."""
     outputs: tuple[str, ...]
-    """Names of the result arrays, including units; the first is the quantity, the others are its prediction intervals."""
+    """Names of result arrays, including units: the quantity (of a table the column of the transmitter), and its prediction
+    intervals. Further arrays, such as impulse responses and `results_file.SHARED`, come with them."""
     label: str
     """Label of an axis or a colour bar, with the unit of the figure."""
     needs: tuple[str, ...]
@@ -66,6 +67,8 @@ _ALL = (
 )
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _ALL}
 """Quantities by name, in the order of `--help`."""
+COMPILED = ("spectra", "power", "snapshot")
+"""Quantities that exported and cached fields provide: outputs of a field and their prediction intervals."""
 INTERVALS = tuple(name for quantity in _ALL for name in quantity.outputs[1:])
 """Names of the arrays of expected scores and prediction intervals; NaN stands for an invalid one."""
 

@@ -168,10 +168,10 @@ def write_archive(
                 np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any], source: dict[str, Any]) -> None:
+def write_arrays(path: Path, arrays: dict[str, Any], source: dict[str, Any]) -> None:
     """Writes arrays to a compressed .npz file, with their provenance as JSON text in `meta`."""
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays, meta=np.array(json.dumps(source)))
+        np.savez_compressed(stream, **arrays | {"meta": np.array(json.dumps(source))})
 
 
 def _joined(pieces: list[np.ndarray]) -> np.ndarray:

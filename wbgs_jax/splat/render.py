@@ -63,7 +63,9 @@ def measure_limits(splats: Splats, slack: float = 1.25, tiling: Tiling | None = 
         ValueError: called under jit.
     """
     if isinstance(splats.depths, jax.core.Tracer):
-        raise ValueError("the tile lists cannot be sized under jit: pass limits=..., computed outside with measure_limits")
+        raise ValueError(
+            "tile lists cannot be sized under jit: pass capacity (of geometry_plan: limits), computed outside of jit"
+        )
     limits = fit_limits(0, 0, tiling=tiling)
     while True:
         jobs = build_tile_jobs(splats, limits)

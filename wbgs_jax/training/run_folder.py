@@ -1,7 +1,7 @@
 """A run folder: its configuration (`config.json`), checkpoints, and the trained field.
 
 config.json   metrics.jsonl   checkpoints/STEP/   eval.json   manifest.json   pictures/*.png
-kriging.npz   intervals.npz   power_confidence.npz
+neighbours.npz   confidence.npz   power_confidence.npz
 
 There is one training per folder: two would overwrite each other's curves and checkpoints.
 """
