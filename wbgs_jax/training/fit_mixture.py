@@ -243,7 +243,7 @@ def _kriged(
     (Breiman et al. 1984), because queries lie further away than transmitters of one track do from each other."""
     truth, scores = np.asarray(dataset.pas(index)), dict[tuple[float, float], np.ndarray]()
     local = dataclasses.replace(mixture, elements=mixture.elements[:0])  # the line of sight takes longer than all others
-    for length in np.geomspace(*_reach(dataset.tx_positions[known.links]), LENGTHS):
+    for length in np.geomspace(*_reach(dataset.tx_positions[known.links]), LENGTHS).tolist():
         for nugget in NUGGETS:
             tried = dataclasses.replace(local, length=jnp.float32(length), nugget=jnp.float32(nugget))
             spectra, _ = predict_members(tried, dataset, known, index, kept, ("kriging",))
