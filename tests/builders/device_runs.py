@@ -12,13 +12,12 @@ import jax
 import numpy as np
 
 from builders.synthetic import tiny_dataset, tiny_settings
-from builders.toys import GROWING
+from builders.toys import GROWING, as_trained
 from wbgs_jax._util.devices import COORDINATOR, Devices, connect
 from wbgs_jax.config import Settings, changed
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.inference import batching, predictor
-from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.training.loop import TrainResult, train
 
 FOUR = {"optim": {"batch": 4}, "loop": {"epoch_steps": 4, "checkpoint_every": 4}}
@@ -38,7 +37,7 @@ def data() -> Dataset:
 
 def answers(result: TrainResult, dataset: Dataset) -> list[np.ndarray]:
     """The spectra of links and of queries, by all three ways to ask for many."""
-    trained: TrainedField = TrainedField(None, result.field, result.params, 0, 0.0)  # type: ignore[arg-type]
+    trained = as_trained(result.field, result.params)
     query, receiver = dataset.query(np.arange(ASKED)), dataset.receiver()
     links = predictor.observe_links(result.field, result.params, dataset, np.arange(ASKED)).pas
     queries = predictor.observe_queries(trained, receiver, query, "pas")

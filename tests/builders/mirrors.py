@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from builders.synthetic import tiny_dataset
-from builders.toys import toy_settings
+from builders.toys import as_trained
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields import Field, Observation
-from wbgs_jax.inference.trained_field import RunConfig, TrainedField
+from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.paths import REFLECTED
 from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
 from wbgs_jax.radio.channel import Arrivals, decibels
@@ -70,13 +70,12 @@ class Mirrored(TrainedField):
         return tiny_dataset()
 
 
-def trained_field(field: Field, params: Any) -> Mirrored:
+def trained_field(field: Field, params: Any) -> TrainedField:
     """Returns a field of mirrors as a trained one."""
-    config = RunConfig("mirrors", field.name, "smoke", 0, None, toy_settings())
-    return Mirrored(config, field, params, 0, 0.0)
+    return as_trained(field, params, Mirrored)
 
 
-def trained(images=5) -> Mirrored:
+def trained(images=5) -> TrainedField:
     field = MirrorsField(images=images)
     return trained_field(field, field.init(jax.random.key(0)))
 

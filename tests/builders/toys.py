@@ -14,6 +14,7 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.config import PRESETS, LoopConfig, OptimConfig, Settings, changed
 from wbgs_jax.fields import Field, Group, Observation, base, register
 from wbgs_jax.fields.base import with_field
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 
 GROWING = tiny_settings(
     field={"network_lr": 1.5e-2, "means_lr": 1e-2, "log_scales_lr": 3e-2, "opacity_lr": 0.1},
@@ -126,6 +127,11 @@ def toy_settings(**changes: Any) -> Settings:
     """As `synthetic.tiny_settings`, of a toy field without hooks."""
     loop = LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2)
     return changed(Settings(RippleConfig(), OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0), loop), changes)
+
+
+def as_trained(field: Any, params: Any, kind: type[TrainedField] = TrainedField) -> TrainedField:
+    """A field as a trained one, without a run folder; `kind` may be a subclass that has the data."""
+    return kind(RunConfig("gone", field.name, "none", 0, None, toy_settings()), field, params, 3, 0.0)
 
 
 def metrics_of(folder):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import FREQUENCIES_HZ, tiny_dataset
-from builders.toys import NoisyField, RippleConfig, RippleField, toy_settings
+from builders.toys import NoisyField, RippleConfig, RippleField, as_trained
 
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
@@ -21,7 +21,6 @@ from wbgs_jax.evaluation.report import closing_lines, table
 from wbgs_jax.evaluation.score import evaluate, held_out, power_figures, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
-from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.metrics import plane_normal
 
 
@@ -37,22 +36,16 @@ class KnowingField(RippleField):
         return Observation(seen.pas, 1e-3 * jnp.exp(1j * phases), -60 + query.tx_position[:, 0])
 
 
-def as_trained(field: RippleField) -> TrainedField:
-    """Returns a field with initial parameters as a trained one, without data: these are given."""
-    config = RunConfig("gone", field.name, "none", 0, None, toy_settings())
-    return TrainedField(config, field, field.init(jax.random.key(1)), 3, 0.0)
-
-
 @pytest.fixture(scope="module")
 def knowing():
     field = KnowingField(RippleConfig())
-    return as_trained(field)
+    return as_trained(field, field.init(jax.random.key(1)))
 
 
 @pytest.fixture(scope="module")
 def blind():
     field = RippleField(RippleConfig())
-    return as_trained(field)
+    return as_trained(field, field.init(jax.random.key(1)))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_settings
+from builders.toys import as_trained
 from builders.wave_runs import PARTS, RX, places, run_in
 
 from wbgs_jax._util.files import write_csv
@@ -15,7 +16,6 @@ from wbgs_jax.inference.path_table import SIGHT
 from wbgs_jax.inference.predictor import observe_queries
 from wbgs_jax.inference.quantities import Options
 from wbgs_jax.inference.results_file import Answers, table_rows
-from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
 from wbgs_jax.types import make_query
 
@@ -30,7 +30,7 @@ NOTHING = np.zeros(3)
 @pytest.fixture(scope="module")
 def asked(tmp_path_factory):
     run = run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("room"), places(2), np.array([6e9]))
-    trained = TrainedField(RunConfig("room", "wave", "smoke", 0, None, SETTINGS), run.field, run.state.params, 0, 0.0)
+    trained = as_trained(run.field, run.state.params)
     return LoadedField(trained, run.dataset, run.dataset.receiver())
 
 

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.compilation import cache_folder, load_program, source_digest, trace_program
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, opened_archive
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
-from wbgs_jax.inference.queries import Product
+from wbgs_jax.inference.queries import Product, flatten
 from wbgs_jax.types import Query
 
 if TYPE_CHECKING:
@@ -57,15 +58,14 @@ class CachedField:
 
     def answer(self, what: str, block: list[Product]) -> dict[str, np.ndarray]:
         """Returns the same as `LoadedField.answer`, for at most `MOST` queries."""
-        rows = np.concatenate([product.rows for product in block])
-        order = np.argsort(rows)
-        positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])[order]
-        frequencies = np.concatenate([np.tile(one.frequencies_hz, len(one.tx_positions)) for one in block])[order]
-        # The block is filled up with copies of the last query.
-        chosen = np.minimum(np.arange(size_for(len(rows))), len(rows) - 1)
-        query = np.asarray(positions, np.float32)[chosen], np.asarray(frequencies, np.float32)[chosen]
-        found = self.program(*self.arrays, *query)
-        answers = {name: np.asarray(found[name])[: len(rows)] for name in QUANTITIES[what].outputs if name in found}
+        _, positions, frequencies = flatten(block)
+
+        def wanted(query: tuple[np.ndarray, np.ndarray]) -> dict[str, Any]:
+            found = self.program(*self.arrays, *query)
+            return {name: found[name] for name in QUANTITIES[what].outputs if name in found}
+
+        query = np.asarray(positions, np.float32), np.asarray(frequencies, np.float32)
+        answers = map_blocks(wanted, query, size_for(len(positions)), full=True)
         return self.domain.without_intervals(answers, positions)
 
 
@@ -111,13 +111,13 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         loaded: the field at that receiver.
         watched: files and folders from which it is derived; a change invalidates the stored field.
     """
-    from wbgs_jax.inference.evaluate_quantities import known_quantities, lowest_frequency
+    from wbgs_jax.inference.evaluate_quantities import lowest_frequency
     from wbgs_jax.inference.export import answer_all, freeze, frozen_outputs
 
     path, trained = _place(run, rx, count), loaded.trained
     if path is None or not type(trained.field).__module__.startswith("wbgs_jax."):  # `source_digest` covers only this package
         return None
-    names, known = frozen_outputs(trained, loaded.dataset), known_quantities(trained.field, loaded.dataset)
+    names = frozen_outputs(trained, loaded.dataset)
     leaves, structure = jax.tree.flatten(freeze(trained, loaded.receiver))
     arrays = tuple(np.asarray(leaf) for leaf in leaves)
     if sum(array.nbytes for array in arrays) > LARGEST:
@@ -132,7 +132,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
     meta = {
         "source": loaded.source,
         "domain": loaded.domain.as_json(),
-        "what": [what for what in COMPILED if what in known],
+        "what": [what for what in COMPILED if QUANTITIES[what].outputs[0] in names],
         "lowest_hz": lowest_frequency(trained.field, loaded.dataset),
         "watched": [str(place) for place in watched],
         "state": _state(watched),

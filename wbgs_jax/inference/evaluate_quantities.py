@@ -24,7 +24,7 @@ from wbgs_jax.inference.kriging import for_receiver
 from wbgs_jax.inference.path_table import path_table
 from wbgs_jax.inference.predictor import BLOCK, check_power, check_spectra, observe_queries, trained_band
 from wbgs_jax.inference.quantities import QUANTITIES, Options
-from wbgs_jax.inference.queries import Product
+from wbgs_jax.inference.queries import Product, Queries, flatten
 from wbgs_jax.inference.results_file import SHARED
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.transport import mimo_matrix, snapshots_from_paths
@@ -101,15 +101,14 @@ class LoadedField:
                 table["tx"] = product.tx_numbers[table["tx"]]
             order = np.argsort(np.concatenate([table["tx"] for table in found]), kind="stable")
             return {name: np.concatenate([table[name] for table in found])[order] for name in found[0]}
-        order = np.argsort(np.concatenate([product.rows for product in block]))
+        order, positions, _ = flatten(block)
         answers = {
             name: values
             if name in SHARED
             else np.concatenate([own[name].reshape(-1, *own[name].shape[2:]) for own in found])[order]
             for name, values in found[0].items()
         }
-        positions = np.concatenate([np.repeat(one.tx_positions, len(one.frequencies_hz), axis=0) for one in block])
-        return self.domain.without_intervals(answers, positions[order])
+        return self.domain.without_intervals(answers, positions)
 
 
 def domain_of(dataset: Dataset) -> Domain:
@@ -158,7 +157,7 @@ def known_quantities(field: Field, dataset: Dataset) -> list[str]:
 
 def _queries(tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
     """Returns queries for every transmitter at every frequency; the frequency varies fastest."""
-    return make_query(np.repeat(tx_positions, len(frequencies_hz), 0), np.tile(frequencies_hz, len(tx_positions)))
+    return make_query(*Queries(tx_positions, frequencies_hz).flat())
 
 
 def _shaped(found: Any, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> np.ndarray:
@@ -322,10 +321,5 @@ def arrivals_of(
     check_quantity("paths", trained.field)
     plan = trained.field.plan(trained.params, receiver)
     query = make_query(np.asarray(tx_positions), np.full(len(tx_positions), frequency_hz))
-    found: Arrivals = map_blocks(lambda block: _arrivals(trained.field, trained.params, plan, block), query, BLOCK)
+    found: Arrivals = map_blocks(lambda block: paths_of(trained.field, trained.params, plan, block), query, BLOCK)
     return found
-
-
-@jax.jit
-def _arrivals(field: Field, params: Any, plan: Any, query: Query) -> Arrivals:
-    return paths_of(field, params, plan, query)

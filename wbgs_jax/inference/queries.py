@@ -97,6 +97,17 @@ class Queries:
         return hashlib.sha256(positions.tobytes() + frequencies.tobytes()).hexdigest()
 
 
+def flatten(
+    block: list[Product],
+) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Returns the order that sorts a block's products, one after the other, into the order of the queries, and the position
+    (metres) and frequency (hertz) of each query in that order."""
+    order = np.argsort(np.concatenate([product.rows for product in block]))
+    flat = [Queries(product.tx_positions, product.frequencies_hz).flat() for product in block]
+    positions, frequencies = (np.concatenate(parts)[order] for parts in zip(*flat, strict=True))
+    return order, positions, frequencies
+
+
 def shown_rows(count: int) -> Int[np.ndarray, " k"]:
     """Returns the indices of the queries in a figure: all, or `SHOWN` evenly spaced ones."""
     return np.unique(np.linspace(0, count - 1, min(count, SHOWN)).round().astype(int))
