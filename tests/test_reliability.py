@@ -76,8 +76,8 @@ def test_a_full_disk_leaves_the_checkpoint_before(saved, error, monkeypatch):
 
 
 @pytest.mark.heavy
-def test_other_data_under_the_same_name_are_told(tmp_path):
-    """To whoever goes on with a training, asks it or scores it."""
+def test_other_data_under_the_same_name_are_refused(tmp_path):
+    """When a training continues, is queried or is scored."""
     run = make_coherent_run(tmp_path / "box")
     stored = checkpoint.read(run / "checkpoints", 5)
     assert "data" not in stored.metadata  # of before checksums: taken as it is
@@ -86,7 +86,7 @@ def test_other_data_under_the_same_name_are_told(tmp_path):
     dataset = hold_out_validation(load_dataset(scene))
     Run(dataset, "wave", SETTINGS, 0, folder).save()
     other = hold_out_validation(tiny_dataset(seed=1))
-    with pytest.raises(UserError, match="are not those that it was trained on"):
+    with pytest.raises(UserError, match="have changed since it was trained"):
         Run(other, "wave", SETTINGS, 0, folder).restore()
     assert Run(dataset, "wave", SETTINGS, 0, folder).restore()
     for entry in (folder / "checkpoints").iterdir():
@@ -94,7 +94,7 @@ def test_other_data_under_the_same_name_are_told(tmp_path):
     asked = ["--run", run, "--tx", "1,0,1", "--ghz", "10", "--out", tmp_path / "x.npz"]
     assert call(predict.main, *asked).code == 0
     save_scene(scene, tiny_scene(seed=1))
-    assert_error_for_people(call(predict.main, *asked), "are not those that it was trained on")
+    assert_error_for_people(call(predict.main, *asked), "have changed since it was trained")
 
 
 def test_a_checksum_is_of_every_number_and_of_no_name(rng):

@@ -177,12 +177,22 @@ def checksum(dataset: Dataset) -> str:
     return found.hexdigest()
 
 
+def check_checksum(actual: str, expected: str, where: str) -> None:
+    """Checks that the data of a run are those it was trained on; an empty expectation is met by any.
+
+    Raises:
+        UserError: the checksums differ.
+    """
+    if expected and actual != expected:
+        raise UserError(f"the data of {where} have changed since it was trained; restore them, or train again")
+
+
 def check_data(dataset: Dataset, expected: str, where: str) -> Dataset:
-    """Returns the dataset if its checksum is the expected one (or if that is empty).
+    """Returns the dataset, its checksum compared with the expected one (unless that is empty).
 
     Raises:
         UserError: the checksum differs.
     """
-    if expected and checksum(dataset) != expected:
-        raise UserError(f"the data of {where} are not those that it was trained on; restore them, or train again")
+    if expected:
+        check_checksum(checksum(dataset), expected, where)
     return dataset

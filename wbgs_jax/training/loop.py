@@ -27,7 +27,7 @@ from wbgs_jax._util.compilation import give_back
 from wbgs_jax._util.devices import any_process, by_first, check_alike, devices_for, is_first
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import Settings
-from wbgs_jax.data.dataset import Dataset, checksum
+from wbgs_jax.data.dataset import Dataset, check_checksum, checksum
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.data.splits import training_links, without_test
 from wbgs_jax.evaluation.score import watch
@@ -379,8 +379,7 @@ class Run:
         if not steps:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
-        if saved.metadata.get("data", self.checksum) != self.checksum:
-            raise UserError(f"the data of {self.folder} have changed since it was trained; restore them, or train again")
+        check_checksum(self.checksum, saved.metadata.get("data", ""), str(self.folder))
         self.field = field_from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
