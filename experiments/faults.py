@@ -135,11 +135,12 @@ def with_wrong_receiver(dataset: Dataset, fault: Fault, rng: np.random.Generator
     step, axis = (_directions(rng, n) for _ in range(2))
     turn = Rotation.from_rotvec(np.deg2rad(fault.receiver_deg) * axis)
     xyzw = (turn * Rotation.from_quat(np.roll(receivers.orientation, -1, axis=1))).as_quat()
+    exponents = receivers.antenna.exponents * (0 if fault.pattern_unknown else 1)
     wrong = dataclasses.replace(
         receivers,
         position=jnp.asarray(np.asarray(receivers.position) + fault.receiver_m * step, jnp.float32),
         orientation=jnp.asarray(np.roll(xyzw, 1, axis=1), jnp.float32),
-        pattern_exponents=receivers.pattern_exponents * (0 if fault.pattern_unknown else 1),
+        antenna=dataclasses.replace(receivers.antenna, exponents=exponents),
     )
     return dataclasses.replace(dataset, receivers=wrong)
 

@@ -3,6 +3,7 @@
 SI units: metres, hertz, radians. Constructors check their arguments; arrays are float32 on the device.
 """
 
+import dataclasses
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from wbgs_jax._util.checks import check_array, concrete
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.observation_kinds import Observations, Observed, power_of
-from wbgs_jax.radio.antenna import pattern_exponents
+from wbgs_jax.radio.antenna import Antenna, pattern_exponents
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 
 ElementUnit = Literal["wavelengths", "metres"]
@@ -64,10 +65,28 @@ class Receiver:
     """Unit quaternion (wxyz) that rotates the receiver's local frame into the world frame."""
     element_positions: Float[Array, "*r elements 3"]
     """Local frame, in `unit`."""
-    pattern_exponents: Float[Array, "*r 2"]
-    """Exponents of the elements' gain patterns: the element of 3GPP TR 38.901 and the short dipole; zeros for isotropic
-    elements (`radio/antenna.py`)."""
+    antenna: Antenna
+    """Antenna of every element, in the local frame, with leading axes as above."""
     unit: ElementUnit = static(default="wavelengths")
+
+    def __init__(
+        self,
+        position: Float[Array, "*r 3"],
+        orientation: Float[Array, "*r 4"],
+        element_positions: Float[Array, "*r elements 3"],
+        antenna: Antenna | Float[Array, "*r 2"],
+        unit: ElementUnit = "wavelengths",
+    ) -> None:
+        """Takes the exponents of a parametric antenna for the antenna."""
+        antenna = antenna if isinstance(antenna, Antenna) else Antenna(None, antenna)
+        values = (position, orientation, element_positions, antenna, unit)
+        for one, value in zip(dataclasses.fields(self), values, strict=True):
+            object.__setattr__(self, one.name, value)
+
+    @property
+    def pattern_exponents(self) -> Float[Array, "*r 2"]:
+        """Exponents of the elements' parametric pattern (`Antenna.exponents`)."""
+        return self.antenna.exponents
 
     def element_wavelengths(self, frequency_hz: Float[Array, "*b"]) -> Float[Array, "*b_elements 3"]:
         """Returns the element positions in wavelengths: (elements, 3) if stored in wavelengths, else (*b, elements, 3)."""
@@ -77,38 +96,62 @@ class Receiver:
 
 
 @pytree
-class Query:
-    """A batch of queries to a field for one receiver: transmitter positions and frequencies."""
+class Transmitter:
+    """B transmitters. Properties other than the position are optional; None for all of them, or one row for each."""
 
-    tx_position: Float[Array, "*b 3"]
+    position: Float[Array, "*b 3"]
     """World frame, metres."""
-    frequency_hz: Float[Array, "*b"]
-
-    @property
-    def query(self) -> "Query":
-        """The query itself, so that it can be used in place of `Links`."""
-        return self
+    orientation: Float[Array, "*b 4"] | None = None
+    """Quaternion (wxyz) that rotates the transmitter's local frame, in which its antenna is described, into the world frame;
+    None if they are the same."""
+    velocity: Float[Array, "*b 3"] | None = None
+    """Metres per second, world frame; None at rest."""
+    antenna: Antenna | None = None
+    """Antenna, with leading axes as above; None for that which the field has learned or assumes."""
+    power_dbm: Float[Array, "*b"] | None = None
+    """Transmitted power, dBm; None if unknown: received powers are then relative to it."""
 
 
 @pytree
-class Links:
-    """Combinations of transmitter position, receiver and frequency."""
+class Query:
+    """B combinations of a transmitter and a frequency, for which a field is queried at one receiver."""
 
-    query: Query
+    transmitter: Transmitter
+    frequency_hz: Float[Array, "*b"]
+    time_s: Float[Array, "*b"] | None = dataclasses.field(default=None, kw_only=True)
+    """Time, seconds; None where nothing moves."""
+
+    def __init__(
+        self,
+        transmitter: Transmitter | Float[Array, "*b 3"],
+        frequency_hz: Float[Array, "*b"],
+        *,
+        time_s: Float[Array, "*b"] | None = None,
+    ) -> None:
+        """Takes positions (metres) for transmitters without further properties."""
+        if not isinstance(transmitter, Transmitter):
+            transmitter = Transmitter(transmitter)
+        for name, value in {"transmitter": transmitter, "frequency_hz": frequency_hz, "time_s": time_s}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def tx_position(self) -> Float[Array, "*b 3"]:
+        """Positions of the transmitters, world frame, metres."""
+        return self.transmitter.position
+
+    def with_indices(self, receiver_index: Int[Array, "*b"], tx_index: Int[Array, "*b"]) -> "Links":
+        """Returns these queries as links, given the indices of receivers and transmitters."""
+        return Links(self.transmitter, self.frequency_hz, receiver_index, tx_index, time_s=self.time_s)
+
+
+@pytree
+class Links(Query):
+    """B combinations of a transmitter, a receiver and a frequency."""
+
     receiver_index: Int[Array, "*b"]
     """Index of the receiver in the dataset."""
     tx_index: Int[Array, "*b"]
     """Index of the transmitter in the dataset; links with the same position share it."""
-
-    @property
-    def tx_position(self) -> Float[Array, "*b 3"]:
-        """World frame, metres."""
-        return self.query.tx_position
-
-    @property
-    def frequency_hz(self) -> Float[Array, "*b"]:
-        """Hertz."""
-        return self.query.frequency_hz
 
 
 @pytree
@@ -192,6 +235,7 @@ def make_receiver(
     element_positions: Any = None,
     unit: ElementUnit = "wavelengths",
     pattern: str = "",
+    antenna: Antenna | None = None,
 ) -> Receiver:
     """Returns a float32 receiver.
 
@@ -201,12 +245,13 @@ def make_receiver(
         element_positions: (elements, 3) in the local frame; by default the 4x4 half-wavelength array in the local y-z plane.
         unit: of the element positions.
         pattern: of the elements, a name in `radio.antenna.PATTERN_EXPONENTS`; empty for isotropic ones.
+        antenna: of the elements, instead of a named pattern.
     """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion)
     arrays = [jnp.asarray(np.asarray(a), jnp.float32) for a in (position, quaternion, elements, pattern_exponents(pattern))]
-    return Receiver(arrays[0], arrays[1], arrays[2], arrays[3], unit)
+    return Receiver(arrays[0], arrays[1], arrays[2], antenna or Antenna(None, arrays[3]), unit)
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
@@ -214,17 +259,58 @@ def stack_receivers(receivers: list[Receiver]) -> Receiver:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
-def make_query(tx_position: Any, frequency_hz: Any) -> Query:
-    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz."""
+def make_query(
+    tx_position: Any,
+    frequency_hz: Any,
+    *,
+    orientation: Any = None,
+    velocity: Any = None,
+    antenna: Antenna | None = None,
+    power_dbm: Any = None,
+    time_s: Any = None,
+) -> Query:
+    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz.
+
+    Args:
+        tx_position: of the transmitters, world frame.
+        frequency_hz: of the carriers.
+        orientation, velocity, antenna, power_dbm: further properties of the transmitters (`Transmitter`), one for all or one
+            for each.
+        time_s: seconds, one or (b,).
+    """
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
-    frequency = jnp.broadcast_to(jnp.asarray(frequency_hz, jnp.float32), position.shape[:1])
-    return Query(position, frequency)
+    count = position.shape[0]
+
+    def rows(values: Any, *shape: int) -> Any:
+        return None if values is None else jnp.broadcast_to(jnp.asarray(values, jnp.float32), (count, *shape))
+
+    transmitter = Transmitter(
+        position, rows(orientation, 4), rows(velocity, 3), repeat_antenna(antenna, count), rows(power_dbm)
+    )
+    return Query(transmitter, rows(frequency_hz), time_s=rows(time_s))
+
+
+def repeat_antenna(antenna: Antenna | None, count: int) -> Antenna | None:
+    """Returns an antenna with a leading axis of `count` equal ones, unless it has a leading axis already."""
+    if antenna is None or antenna.exponents.ndim > 1:
+        return antenna
+    repeated: Antenna = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), antenna)
+    return repeated
 
 
 def check_query(query: Query) -> None:
-    """Raises an error unless positions are (b, 3) in metres and frequencies (b,) in hertz."""
+    """Raises an error unless positions are (b, 3) in metres, frequencies (b,) in hertz, and further properties of transmitters
+    have one row for each."""
+    transmitter = query.transmitter
     check_array("tx_position", query.tx_position, ("b", 3))
-    check_array("frequency_hz", query.frequency_hz, (query.tx_position.shape[0],))
+    count = query.tx_position.shape[0]
+    check_array("frequency_hz", query.frequency_hz, (count,))
+    optional = {"orientation": (count, 4), "velocity": (count, 3), "power_dbm": (count,)}
+    for name, shape in optional.items():
+        if (values := getattr(transmitter, name)) is not None:
+            check_array(f"transmitter.{name}", values, shape)
+    if query.time_s is not None:
+        check_array("time_s", query.time_s, (count,))
     frequency, position = concrete(query.frequency_hz), concrete(query.tx_position)
     if frequency is not None and frequency.size and not frequency.min() >= LOWEST_OF_PATHS_HZ:
         raise ValueError(f"frequency_hz is {frequency.min():g}; frequencies are in hertz (2.4e9 for 2.4 GHz) and positive")

@@ -20,7 +20,7 @@ from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.coherent_settings import MAX_FACETS
-from wbgs_jax.types import Mesh, make_query, make_receiver
+from wbgs_jax.types import Mesh, Query, Transmitter, make_query, make_receiver
 
 SCENES, RIVAL_SCENES = ("2", "3", "4", "5"), ("1", "2")
 BLOCK_TX = 16
@@ -49,7 +49,8 @@ def measure(report: Report, effort: Effort) -> None:
 @jax.jit
 def answer(params: Any, plan: Any, paths: Any, place: Any, frequency_hz: Float[jax.Array, " b"]) -> Any:
     """Returns spectra, snapshots and powers of transmitters whose paths are known."""
-    return coherent.observe(params, plan, jax.tree.map(lambda leaf: leaf[place], paths), frequency_hz)
+    paths = jax.tree.map(lambda leaf: leaf[place], paths)
+    return coherent.observe(params, plan, paths, Query(Transmitter(paths.specular.points[:, 0, 0]), frequency_hz))
 
 
 def measure_scene(report: Report, effort: Effort, number: str) -> None:

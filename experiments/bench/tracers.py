@@ -20,7 +20,7 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, with_entry
-from wbgs_jax.types import make_receiver
+from wbgs_jax.types import Query, Transmitter, make_receiver
 
 ORDERS = (0, 1, 2)
 SAME_PLACE_M = 2e-3
@@ -81,8 +81,8 @@ class Ours:
 @jax.jit
 def _ours(params: Any, plan: Any, tx: Any, frequencies_hz: Any) -> Any:
     paths = coherent.trace(plan, tx)
-    one = jax.vmap(lambda paths, f: coherent.arrivals_at(params, plan, paths, f), (None, 0))
-    return jax.vmap(one, (0, None))(paths, frequencies_hz)
+    one = jax.vmap(lambda paths, tx, f: coherent.arrivals_at(params, plan, paths, Query(Transmitter(tx), f)), (None, None, 0))
+    return jax.vmap(one, (0, 0, None))(paths, tx, frequencies_hz)
 
 
 class DiffeRT:

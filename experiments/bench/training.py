@@ -89,7 +89,7 @@ def parts(run: Run, turns: int) -> dict[str, Callable[[], Any]]:
         """Forward and backward of a part; the sum costs next to nothing."""
         return jax.grad(lambda *args: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(function(*args))), argnums)
 
-    query = jax.tree.map(lambda a: a[index], data.links.query)
+    query = jax.tree.map(lambda a: a[index], data.links)
     geometry = plan(params)
     planned = wideband.WidebandPlan(geometry, None, field.frame, receiver, field.config)  # features: in every call
     even = jnp.full((params.gaussians.alive.size, len(index)), 0.3)  # the time does not depend on these values

@@ -63,4 +63,4 @@ def heard_in(run, params, tx_positions, frequencies_hz):
 @jax.jit
 def snapshots(params, plan, prepared, links):
     """What the coherent field says of links of one receiver whose paths are prepared."""
-    return coherent.path_snapshots(params, plan, prepared.of(links), links.query.frequency_hz)
+    return coherent.path_snapshots(params, plan, prepared.of(links), links)

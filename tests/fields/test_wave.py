@@ -26,7 +26,7 @@ from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
 from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
 from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.types import Batch, Links, make_query, make_receiver
+from wbgs_jax.types import Batch, make_query, make_receiver
 
 FREQUENCIES = np.array([1e9, 3e9, 10e9, 30e9])
 RX = (1.0, 1.0, 1.2)
@@ -177,7 +177,7 @@ def test_prepared_links_are_rendered_as_others_are(rng):
     field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), **SMALL)
     tx = rng.uniform([0.3, 0.3, 0.3], [5.7, 3.7, 2.7], (3, 3))
     query = make_query(tx[[2, 0, 2]], [2e9, 5e9, 20e9])
-    links = Links(query, jnp.zeros(3, int), jnp.array([7, 3, 7]))
+    links = query.with_indices(jnp.zeros(3, int), jnp.array([7, 3, 7]))
     receivers = jax.tree.map(lambda leaf: leaf[None], plan.receiver)
     prepared = field.prepare(links, receivers)
     np.testing.assert_array_equal(prepared.tx_index, [3, 7])
@@ -258,7 +258,7 @@ def test_without_phases_the_spectrum_is_that_of_added_powers(rng):
 def test_spectra_are_those_of_snapshots_where_places_are_known_and_of_added_powers_where_they_are_not(rng):
     _, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0, 0.0), **SMALL)
     query = make_query(rng.uniform([3.5, 0.5, 0.5], [5.5, 3.5, 2.5], (3, 3)), [5e9, 28e9, 94e9])
-    see = jax.jit(lambda params: wave.observe(params, plan, wave.trace(plan, query.tx_position), query.frequency_hz))
+    see = jax.jit(lambda params: wave.observe(params, plan, wave.trace(plan, query.tx_position), query))
     known, unknown = (
         see(dataclasses.replace(params, placement=jnp.full_like(params.placement, np.log(m)))) for m in (1e-7, 1.0)
     )
@@ -312,7 +312,7 @@ def test_a_link_without_any_path_has_gradients(coherent):
     """Data may hold a spectrum where the mesh lets nothing through; a training goes on."""
     field, params, plan = field_of(SHEETS, RX, mirror_areas=(0.0,), coherent=coherent, **SMALL)
     query, receivers = make_query([[3.0, 2.0, 1.0]], 28e9), jax.tree.map(lambda leaf: leaf[None], plan.receiver)
-    links = Links(query, jnp.zeros(1, int), jnp.zeros(1, int))
+    links = query.with_indices(jnp.zeros(1, int), jnp.zeros(1, int))
     prepared = field.prepare(links, receivers)
     nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if leaf.dtype == bool else leaf, prepared)
     heard = jnp.exp(1j * jnp.arange(16.0))[None].astype(jnp.complex64)

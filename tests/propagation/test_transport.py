@@ -25,7 +25,7 @@ from builders.rooms import (
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity, slab_coefficients
 from wbgs_jax.propagation.transport import _across, element_voltages, snapshots_from_paths
 from wbgs_jax.radio import channel
-from wbgs_jax.radio.antenna import Antenna, antenna_field, element_gain
+from wbgs_jax.radio.antenna import Antenna, element_gain
 from wbgs_jax.radio.array import planar_array, snapshot_to_pas
 from wbgs_jax.types import make_receiver
 
@@ -246,7 +246,7 @@ def test_free_space_between_turned_antennas(frequency, rng):
     search = search_of([rectangle((100, 100, 100), (1, 0, 0), (0, 1, 0))], rx, mirror_areas=())
     found = snapshot_of(search, tx, frequency, make_receiver(rx), antennas)
     towards = (tx - rx) / np.linalg.norm(tx - rx)
-    sent, taken = (antenna_field(a, jnp.asarray(k, jnp.float32)) for a, k in zip(antennas, (-towards, towards), strict=True))
+    sent, taken = (a.field(jnp.asarray(k, jnp.float32)) for a, k in zip(antennas, (-towards, towards), strict=True))
     isotropic = free_space(tx, rx, frequency)
     np.testing.assert_allclose(found, isotropic * float(jnp.dot(sent, taken)), atol=0.02 * np.abs(isotropic).max())
 

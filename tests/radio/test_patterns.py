@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wbgs_jax.radio.antenna import Antenna, antenna_field, dipole_gain, element_gain, pattern_exponents, upright, zenith_vector
+from wbgs_jax.radio.antenna import Antenna, dipole_gain, element_gain, pattern_exponents, upright, zenith_vector
 
 
 def directions(rng, n=50):
@@ -34,7 +34,7 @@ def test_a_short_dipole_radiates_what_it_is_given(rng):
 
 def test_an_upright_isotropic_antenna_is_vertical_polarisation_alone(rng):
     k = jnp.asarray(directions(rng))
-    np.testing.assert_allclose(antenna_field(upright(jnp.zeros(2)), k), zenith_vector(k), atol=1e-6)
+    np.testing.assert_allclose(upright(jnp.zeros(2)).field(k), zenith_vector(k), atol=1e-6)
 
 
 @pytest.mark.parametrize("pattern", ["iso", "tr38901", "dipole"])
@@ -42,13 +42,13 @@ def test_a_turned_antenna_seen_from_a_turned_direction_is_itself_turned(pattern,
     turn, k = Rotation.from_quat(rng.normal(size=4)), directions(rng)
     exponents = jnp.array(pattern_exponents(pattern))
     scale = rng.uniform(0.3, 3)  # of the quaternion, which means nothing
-    turned = antenna_field(Antenna(scale * wxyz(turn), exponents), jnp.asarray(turn.apply(k), jnp.float32))
-    np.testing.assert_allclose(turned, turn.apply(antenna_field(upright(exponents), jnp.asarray(k))), atol=2e-4)
+    turned = Antenna(scale * wxyz(turn), exponents).field(jnp.asarray(turn.apply(k), jnp.float32))
+    np.testing.assert_allclose(turned, turn.apply(upright(exponents).field(jnp.asarray(k))), atol=2e-4)
 
 
 def test_the_field_is_across_the_ray_and_as_large_as_the_gain(rng):
     turn, k = Rotation.from_quat(rng.normal(size=4)), jnp.asarray(directions(rng))
-    field = np.asarray(antenna_field(Antenna(wxyz(turn), jnp.array([1.0, 0.0])), k))
+    field = np.asarray(Antenna(wxyz(turn), jnp.array([1.0, 0.0])).field(k))
     np.testing.assert_allclose(np.sum(field * k, -1), 0, atol=1e-5)
     gain = element_gain(jnp.asarray(turn.inv().apply(k), jnp.float32))
     np.testing.assert_allclose(np.linalg.norm(field, axis=-1), gain, rtol=1e-3)
@@ -58,7 +58,7 @@ def test_a_half_wave_dipole_is_nearly_a_power_of_the_short_one():
     zenith = np.radians(np.linspace(1, 90, 200))
     exact = np.sqrt(1.643) * np.cos(np.pi / 2 * np.cos(zenith)) / np.sin(zenith)
     k = jnp.asarray(np.stack([np.sin(zenith), np.zeros_like(zenith), np.cos(zenith)], -1))
-    field = antenna_field(upright(jnp.array(pattern_exponents("hw_dipole"))), k)
+    field = upright(jnp.array(pattern_exponents("hw_dipole"))).field(k)
     error_db = 20 * np.log10(np.linalg.norm(field, axis=-1) / exact)
     assert np.abs(error_db[20 * np.log10(exact) > -10]).max() < 0.45
 
@@ -68,7 +68,7 @@ def test_straight_up_and_down_antennas_have_gradients(exponents):
     """A transmitter straight above a receiver must not end a training."""
 
     def strength(orientation, exponents, k):
-        field = antenna_field(Antenna(orientation, exponents), k)
+        field = Antenna(orientation, exponents).field(k)
         return jnp.sum(field * jnp.array([0.3, -0.2, 0.7]))
 
     for height in (1.0, -1.0):

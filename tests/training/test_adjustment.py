@@ -193,7 +193,7 @@ def test_what_has_moved_is_found_and_what_nobody_sees_stays(run, rng):
     data = run.data.with_observations(snapshots=heard)
     still, widths = run.field.motion, widths_of(run)
     prior = np.asarray(ravel_pytree(widths)[0], float) ** 2
-    found, covariance, frequency = still, np.diag(prior), np.asarray(links.query.frequency_hz)
+    found, covariance, frequency = still, np.diag(prior), np.asarray(links.frequency_hz)
     for highest in FREQUENCIES:
         pool, known = np.flatnonzero(frequency <= highest), (found, covariance, widths, everything(run))
         found, covariance = adjust(run.field, run.state.params, run.prepared, *known, data, pool, 64, rng)

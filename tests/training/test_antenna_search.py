@@ -11,7 +11,7 @@ import pytest
 from builders.synthetic import FREQUENCIES_HZ, tiny_settings
 from builders.wave_runs import PARTS, places, run_in, snapshots
 
-from wbgs_jax.radio.antenna import Antenna, antenna_field, upright
+from wbgs_jax.radio.antenna import Antenna, upright
 from wbgs_jax.training.calibration.antennas import antenna_candidates, gains_much, search_antennas
 from wbgs_jax.training.calibration.objective import make_scores, surely_better
 
@@ -68,10 +68,10 @@ def test_known_elements_are_left_alone(untrained):
 
 def test_the_candidates_are_what_they_are_called():
     forward = jnp.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    down = np.asarray(antenna_field(antenna_candidates()["tr38901 along +x towards -z"], forward))
+    down = np.asarray(antenna_candidates()["tr38901 along +x towards -z"].field(forward))
     assert np.linalg.norm(down, axis=-1) == pytest.approx([10 ** (8 / 20), 10 ** (-22 / 20)], rel=1e-4)
     assert abs(down[0, 0]) == pytest.approx(np.linalg.norm(down[0]), rel=1e-4)  # polarised along x
-    fields = [np.abs(antenna_field(a, jnp.asarray(np.eye(3) + 0.1, jnp.float32))) for a in antenna_candidates().values()]
+    fields = [np.abs(a.field(jnp.asarray(np.eye(3) + 0.1, jnp.float32))) for a in antenna_candidates().values()]
     assert not any(np.allclose(a, b, atol=1e-3) for i, a in enumerate(fields) for b in fields[:i])
 
 
@@ -95,7 +95,7 @@ def test_an_antenna_of_any_length_of_quaternion_is_the_same(rng):
     longer = Antenna(3 * antenna.orientation, antenna.exponents)
     k = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
     k = k / jnp.linalg.norm(k, axis=-1, keepdims=True)
-    np.testing.assert_allclose(antenna_field(longer, k), antenna_field(antenna, k), atol=1e-5)
+    np.testing.assert_allclose(longer.field(k), antenna.field(k), atol=1e-5)
 
 
 STORED = json.loads((Path(__file__).parent / "antenna_scores.json").read_text())

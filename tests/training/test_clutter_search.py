@@ -65,7 +65,7 @@ def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands_and_read_again(tmp
     density = np.asarray(densities(trained.params.clutter)).mean(-1)
     assert density[filled].mean() > 3 * density[~filled].mean()
     again = train(dataset, "wave", SETTINGS, 0, tmp_path / "run", resume=True)
-    query = dataset.links(dataset.train[:8]).query
+    query = dataset.query(dataset.train[:8])
     seen = [one.field.render(one.params, one.field.plan(one.params, dataset.receiver()), query).pas for one in (trained, again)]
     np.testing.assert_array_equal(again.params.clutter, trained.params.clutter)
     np.testing.assert_allclose(seen[1], seen[0], atol=1e-6)

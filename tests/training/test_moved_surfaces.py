@@ -132,7 +132,7 @@ def test_a_displaced_plan_hears_what_is_heard_where_things_have_gone(truth, tmp_
     there = run.field.moved(motion)
 
     def heard_by(plan, paths):
-        return coherent.path_snapshots(params, plan, paths, query.frequency_hz)
+        return coherent.path_snapshots(params, plan, paths, query)
 
     paths = coherent.trace(plan, query.tx_position)
     elsewhere = there.plan(params, receiver)

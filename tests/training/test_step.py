@@ -78,8 +78,8 @@ def test_data_on_the_device_are_the_datasets(kind, n_rx, unit):
     for number in range(n_rx):
         index = np.flatnonzero(source.receiver_index == number)[:4]
         batch = data.batch(jnp.asarray(index), jax.random.key(0))
-        np.testing.assert_array_equal(batch.links.query.tx_position, source.query(index).tx_position)
-        np.testing.assert_array_equal(batch.links.query.frequency_hz, source.query(index).frequency_hz)
+        np.testing.assert_array_equal(batch.links.tx_position, source.query(index).tx_position)
+        np.testing.assert_array_equal(batch.links.frequency_hz, source.query(index).frequency_hz)
         np.testing.assert_array_equal(batch.links.receiver_index, source.receiver_index[index])
         np.testing.assert_array_equal(batch.links.tx_index, source.tx_index[index])
         for own, expected in zip(jax.tree.leaves(batch.receiver), jax.tree.leaves(source.receiver(number)), strict=True):
@@ -100,8 +100,8 @@ def test_spectra_of_a_folder_on_the_device_are_the_datasets(tmp_path):
     data = training_data(source)
     index = source.test[:3]
     np.testing.assert_allclose(data.pas(jnp.asarray(index)), source.pas(index), atol=1e-5)
-    np.testing.assert_array_equal(data.links.query.tx_position[index], source.query(index).tx_position)
-    np.testing.assert_array_equal(data.links.query.frequency_hz[index], source.query(index).frequency_hz)
+    np.testing.assert_array_equal(data.links.tx_position[index], source.query(index).tx_position)
+    np.testing.assert_array_equal(data.links.frequency_hz[index], source.query(index).frequency_hz)
 
 
 def test_an_epoch_of_several_steps_equals_as_many_epochs_of_one(tmp_path, dataset):

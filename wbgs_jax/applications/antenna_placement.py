@@ -19,7 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of
-from wbgs_jax.types import Query, make_receiver
+from wbgs_jax.types import make_query, make_receiver
 
 Powers = Callable[[Float[Array, "k 3"], Any], Float[Array, "k users"]]
 """(antenna positions (k, 3), smoothing length in metres) -> power (dB) that every user receives from each."""
@@ -71,7 +71,7 @@ def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
 
     def at(plan: Any, places: Float[Array, "k 3"], blur: Any, frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
-        query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
+        query = make_query(places, frequency_hz)
         power = field.render(field.smoothed(params, blur), plan, query).power_db
         assert power is not None, "the field predicts power"
         return power

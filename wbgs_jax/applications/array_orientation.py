@@ -17,10 +17,10 @@ from wbgs_jax.applications.antenna_placement import soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
-from wbgs_jax.radio.antenna import Antenna, antenna_field, pattern_exponents, zenith_vector
+from wbgs_jax.radio.antenna import Antenna, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
 from wbgs_jax.radio.channel import Arrivals, decibels
-from wbgs_jax.types import Query, make_receiver
+from wbgs_jax.types import make_query, make_receiver
 
 Turned = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
 """Azimuth and elevation of the boresight (radians, world frame) -> power (dB) from every transmitter."""
@@ -58,7 +58,7 @@ def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters:
     field, params = field.receiver_independent(params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
-    return paths_of(field, params, plan, Query(places, jnp.full(len(places), frequency_hz, jnp.float32)))
+    return paths_of(field, params, plan, make_query(places, frequency_hz))
 
 
 def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
@@ -79,7 +79,7 @@ def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
     exponents = jnp.array(pattern_exponents(pattern), jnp.float32)
 
     def one(angles: Float[Array, "2"]) -> Float[Array, " tx"]:
-        pattern_field = antenna_field(Antenna(boresight_quaternion(angles), exponents), direction)
+        pattern_field = Antenna(boresight_quaternion(angles), exponents).field(direction)
         return decibels(jnp.sum(squared_magnitude(jnp.sum(vector * pattern_field, -1)), -1))
 
     return jax.vmap(one)

@@ -24,7 +24,7 @@ from wbgs_jax.inference.predictor import check_power
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.channel import NOT_HEARD_DB
-from wbgs_jax.types import Query, Receiver
+from wbgs_jax.types import Receiver, make_query
 
 What = Literal["spectra", "snapshots", "power"]
 """Kind of observation."""
@@ -113,7 +113,7 @@ class Locator:
         params = self.field.smoothed(self.params, blur)
 
         def at(plan: Any, frequency_hz: Float[Array, ""]) -> Array:
-            query = Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1]))
+            query = make_query(places, frequency_hz)
             predicted = self.field.render(params, plan, query)
             if self.what == "spectra":  # observations have the noise of the training data
                 predicted = predicted._replace(pas=as_observed(self.field, params, predicted.pas))

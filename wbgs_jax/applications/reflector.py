@@ -24,7 +24,7 @@ from wbgs_jax.propagation.paths import TRANSMITTED
 from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import decibels, free_space_db
-from wbgs_jax.types import Query, make_receiver
+from wbgs_jax.types import make_query, make_receiver
 
 STEPS = 60
 """Gradient steps."""
@@ -168,7 +168,7 @@ def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
 
     def at(plan: Any, places: Float[Array, "k 3"], frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
-        arrived = paths_of(field, params, plan, Query(places, jnp.broadcast_to(frequency_hz, places.shape[:1])))
+        arrived = paths_of(field, params, plan, make_query(places, frequency_hz))
         assert arrived.interaction is not None, "arrivals of traced paths have interactions"
         straight = jnp.all(arrived.interaction <= TRANSMITTED, -1)
         return decibels(jnp.sum(jnp.where(straight, squared_magnitude(arrived.amplitude), 0), -1))

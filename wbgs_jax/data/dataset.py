@@ -17,7 +17,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.observation_kinds import KINDS, HostObservations, Kind, Observed, only_kind
 from wbgs_jax.radio.array import PAS_SHAPE
-from wbgs_jax.types import Links, Query, Receiver
+from wbgs_jax.types import Links, Query, Receiver, make_query
 
 AT_ONCE = 1024
 """Number of spectra computed from snapshots at a time."""
@@ -103,12 +103,12 @@ class Dataset(Observed):
 
     def query(self, index: Int[np.ndarray, " b"]) -> Query:
         """Returns the float32 queries of links."""
-        return Query(jnp.asarray(self.tx_positions[index], jnp.float32), jnp.asarray(self.frequencies_hz[index], jnp.float32))
+        return make_query(self.tx_positions[index], self.frequencies_hz[index])
 
     def links(self, index: Int[np.ndarray, " b"]) -> Links:
         """Returns links as float32 and int32 arrays on the device."""
         receiver, tx = (jnp.asarray(which[index], jnp.int32) for which in (self.receiver_index, self.tx_index))
-        return Links(self.query(index), receiver, tx)
+        return self.query(index).with_indices(receiver, tx)
 
     def pas(self, index: Int[np.ndarray, " b"]) -> Float[Array, "b 90 360"]:
         """Returns the observed power angular spectra (float32, maximum 1) of links.

@@ -188,7 +188,7 @@ class Field(ABC):
         """
 
     @abstractmethod
-    def render(self, params: Params, plan: Any, links: Query | Links) -> Observation:
+    def render(self, params: Params, plan: Any, links: Query) -> Observation:
         """Returns the predicted observations of a plan's receiver on B links.
 
         Args:
@@ -282,7 +282,7 @@ class Field(ABC):
         parts = {name: component.smoothed(getattr(params, name), metres) for name, component in components_of(self).items()}
         return dataclasses.replace(params, **parts) if parts else params
 
-    def inspect(self, params: Params, plan: Any = None, links: Query | Links | None = None) -> Inspection:
+    def inspect(self, params: Params, plan: Any = None, links: Query | None = None) -> Inspection:
         """Returns the contents of the field (host), including its Gaussians for B links if links and a plan are given."""
         parts = components_of(self).items()
         if not parts:
@@ -381,19 +381,19 @@ def field_from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) 
     return cls(**parts, config=config)  # type: ignore[call-arg]
 
 
-def paths_of(field: Field, params: Params, plan: Any, links: Query | Links) -> Arrivals:
+def paths_of(field: Field, params: Params, plan: Any, links: Query) -> Arrivals:
     """Returns all paths of B links, leading axis B, from a field whose `outputs` include "paths".
 
     Raises:
         ValueError: positions or frequencies are invalid.
         UserError: the field predicts no paths.
     """
-    check_query(links.query)  # here: under `jit` there are no values to check
+    check_query(links)  # here: under `jit` there are no values to check
     return _paths_of(field, params, plan, links)
 
 
 @jax.jit
-def _paths_of(field: Field, params: Params, plan: Any, links: Query | Links) -> Arrivals:
+def _paths_of(field: Field, params: Params, plan: Any, links: Query) -> Arrivals:
     paths = field.render(params, plan, links).paths
     if paths is None:
         raise UserError(f"the {field.name} field of this run predicts no paths; train the default one on data with a mesh")
@@ -448,6 +448,18 @@ def compare(seen: Observation, batch: Batch, ssim_weight: float = 0.2, ssim_stri
     if error is None:
         raise UserError(f"these data are {kind.words}, which this field does not predict; choose another field")
     return error, Aux({})
+
+
+def received_dbm(seen: Observation, links: Query) -> Float[Array, " b"]:
+    """Returns the absolute received powers (dBm) of predictions for links whose transmitted powers are given.
+
+    Raises:
+        ValueError: the field predicts no received power, or the transmitted power is unknown.
+    """
+    power_dbm = links.transmitter.power_dbm
+    if seen.power_db is None or power_dbm is None:
+        raise ValueError("a received power in dBm needs a field that predicts power, and `power_dbm` of the transmitters")
+    return seen.power_db + power_dbm
 
 
 def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:

@@ -179,10 +179,10 @@ class WaveField(Calibratable):
         """Returns the paths between the transmitters and receivers of links (host); geometry is not trained."""
         return prepare_paths(links, lambda number: self.plan(None, jax.tree.map(lambda leaf: leaf[number], receivers)))
 
-    def render(self, params: WaveParams, plan: WavePlan, links: Query | Links) -> Observation:
+    def render(self, params: WaveParams, plan: WavePlan, links: Query) -> Observation:
         """Returns spectra, snapshots, received power and paths of B links, which must be `Links` if paths are prepared."""
         paths = plan.paths_of(links)
-        return observe(params, dataclasses.replace(plan, prepared=None), paths, links.frequency_hz)
+        return observe(params, dataclasses.replace(plan, prepared=None), paths, links)
 
     def loss(
         self,
@@ -271,7 +271,7 @@ class WaveField(Calibratable):
         """Returns the field unchanged: estimated displacements and array gains of receivers apply to these receivers only."""
         return self, params
 
-    def inspect(self, params: WaveParams, plan: WavePlan | None = None, links: Query | Links | None = None) -> Inspection:
+    def inspect(self, params: WaveParams, plan: WavePlan | None = None, links: Query | None = None) -> Inspection:
         """Returns the numbers of materials, facets and edges, the properties of the materials, and the displaced surfaces."""
         edges = int(np.count_nonzero(np.asarray(self.edges.length)))
         sizes = {"materials": len(self.known_thickness), "facets": len(self.facets.offset), "edges": edges}
@@ -332,14 +332,14 @@ def _traced(*trees: Any) -> bool:
 
 def render(params: WaveParams, plan: WavePlan, query: Query) -> Float[Array, "b 90 360"]:
     """Returns the power angular spectra of B queries."""
-    return observe(params, plan, plan.paths_of(query), query.frequency_hz).pas
+    return observe(params, plan, plan.paths_of(query), query).pas
 
 
 def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array, "b elements"]:
     """Returns the complex array snapshots (channel state) of B queries."""
-    return path_snapshots(params, plan, plan.paths_of(query), query.frequency_hz)
+    return path_snapshots(params, plan, plan.paths_of(query), query)
 
 
 def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
     """Returns all paths of B queries, leading axis B, with amplitudes, directions and lengths."""
-    return path_arrivals(params, plan, plan.paths_of(query), query.frequency_hz)
+    return path_arrivals(params, plan, plan.paths_of(query), query)

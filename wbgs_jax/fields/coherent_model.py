@@ -39,7 +39,7 @@ from wbgs_jax.radio.array import (
     wide_covariance_to_pas,
 )
 from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
-from wbgs_jax.types import Links, Query, Receiver, check_query
+from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
 FAINTEST_SUM = 1e-12
 """Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
@@ -80,7 +80,7 @@ class WaveParams:
     log_gain: Float[Array, ""]
     """Logarithm of the overall gain: that of the transmitter, and any other common factor of all snapshots."""
     transmitter: Antenna
-    """Antenna of all transmitters, in the world frame."""
+    """Antenna of all transmitters without an antenna of their own, in the frame of the transmitter."""
     element: Antenna
     """Antenna of every element of the array in addition to its known pattern, in the receiver's frame."""
     placement: Float[Array, " places"]
@@ -151,12 +151,12 @@ class WavePlan:
     """Paths of the links that will be queried; None if paths are to be traced for each query."""
     config: WaveConfig = static()
 
-    def paths_of(self, links: Query | Links) -> TracedPaths:
+    def paths_of(self, links: Query) -> TracedPaths:
         """Returns the paths of B links, from the prepared ones or by tracing."""
         if self.prepared is None:
-            check_query(links.query)
+            check_query(links)
             return trace(self, links.tx_position)
-        if isinstance(links, Query):
+        if not isinstance(links, Links):
             raise TypeError("a plan with prepared paths traces no others; make a plan without them, or query `Links`")
         return self.prepared.of(links)
 
@@ -180,23 +180,19 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
 
 
 @jax.jit
-def path_snapshots(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
-) -> Complex[Array, "b elements"]:
-    """Returns the snapshots of B transmitters from their paths."""
-    return _snapshots(params, plan, path_arrivals(params, plan, paths, frequency_hz), frequency_hz)
+def path_snapshots(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Complex[Array, "b elements"]:
+    """Returns the snapshots of B links from their paths."""
+    return _snapshots(plan, path_arrivals(params, plan, paths, links), links.frequency_hz)
 
 
 @jax.jit
-def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Arrivals:
-    """Returns the arrivals over all paths of B transmitters, leading axis B."""
-    found: Any = jax.vmap(lambda paths, f: arrivals_at(params, plan, paths, f))(paths, frequency_hz)
+def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Arrivals:
+    """Returns the arrivals over all paths of B links, leading axis B."""
+    found: Any = jax.vmap(lambda paths, link: arrivals_at(params, plan, paths, link))(paths, links)
     return found
 
 
-def _snapshots(
-    params: WaveParams, plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]
-) -> Complex[Array, "b elements"]:
+def _snapshots(plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
     y = jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
     return y if plan.tuning is None else y * element_gains(plan.tuning)
 
@@ -207,13 +203,13 @@ def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elemen
 
 
 @jax.jit
-def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]) -> Observation:
-    """Returns spectra, snapshots, received power and arrivals of B transmitters from their paths."""
+def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Observation:
+    """Returns spectra, snapshots, received power and arrivals of B links from their paths."""
     if not plan.config.coherent:
-        blind = phase_blind_pas(params, plan, paths, frequency_hz)
-        return Observation(blind, paths=path_arrivals(params, plan, paths, frequency_hz))
-    arrived = path_arrivals(params, plan, paths, frequency_hz)
-    y, elements = _snapshots(params, plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
+        blind = phase_blind_pas(params, plan, paths, links)
+        return Observation(blind, paths=path_arrivals(params, plan, paths, links))
+    arrived, frequency_hz = path_arrivals(params, plan, paths, links), links.frequency_hz
+    y, elements = _snapshots(plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
     if plan.beams is not None:
         pas = covariance_to_pas(covariance, plan.beams)
@@ -247,13 +243,13 @@ def path_covariances(
 
 
 @jax.jit
-def phase_blind_pas(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, " b"]
-) -> Float[Array, "b 90 360"]:
+def phase_blind_pas(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Float[Array, "b 90 360"]:
     """Returns spectra with the powers of all paths added, which is this model without phases."""
-    return jax.vmap(lambda paths, f: added_powers(arrivals_at(params, plan, paths, f), plan.receiver.element_wavelengths(f)))(
-        paths, frequency_hz
-    )
+
+    def one(paths: TracedPaths, link: Query) -> Float[Array, "90 360"]:
+        return added_powers(arrivals_at(params, plan, paths, link), plan.receiver.element_wavelengths(link.frequency_hz))
+
+    return jax.vmap(one)(paths, links)
 
 
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
@@ -265,12 +261,20 @@ def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""])
     return Slabs(permittivity[material], thickness[material], params.thick)
 
 
-def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, frequency_hz: Float[Array, ""]) -> Arrivals:
-    """Returns the arrivals over all paths of one transmitter."""
+def transmitter_antenna(params: WaveParams, transmitter: Transmitter) -> Antenna:
+    """Returns the antenna of one transmitter in the world frame: its own one if it has any, else the learned one, after the
+    rotation of the transmitter if it has an orientation."""
+    antenna = params.transmitter if transmitter.antenna is None else transmitter.antenna
+    return antenna if transmitter.orientation is None else antenna.rotated(transmitter.orientation)
+
+
+def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Query) -> Arrivals:
+    """Returns the arrivals over all paths of one link."""
+    frequency_hz = link.frequency_hz
     slabs, found = slabs_at(params, plan, frequency_hz), []
     clutter = None if params.clutter is None else _clutter_at(params.clutter, frequency_hz)
     for row, some in enumerate((paths.specular, paths.diffracted)):
-        antennas = params.transmitter, params.element
+        antennas = transmitter_antenna(params, link.transmitter), params.element
         one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
         if clutter is not None:
@@ -338,7 +342,7 @@ def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedP
     """
     numbers = np.stack([np.asarray(links.receiver_index), np.asarray(links.tx_index)], -1)
     pairs, first = np.unique(numbers, axis=0, return_index=True)
-    positions, found, beams = np.asarray(links.query.tx_position)[first], [], []
+    positions, found, beams = np.asarray(links.tx_position)[first], [], []
     for receiver in np.unique(pairs[:, 0]):
         plan = plan_of(int(receiver))  # one at a time: the mirror images of many receivers would need much memory
         found.append(_traced_in_blocks(plan, positions[pairs[:, 0] == receiver]))

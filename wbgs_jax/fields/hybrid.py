@@ -36,7 +36,7 @@ from wbgs_jax.fields.mixture import (
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan, gaussian_state
 from wbgs_jax.radio.channel import NOT_HEARD_DB
 from wbgs_jax.splat import TileLimits
-from wbgs_jax.types import Batch, Links, Query, Receiver, Scene
+from wbgs_jax.types import Batch, Query, Receiver, Scene
 
 
 @dataclass(frozen=True)
@@ -131,21 +131,21 @@ class HybridField(Field):
         wave = None if self.wave is None else self.wave.plan(params.wave, receiver, prepared)
         return HybridPlan(wave, self.wideband.plan(params.wideband, receiver, None, capacity))
 
-    def render(self, params: HybridParams, plan: HybridPlan, links: Query | Links) -> Observation:
+    def render(self, params: HybridParams, plan: HybridPlan, links: Query) -> Observation:
         """Returns the mixed spectra and received powers of B links, and the snapshots and paths of the coherent field."""
         if self.wave is None:
             return self.wideband.render(params.wideband, plan.wideband, links)
         coherent = self.wave.render(params.wave, plan.wave, links)
-        pas, power_db, inputs = self._said(params, plan, links.query, coherent)
+        pas, power_db, inputs = self._said(params, plan, links, coherent)
         spectra, power = mixed(params.trust.spectra, inputs, pas), mixed(params.trust.power, inputs, power_db)
         return coherent._replace(pas=spectra, power_db=power, covariance=None)  # the covariance is of the coherent field only
 
     def opinions(
-        self, params: HybridParams, plan: HybridPlan, links: Query | Links
+        self, params: HybridParams, plan: HybridPlan, links: Query
     ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on; the
         scene must have a mesh."""
-        return self._said(params, plan, links.query, self.wave.render(params.wave, plan.wave, links))
+        return self._said(params, plan, links, self.wave.render(params.wave, plan.wave, links))
 
     def with_shares(
         self, params: HybridParams, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0
@@ -203,13 +203,13 @@ class HybridField(Field):
         trust = None if params is None else jax.tree.map(lambda _: "trust", params.trust)
         return groups | {"trust": Group(0.0)}, None if params is None else replaced(labels, trust=trust)
 
-    def inspect(self, params: HybridParams, plan: HybridPlan | None = None, links: Query | Links | None = None) -> Inspection:
+    def inspect(self, params: HybridParams, plan: HybridPlan | None = None, links: Query | None = None) -> Inspection:
         """Returns the contents of both fields, with the state of the Gaussians conditioned on the coherent field."""
         found = super().inspect(params)
         if plan is None or links is None:
             return found
         given = None if self.wave is None else self.wave.render(params.wave, plan.wave, links).pas
-        return found._replace(gaussians=gaussian_state(params.wideband, plan.wideband, links.query, given))
+        return found._replace(gaussians=gaussian_state(params.wideband, plan.wideband, links, given))
 
 
 def _coherent(config: WaveConfig, scene: Scene, seed: int) -> WaveField | None:
@@ -231,4 +231,4 @@ def _informed(batch: Batch) -> Bool[Array, "b 1 1"]:
         key = jax.random.fold_in(batch.key, tx)
         return jax.random.bernoulli(jax.random.fold_in(key, jax.lax.bitcast_convert_type(frequency_hz, jnp.uint32)))
 
-    return jax.vmap(drawn)(batch.links.tx_index, batch.links.query.frequency_hz)[:, None, None]
+    return jax.vmap(drawn)(batch.links.tx_index, batch.links.frequency_hz)[:, None, None]

@@ -41,7 +41,7 @@ from wbgs_jax.fields.base import Observation, Params
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
-from wbgs_jax.types import Links, Query
+from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
 """Weights of the first of two experts at which links are scored."""
@@ -93,9 +93,7 @@ class Opinions(NamedTuple):
 class Mixing(Protocol):
     """A field that mixes three experts with weights that are fitted after its training."""
 
-    def opinions(
-        self, params: Params, plan: Any, links: Query | Links
-    ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+    def opinions(self, params: Params, plan: Any, links: Query) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on."""
         ...
 

@@ -29,9 +29,10 @@ from wbgs_jax.fields.networks import (
     positional_encoding,
     signal_activation,
 )
+from wbgs_jax.radio.antenna import Antenna
 from wbgs_jax.radio.array import EXACT, PAS_HEIGHT, PAS_SHAPE, PAS_WIDTH, array_response, pas_directions
 from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
-from wbgs_jax.types import Batch, Links, Query, Receiver, Scene, check_query, check_receiver
+from wbgs_jax.types import Batch, Query, Receiver, Scene, Transmitter, check_query, check_receiver
 
 PIXELS = PAS_HEIGHT * PAS_WIDTH
 MIN_LENGTH = 1e-3
@@ -145,9 +146,9 @@ class Nerf2Field(Field):
         box = jax.lax.stop_gradient(self.box)
         return Nerf2Plan(make_rays(box, receiver, local), receiver, box, self.config)
 
-    def render(self, params: Weights, plan: Nerf2Plan, links: Query | Links) -> Observation:
+    def render(self, params: Weights, plan: Nerf2Plan, links: Query) -> Observation:
         """Returns the spectra of B links."""
-        return Observation(render(params, plan, links.query))
+        return Observation(render(params, plan, links))
 
     def loss(
         self, params: Weights, prepared: None, batch: Batch, capacity: None = None, probe: None = None
@@ -158,7 +159,7 @@ class Nerf2Field(Field):
         local = jnp.asarray(pas_directions().reshape(-1, 3), self.box.dtype)[pixels]
         truth = batch.pas.reshape(batch.pas.shape[0], -1)[:, pixels]
         plan = self._plan(batch.receiver, local)
-        predicted = march(params, plan, plan.rays, batch.links.query).T
+        predicted = march(params, plan, plan.rays, batch.links).T
         return pixel_loss(predicted, truth, self.config.pixel_loss), Aux({"batch_ssim": jnp.full((), jnp.nan)})
 
     @classmethod
@@ -172,10 +173,10 @@ class Nerf2Field(Field):
 def _init(field: Nerf2Field, key: Key[Array, ""]) -> Weights:
     """Returns initial weights; only the shapes of the inputs matter."""
     box = field.box
-    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), jnp.zeros(2))
+    receiver = Receiver(box.mean(0), jnp.array([1.0, 0, 0, 0]), jnp.zeros((1, 3)), Antenna(None, jnp.zeros(2)))
     rays = make_rays(box, receiver, jnp.array([[0.0, 0.0, 1.0]]))
     plan = Nerf2Plan(rays, receiver, box, field.config)
-    query = Query(box[1:], jnp.full((1,), 1e9))
+    query = Query(Transmitter(box[1:]), jnp.full((1,), 1e9))
     key_attenuation, key_radiance = jax.random.split(key)
     attenuation, radiance = _networks(field.config)
     outputs: Any

@@ -49,7 +49,6 @@ from wbgs_jax.splat import GeometryPlan, TileLimits, fit_limits, geometry_plan, 
 from wbgs_jax.types import (
     Batch,
     Gaussians,
-    Links,
     Query,
     Receiver,
     Scene,
@@ -147,11 +146,11 @@ class WidebandField(Field):
         return WidebandPlan(geometry, features, frame, receiver, self.config)
 
     def render(
-        self, params: WidebandParams, plan: WidebandPlan, links: Query | Links, given: Float[Array, "b 90 360"] | None = None
+        self, params: WidebandParams, plan: WidebandPlan, links: Query, given: Float[Array, "b 90 360"] | None = None
     ) -> Observation:
         """Returns the spectra and received powers of B links; `given` are conditioning spectra, for networks that have inputs
         for them."""
-        return self._render(params, plan, links.query, given)
+        return self._render(params, plan, links, given)
 
     def _render(
         self,
@@ -182,7 +181,7 @@ class WidebandField(Field):
         """Returns the image loss of a batch (paper, equation 5), plus the error of received power if the data contain it.
         `probe` is an offset of the projected centres, pixels; `given` are conditioning spectra."""
         planned = self._plan(params, batch.receiver, capacity, probe)
-        seen = self._render(params, planned, batch.links.query, given, detached=batch.pas is not None)
+        seen = self._render(params, planned, batch.links, given, detached=batch.pas is not None)
         loss, aux = compare(seen, batch, self.config.ssim_weight, self.config.ssim_stride)
         if batch.pas is not None and (error_db := power_error_db(seen, batch)) is not None:
             loss += self.config.power_weight * error_db
@@ -201,11 +200,9 @@ class WidebandField(Field):
                 required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
         return fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
 
-    def inspect(
-        self, params: WidebandParams, plan: WidebandPlan | None = None, links: Query | Links | None = None
-    ) -> Inspection:
+    def inspect(self, params: WidebandParams, plan: WidebandPlan | None = None, links: Query | None = None) -> Inspection:
         """Returns the number of Gaussians, and their state for B links."""
-        state = None if plan is None or links is None else gaussian_state(params, plan, links.query)
+        state = None if plan is None or links is None else gaussian_state(params, plan, links)
         return Inspection({"gaussians": int(np.asarray(params.gaussians.alive).sum())}, gaussians=state)
 
     @classmethod

@@ -24,7 +24,7 @@ from wbgs_jax._util.files import atomic_write, opened_archive
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.queries import Product, flatten
-from wbgs_jax.types import Query
+from wbgs_jax.types import Query, Transmitter
 
 if TYPE_CHECKING:
     from wbgs_jax.inference.evaluate_quantities import LoadedField
@@ -124,7 +124,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
         return None
 
     def answer(*arrays: Any) -> dict[str, Any]:
-        return answer_all(jax.tree.unflatten(structure, arrays[:-2]), Query(*arrays[-2:]), names)
+        return answer_all(jax.tree.unflatten(structure, arrays[:-2]), Query(Transmitter(arrays[-2]), arrays[-1]), names)
 
     size = size_for(count)
     shapes = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in arrays]

@@ -40,7 +40,7 @@ from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
 from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.trained_field import TrainedField
-from wbgs_jax.types import Query, Receiver
+from wbgs_jax.types import Query, Receiver, Transmitter
 
 FORMAT = 2
 METADATA, FIELD = "metadata.json", "field.bin"
@@ -153,7 +153,7 @@ def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]
     frozen = frozen._replace(plan=portable(frozen.plan))
 
     def answer(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> dict[str, Array]:
-        return answer_all(frozen, Query(tx_position, frequency_hz), names)
+        return answer_all(frozen, Query(Transmitter(tx_position), frequency_hz), names)
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)

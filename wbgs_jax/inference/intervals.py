@@ -24,7 +24,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
-from wbgs_jax.types import Query
+from wbgs_jax.types import Query, Transmitter
 
 MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
@@ -196,7 +196,7 @@ def expect_many(
 
     def of_block(block: Any) -> Expected:
         spectra, tx, hertz, power = jax.tree.map(jnp.asarray, block)
-        return _expected(confidence, spectra, Query(tx, hertz), power)
+        return _expected(confidence, spectra, Query(Transmitter(tx), hertz), power)
 
     rows = (pas, tx_position, frequency_hz, power_db)
     rows = jax.tree.map(lambda values: np.asarray(values, np.float32), rows)

@@ -20,7 +20,7 @@ from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.kriging import Beside, correct, for_receiver
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_SHAPE
-from wbgs_jax.types import Links, Query, Receiver, check_query
+from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
 BLOCK = 16
 """Queries rendered at a time, with common footprints; larger blocks need more memory and are not faster on a CPU."""
@@ -136,7 +136,7 @@ def _observe(
 ) -> Any:
     def own(links: Links, field: Field, params: Any, plan: Any, neighbours: Beside) -> Any:
         seen = field.render(params, plan, links)
-        seen = seen._replace(pas=correct(neighbours, seen.pas, links.query), paths=None)
+        seen = seen._replace(pas=correct(neighbours, seen.pas, links), paths=None)
         return getattr(seen, quantity) if quantity else seen
 
     return spread(own, mesh, divided=0)(links, field, params, plan, neighbours)
@@ -155,10 +155,10 @@ class OnAnyShape:
             raise ValueError(f"tx_position has shape {position.shape}; expected (3,) or (..., 3)")
         shape = jnp.broadcast_shapes(position.shape[:-1], frequency.shape)
         position, frequency = jnp.broadcast_to(position, (*shape, 3)), jnp.broadcast_to(frequency, shape)
-        query = Query(position.reshape(-1, 3), frequency.reshape(-1))
+        query = Query(Transmitter(position.reshape(-1, 3)), frequency.reshape(-1))
         check_query(query)
         if 0 in shape:
-            one = Query(jnp.zeros((1, 3), jnp.float32), jnp.ones(1, jnp.float32))
+            one = Query(Transmitter(jnp.zeros((1, 3), jnp.float32)), jnp.ones(1, jnp.float32))
             return jax.tree.map(lambda leaf: jnp.zeros((*shape, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.render, one))
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 
@@ -194,7 +194,7 @@ def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, qua
     count = len(query.frequency_hz)
     devices = _devices(count)
     tx_index = jnp.asarray(group_transmitters(np.asarray(query.tx_position)), jnp.int32)
-    links = Links(query, jnp.zeros(count, jnp.int32), tx_index)
+    links = query.with_indices(jnp.zeros(count, jnp.int32), tx_index)
 
     def answers() -> Iterator[tuple[Int[np.ndarray, " k"], Any]]:
         for start in range(0, count, PREPARED):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Inexact, Int
 
 from wbgs_jax._util.complex_math import phasor
 from wbgs_jax.mesh.edges import Edges
@@ -19,7 +19,7 @@ from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.materials import Slabs, slab_coefficients
 from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
 from wbgs_jax.propagation.utd import wedge_coefficients
-from wbgs_jax.radio.antenna import Antenna, antenna_field, upright, zenith_vector
+from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import to_local
@@ -85,7 +85,7 @@ def arrivals(
     somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
     legs = legs_of(paths)
-    field = antenna_field(transmitter, legs.direction[:, 0]).astype(slabs.permittivity.dtype)
+    field = transmitter.field(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, surfaces, slabs, frequency_hz)
     active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
     if diffracted:
@@ -95,14 +95,22 @@ def arrivals(
     last = last_leg(paths)
     arrival = legs.direction[jnp.arange(len(last)), last]
     local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
-    own = dataclasses.replace(element, exponents=element.exponents + receiver.pattern_exponents)
     theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
-    parts = jnp.stack([_dot(here, basis) for basis in (antenna_field(own, local), theta, jnp.cross(local, theta))], -1)
+    own = _element_field(receiver.antenna, element, local)
+    parts = jnp.stack([_dot(here, basis) for basis in (own, theta, jnp.cross(local, theta))], -1)
     scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
     met = paths.interaction_type, _materials(paths, surfaces)
     arrived = amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:]
     return Arrivals(*arrived, *met, points=paths.points)
+
+
+def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "k 3"]) -> Inexact[Array, "k 3"]:
+    """Returns the polarised amplitude gain of an element in its receiver's frame: that of its antenna times the gain of a
+    further one, which also determines the polarisation if the antenna has neither an orientation nor a table."""
+    if antenna.orientation is None and antenna.pattern is None:
+        return dataclasses.replace(further, exponents=further.exponents + antenna.exponents).field(direction)
+    return antenna.field(direction) * further.parametric_gain(direction)[..., None]
 
 
 def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:

@@ -37,6 +37,13 @@ def to_local(vectors: Inexact[Array, "*n 3"], orientation: Float[Array, "4"]) ->
     return jnp.matmul(vectors, rotation_matrix(orientation), precision=EXACT)
 
 
+def quaternion_product(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """Returns the quaternion (wxyz) of the rotation b followed by the rotation a."""
+    scalar = a[..., :1] * b[..., :1] - jnp.sum(a[..., 1:] * b[..., 1:], -1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + jnp.cross(a[..., 1:], b[..., 1:])
+    return jnp.concatenate([scalar, vector], -1)
+
+
 def turned(orientation: Float[Array, "4"], rotation: Float[Array, "3"]) -> Float[Array, "4"]:
     """Returns a quaternion (wxyz, of any length) after a small rotation of the world frame (rotation vector, radians), with an
     error of third order."""

@@ -23,7 +23,7 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.observation_kinds import KINDS, Observations, Observed, spectra_of
 from wbgs_jax.radio.array import pas_directions, steering_vector
-from wbgs_jax.types import Batch, Links, Query, Receiver
+from wbgs_jax.types import Batch, Links, Receiver, Transmitter
 
 FAR_M = 500.0
 """Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a wavelength
@@ -65,7 +65,7 @@ class TrainingData(Observed):
         return {name: values[index] for name, values in self.observations.items()}
 
     def _spectra(self, observed: Observations, index: Int[Array, " b"]) -> Float[Array, "b 90 360"] | None:
-        elements = self.receiver_of(index).element_wavelengths(self.links.query.frequency_hz[index])
+        elements = self.receiver_of(index).element_wavelengths(self.links.frequency_hz[index])
         return spectra_of(observed, elements, self.steering)
 
 
@@ -218,7 +218,8 @@ def with_virtual(data: TrainingData, virtual: VirtualLinks, observed: UInt8[np.n
     """
     count = len(virtual.frequency_hz)
     more = Links(
-        Query(jnp.asarray(virtual.tx_position, jnp.float32), jnp.asarray(virtual.frequency_hz, jnp.float32)),
+        Transmitter(jnp.asarray(virtual.tx_position, jnp.float32)),
+        jnp.asarray(virtual.frequency_hz, jnp.float32),
         jnp.asarray(virtual.receiver_index, jnp.int32),
         jnp.arange(count, dtype=jnp.int32) + 1 + jnp.max(data.links.tx_index),
     )

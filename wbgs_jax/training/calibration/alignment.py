@@ -250,7 +250,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
         receiver: prior standard deviations of the displacement (metres) and rotation (radians) of the receiver.
         named: whether materials are chosen again whenever paths are traced.
     """
-    data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.query.frequency_hz)[heard.spectra]
+    data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.frequency_hz)[heard.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)

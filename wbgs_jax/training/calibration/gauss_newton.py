@@ -80,7 +80,7 @@ def adjust(
     stiffness, others[numbers] = 1 / others[numbers], 0
     known = jnp.asarray(covariance, jnp.float32), jnp.asarray(others, jnp.float32)
     variance = length_variances(prepared, *known, numbers, len(motion.shift))
-    frequency = np.asarray(data.links.query.frequency_hz)[pool].max()
+    frequency = np.asarray(data.links.frequency_hz)[pool].max()
     furthest = LONGEST_STEP * SPEED_OF_LIGHT / float(frequency) / _arms(motion)[numbers]
     for _ in range(ROUNDS):
         blocks = -(-min(count, len(pool)) // AT_ONCE)
@@ -200,9 +200,9 @@ def normal_equations(
         assert batch.snapshots is not None, "the alignment needs phases"
         queried: Links = jax.tree.map(lambda leaf: leaf[0], batch.links)
         plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(queried.receiver_index))
-        paths, frequency = prepared.of(queried), queried.query.frequency_hz
+        paths, frequency = prepared.of(queried), queried.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
-        arrived: Arrivals = arrivals_at(params, plan, paths, frequency)
+        arrived: Arrivals = arrivals_at(params, plan, paths, queried)
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(queried)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)

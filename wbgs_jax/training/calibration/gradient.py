@@ -63,7 +63,7 @@ def descend(
         rng: random numbers.
     """
     batches = batches_of_one_receiver(data, pool, count, BATCH, rng)
-    wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.query.frequency_hz)[pool].max())
+    wavelength = SPEED_OF_LIGHT / float(np.asarray(data.links.frequency_hz)[pool].max())
     rate, unseen = min(STEP * wavelength, LONGEST_STEP), UNSEEN * 2 * np.pi / wavelength
     # Curvature of the normal prior, relative to a loss that is a mean over this number of values.
     numbers = len(pool) * data.receivers.element_positions.shape[-2]

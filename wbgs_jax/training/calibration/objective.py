@@ -106,7 +106,7 @@ class Told:
 
     def frequency_hz(self) -> Float[np.ndarray, " n"]:
         """Returns the frequencies of the spectra."""
-        return np.asarray(self.data.links.query.frequency_hz)[self.spectra]
+        return np.asarray(self.data.links.frequency_hz)[self.spectra]
 
     def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
         """Returns the transmitters of the first `count` spectra."""

@@ -19,6 +19,7 @@ from wbgs_jax.config import SearchConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
+from wbgs_jax.radio.antenna import is_directional
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas
@@ -56,10 +57,9 @@ def unusual_level(told: Told) -> float:
     assert told.data.snapshots is not None, "the level is that of snapshots"
     snapshots, links = jax.tree.map(lambda leaf: leaf[told.spectra], (told.data.snapshots, told.data.links))
     rx = told.data.receivers.position[links.receiver_index]
-    power, query = received_power_db(snapshots), links.query
-    beyond = np.asarray(beyond_free_space_db(power, query.tx_position, rx, query.frequency_hz))
+    beyond = beyond_free_space_db(received_power_db(snapshots), links.tx_position, rx, links.frequency_hz)
     received = np.asarray(snapshots).any(-1)
-    level = float(np.median(beyond[received])) if received.any() else 0.0
+    level = float(np.median(np.asarray(beyond)[received])) if received.any() else 0.0
     return 0.0 if ROOMS_DB[0] <= level <= ROOMS_DB[1] else level
 
 
@@ -148,7 +148,7 @@ class Search(Hook):
 
     def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
         """Returns parameters with calibrated antennas, and whether any antenna has changed."""
-        count, known = self.config.antenna_spectra, bool(np.any(np.asarray(told.data.receivers.pattern_exponents) != 0))
+        count, known = self.config.antenna_spectra, is_directional(told.data.receivers.antenna)
         params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
         before = report.get("antennas", dataclasses.asdict(found))
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}

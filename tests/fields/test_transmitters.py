@@ -1,0 +1,89 @@
+"""Properties of single transmitters in the coherent field: antenna, orientation and power."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from builders.rooms import field_of, room
+from scipy.spatial.transform import Rotation
+
+from wbgs_jax.fields.base import received_dbm
+from wbgs_jax.radio.antenna import Antenna, tabulated
+from wbgs_jax.types import Query, Transmitter, check_query, make_query
+
+TX = np.array([[4.0, 2.5, 1.4], [2.0, 3.0, 2.0]])
+HZ = 3e9
+
+
+@pytest.fixture(scope="module")
+def setup():
+    field, params, plan = field_of(room(), (1.0, 1.0, 1.2), mirror_areas=(0.0,), specular_kept=8, diffracted_kept=1)
+    return field, params, plan, jax.jit(lambda params, query: field.render(params, plan, query))
+
+
+def antennas(rng):
+    """Two directional antennas in their own frames."""
+    quaternions = np.roll(Rotation.random(2, random_state=rng).as_quat(), 1, -1)
+    return Antenna(jnp.asarray(quaternions, jnp.float32), jnp.array([[1.0, 0.0], [0.3, 0.8]]))
+
+
+def test_each_transmitter_has_its_own_antenna(setup, rng):
+    """As if the field had learned it for all of them."""
+    _, params, _, render = setup
+    both = antennas(rng)
+    found = render(params, make_query(TX, HZ, antenna=both)).snapshots
+    for number in range(2):
+        learned = dataclasses.replace(params, transmitter=jax.tree.map(lambda leaf, i=number: leaf[i], both))
+        expected = render(learned, make_query(TX, HZ)).snapshots[number]
+        np.testing.assert_allclose(found[number], expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_the_orientation_of_a_transmitter_rotates_its_antenna(setup, rng):
+    _, params, _, render = setup
+    both = antennas(rng)
+    flat = dataclasses.replace(both, orientation=None)
+    found = render(params, make_query(TX, HZ, antenna=flat, orientation=both.orientation)).snapshots
+    expected = render(params, make_query(TX, HZ, antenna=both)).snapshots
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    learned = dataclasses.replace(params, transmitter=Antenna(jnp.array([1.0, 0, 0, 0]), jnp.array([1.0, 0.0])))
+    turned = render(learned, make_query(TX, HZ, orientation=both.orientation[0])).snapshots[0]
+    np.testing.assert_allclose(turned, expected[0], atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_tabulated_antenna_is_that_of_its_table(setup):
+    """The table of the dipole."""
+    _, params, _, render = setup
+    gain = np.sqrt(1.5) * np.sin(np.linspace(0, np.pi, 91))[:, None] * np.ones(180)
+    found = render(params, make_query(TX, HZ, antenna=tabulated(gain, None))).snapshots
+    expected = render(params, make_query(TX, HZ, antenna=Antenna(None, jnp.array([0.0, 1.0])))).snapshots
+    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_absolute_powers(setup):
+    _, params, _, render = setup
+    query = make_query(TX, HZ, power_dbm=[20.0, 30.0])
+    seen = render(params, query)
+    np.testing.assert_allclose(received_dbm(seen, query), np.add(seen.power_db, [20, 30]), rtol=1e-6)
+    with pytest.raises(ValueError, match="power_dbm"):
+        received_dbm(seen, make_query(TX, HZ))
+
+
+def test_positions_alone_are_transmitters_without_further_properties():
+    query = Query(jnp.asarray(TX, jnp.float32), jnp.full(2, HZ))
+    assert jax.tree.structure(query) == jax.tree.structure(make_query(TX, HZ))
+    assert len(jax.tree.leaves(query)) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("orientation", jnp.zeros((2, 3))), ("velocity", jnp.zeros((3, 3))), ("power_dbm", jnp.zeros((2, 1)))]
+)
+def test_wrong_shapes_of_properties_are_named(name, values):
+    transmitter = object.__new__(Transmitter)  # past the annotations
+    for one in dataclasses.fields(Transmitter):
+        object.__setattr__(transmitter, one.name, {"position": jnp.asarray(TX), name: values}.get(one.name))
+    query = make_query(TX, HZ)
+    object.__setattr__(query, "transmitter", transmitter)
+    with pytest.raises(ValueError, match=f"transmitter.{name}"):
+        check_query(query)

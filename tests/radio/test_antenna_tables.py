@@ -1,0 +1,181 @@
+"""Tabulated antennas against parametric ones in closed form, and their files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.antenna_file import read_antenna
+from wbgs_jax.radio.antenna import Antenna, dipole_gain, element_gain, mean_gain, pattern_exponents, tabulated, zenith_vector
+from wbgs_jax.radio.geometry import angles_to_direction
+
+STEP = 2
+ZENITH, AZIMUTH = np.radians(np.arange(0, 181, STEP)), np.radians(np.arange(0, 360, STEP))
+
+
+def grid():
+    azimuth, zenith = np.meshgrid(AZIMUTH, ZENITH)
+    return angles_to_direction(jnp.asarray(azimuth, jnp.float32), jnp.asarray(zenith, jnp.float32))
+
+
+def named(pattern):
+    return Antenna(None, jnp.array(pattern_exponents(pattern), jnp.float32))
+
+
+def amplitudes(pattern):
+    return np.asarray((element_gain if pattern == "tr38901" else dipole_gain)(grid()))
+
+
+def crossed():
+    """Horizontal and vertical dipoles fed with a quarter of a period between them: (e_theta, e_phi), smooth at the poles."""
+    azimuth, zenith = np.meshgrid(AZIMUTH, ZENITH)
+    x_theta, x_phi = np.cos(zenith) * np.cos(azimuth), -np.sin(azimuth)
+    return np.sqrt(0.75) * (x_theta - 1j * np.sin(zenith)), np.sqrt(0.75) * (x_phi + 0j)
+
+
+def crossed_field(k):
+    """The same without a table: the part of a constant vector across the direction."""
+    vector = np.sqrt(0.75) * np.array([1, 0, 1j])
+    return vector - np.sum(vector * k, -1, keepdims=True) * k
+
+
+def directions(rng, n=400):
+    k = rng.normal(size=(n, 3))
+    return (k / np.linalg.norm(k, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("pattern", ["tr38901", "dipole"])
+def test_a_table_of_gains_agrees_with_the_parametric_antenna(pattern, rng):
+    k = jnp.asarray(directions(rng, 1000))
+    exact, found = (np.asarray(a.field(k)) for a in (named(pattern), tabulated(amplitudes(pattern), None)))
+    level = np.linalg.norm(exact, axis=-1)
+    strong = level > 0.1 * level.max()
+    error_db = 20 * np.log10(np.linalg.norm(found, axis=-1)[strong] / level[strong])
+    assert strong.sum() > 300 and np.abs(error_db).max() < 0.05
+    assert np.abs(found - exact)[strong].max() < 6e-3 * level.max()
+
+
+def test_a_table_of_fields_is_smooth_at_both_poles(rng):
+    antenna = tabulated(*crossed())
+    k = np.concatenate([directions(rng), [[0, 0, 1], [0, 0, -1], [1e-7, 0, 1], [0, -3e-3, -1], [2e-3, 1e-3, 1]]]).astype(
+        np.float32
+    )
+    k /= np.linalg.norm(k, axis=-1, keepdims=True)
+    np.testing.assert_allclose(antenna.field(jnp.asarray(k)), crossed_field(k), atol=1e-4)
+
+
+def test_gains_at_the_poles_are_those_of_the_table():
+    gain = np.ones((len(ZENITH), len(AZIMUTH)))
+    gain[0], gain[-1] = 3, np.linspace(1, 2, len(AZIMUTH))
+    k = jnp.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0]])
+    np.testing.assert_allclose(np.linalg.norm(tabulated(gain, None).field(k), axis=-1), [3, 1.5, 1], rtol=1e-5)
+
+
+def test_a_rotated_table_seen_from_a_rotated_direction_is_rotated(rng):
+    first, second = Rotation.from_quat(rng.normal(size=4)), Rotation.from_quat(rng.normal(size=4))
+    antenna, k = tabulated(*crossed()), directions(rng, 50)
+    wxyz = [jnp.asarray(np.roll(one.as_quat(), 1), jnp.float32) for one in (first, second)]
+    rotated = antenna.rotated(wxyz[0]).rotated(wxyz[1])
+    both = second * first
+    found = np.asarray(rotated.field(jnp.asarray(both.apply(k), jnp.float32)))
+    expected = np.asarray(antenna.field(jnp.asarray(k)))
+    np.testing.assert_allclose(found, both.apply(expected.real) + 1j * both.apply(expected.imag), atol=2e-3)
+    np.testing.assert_allclose(np.sum(found * both.apply(k), -1), 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("place", [(0.3, -0.5, 0.4), (1e-3, 2e-3, 1.0), (-2e-3, 1e-3, -1.0), (-0.7, 1e-4, 0.1)])
+def test_gradients_of_a_table_agree_with_finite_differences(place, x64):
+    antenna = jax.tree.map(
+        lambda a: jnp.asarray(a, jnp.complex128 if jnp.iscomplexobj(a) else jnp.float64), tabulated(*crossed())
+    )
+
+    def strength(v):
+        field = antenna.field(v / jnp.linalg.norm(v))
+        return jnp.sum((field * jnp.array([0.3 + 0.1j, -0.2, 0.7j])).real)
+
+    v, step = jnp.array(place, jnp.float64), 1e-6
+    differences = [(strength(v + step * e) - strength(v - step * e)) / (2 * step) for e in np.eye(3)]
+    np.testing.assert_allclose(jax.grad(strength)(v), differences, atol=1e-6)
+    for pole in (1.0, -1.0):
+        assert np.isfinite(jax.grad(strength)(jnp.array([0.0, 0.0, pole]))).all()
+
+
+def test_the_directivity_of_an_antenna_without_losses_integrates_to_the_whole_sphere():
+    assert mean_gain(named("dipole")) == pytest.approx(1, abs=1e-4)
+    assert mean_gain(tabulated(amplitudes("dipole"), None)) == pytest.approx(1, abs=2e-3)
+    assert mean_gain(tabulated(*crossed())) == pytest.approx(1, abs=1e-3)
+
+
+def write_csv(path, head, columns):
+    azimuth, zenith = np.meshgrid(np.arange(0, 361, STEP) - 180, np.degrees(ZENITH))
+    rows = np.column_stack([azimuth.ravel(), zenith.ravel(), *columns(np.radians(azimuth), np.radians(zenith))])
+    rows = np.random.default_rng(0).permutation(rows)  # in any order
+    path.write_text(head + "\n" + "\n".join(",".join(map(repr, map(float, row))) for row in rows))
+
+
+def test_a_csv_file_of_gains(tmp_path, rng):
+    def gain(azimuth, zenith):
+        k = angles_to_direction(jnp.asarray(azimuth, jnp.float32), jnp.asarray(zenith, jnp.float32))
+        level = 20 * np.log10(np.linalg.norm(named("tr38901").field(k), axis=-1))
+        return [level.ravel()]
+
+    write_csv(tmp_path / "a.csv", "Azimuth_deg, zenith_deg, gain_dbi", gain)
+    k = jnp.asarray(directions(rng, 100))
+    np.testing.assert_allclose(read_antenna(tmp_path / "a.csv").field(k), named("tr38901").field(k), atol=0.02)
+
+
+def test_fields_of_any_unit_are_scaled_to_an_antenna_without_losses(tmp_path, rng):
+    """From an archive and from a table; both are the crossed dipoles."""
+    theta, phi = crossed()
+    np.savez(tmp_path / "a.npz", e_theta=37 * theta, e_phi=37 * phi, zenith=ZENITH, azimuth=AZIMUTH)
+
+    def components(azimuth, zenith):
+        theta = np.cos(zenith) * np.cos(azimuth) - 1j * np.sin(zenith)
+        return [part.ravel() for part in (theta.real, theta.imag, -np.sin(azimuth), 0 * azimuth)]
+
+    write_csv(tmp_path / "b.csv", "azimuth_deg,zenith_deg,theta_re,theta_im,phi_re,phi_im", components)
+    k = directions(rng, 100)
+    for name in ("a.npz", "b.csv"):
+        np.testing.assert_allclose(read_antenna(tmp_path / name).field(jnp.asarray(k)), crossed_field(k), atol=1e-3)
+
+
+def msi(gain="17.85 dBi", tilt=6):
+    """A beam of 65 degrees, 10 degrees high, tilted downwards; the azimuth of the file is clockwise."""
+    angle = (np.arange(360) + 180) % 360 - 180
+    horizontal = np.minimum(12 * ((angle - 20) / 65) ** 2, 30)  # 20 degrees clockwise
+    vertical = np.minimum(12 * ((angle - tilt) / 10) ** 2, 20)
+    cuts = [f"{i} {a:.6f}" for cut in (horizontal, vertical) for i, a in enumerate(cut)]
+    return "\n".join(["NAME x", f"GAIN {gain}", "HORIZONTAL 360", *cuts[:360], "VERTICAL 360", *cuts[360:]])
+
+
+@pytest.mark.parametrize(("gain", "dbi"), [("17.85 dBi", 17.85), ("15.70 dBd", 17.85), ("15.7", 17.85)])
+def test_an_msi_file_adds_the_attenuations_of_its_cuts(tmp_path, gain, dbi):
+    (tmp_path / "a.msi").write_text(msi(gain))
+    antenna = read_antenna(tmp_path / "a.msi")
+    azimuth, elevation = np.radians([-20, 12.5, -20, -20]), np.radians([-6, -6, -11, -1])
+    k = angles_to_direction(jnp.asarray(azimuth, jnp.float32), jnp.asarray(np.pi / 2 - elevation, jnp.float32))
+    found = antenna.field(k)
+    np.testing.assert_allclose(20 * np.log10(np.linalg.norm(found, axis=-1)), dbi - np.array([0, 3, 3, 3]), atol=0.02)
+    along = np.sum(np.asarray(found) * np.asarray(zenith_vector(k)), -1)
+    np.testing.assert_allclose(along, np.linalg.norm(found, axis=-1), rtol=1e-5)  # vertically polarised
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.txt", "", "does not end in"),
+        ("a.csv", "azimuth_deg,gain_dbi\n", "no column zenith_deg"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,x\n", "line 2"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,1\n90,90,1\n", "no regular grid"),
+        ("a.csv", "azimuth_deg,zenith_deg,gain_dbi\n0,0,100\n", "beyond 80 dBi"),
+        ("a.pln", "NAME x\nGAIN 3\n", "not an MSI Planet file"),
+        ("a.msi", msi().replace("\n90 ", "\n91 "), "not an MSI Planet file"),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match=words) as error:
+        read_antenna(tmp_path / name)
+    assert "\n" not in str(error.value) and name in str(error.value)

@@ -1,0 +1,184 @@
+"""Antenna patterns from files: CSV tables of the whole sphere, MSI Planet files with two cuts, and NumPy archives.
+
+Frame: boresight +x, zenith angles from +z, azimuths counter-clockwise about +z. Gains are absolute (dBi). Fields (NumPy
+archives, columns `theta_re` and so on) have an arbitrary unit: they are scaled to a lossless antenna, whose directivity
+integrates to 4 pi; losses belong to the transmitted power. A file without polarisation describes a vertically polarised
+antenna.
+"""
+
+import csv
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Inexact
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.files import read_arrays, read_text
+from wbgs_jax.radio.antenna import Antenna, tabulated, zenith_weights
+
+SUFFIXES = (".csv", ".msi", ".pln", ".npz")
+"""Endings of pattern files."""
+COMPONENTS = ("theta_re", "theta_im", "phi_re", "phi_im")
+"""Columns of a CSV file with fields instead of gains."""
+DIPOLE_DBI = 2.15
+"""Gain of a half-wave dipole, the reference of dBd."""
+LARGEST_DBI = 80.0
+"""Larger gains (dBi) are mistakes, such as powers instead of decibels."""
+REGULAR = 1e-3
+"""Largest deviation of an angle from its regular grid, degrees."""
+MOST_ROWS = 1_000_000
+"""Largest number of directions: finer than half a degree."""
+CUT = 360
+"""Angles of a cut in an MSI file, one per degree."""
+
+
+def read_antenna(path: Path) -> Antenna:
+    """Returns the antenna of a pattern file (host).
+
+    Args:
+        path: a file with one of the endings `SUFFIXES`:
+
+            * CSV: columns `azimuth_deg`, `zenith_deg` or `elevation_deg`, and `gain_dbi` with an optional `phase_deg`, or the
+              four `COMPONENTS`; every direction of a regular grid over the sphere.
+            * MSI Planet: `GAIN` (dBd, or dBi if the line says so) and the cuts `HORIZONTAL 360` and `VERTICAL 360`, whose
+              attenuations (dB) are added in every direction. Its azimuths are clockwise, its elevations positive downwards.
+            * NumPy archive: complex `e_theta` and `e_phi` (zenith, azimuth), and the angles `zenith` and `azimuth` in radians.
+
+    Raises:
+        UserError: the file cannot be read, or does not describe the whole sphere.
+    """
+    readers = {".csv": _read_csv, ".msi": _read_msi, ".pln": _read_msi, ".npz": _read_archive}
+    if path.suffix.lower() not in readers:
+        raise UserError(f"{path} does not end in {', '.join(SUFFIXES)}; convert the antenna pattern to one of these formats")
+    return readers[path.suffix.lower()](path)
+
+
+def _read_csv(path: Path) -> Antenna:
+    rows = csv.reader(io.StringIO(read_text(path)))
+    names = [name.strip().lower() for name in next(rows, [])]
+    vertical = next((name for name in ("zenith_deg", "elevation_deg", "elevation") if name in names), "zenith_deg")
+    values = ("gain_dbi",) if "gain_dbi" in names else COMPONENTS
+    needed = ("azimuth_deg", vertical, *values)
+    if missing := [name for name in needed if name not in names]:
+        raise UserError(
+            f"{path} has no column {', '.join(missing)}; its first line must name azimuth_deg, zenith_deg and gain_dbi, or "
+            f"{', '.join(COMPONENTS)} instead of the gain"
+        )
+    optional = ("phase_deg",) if "phase_deg" in names and "gain_dbi" in names else ()
+    columns = [names.index(name) for name in (*needed, *optional)]
+    table = []
+    for row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        try:
+            table.append([float(row[column]) for column in columns])
+        except (ValueError, IndexError):
+            raise UserError(f"line {rows.line_num} of {path} lacks a number; fill {', '.join(needed)}") from None
+        if len(table) > MOST_ROWS:
+            raise UserError(f"{path} has more than {MOST_ROWS:,} directions; give a coarser grid")
+    found = np.array(table, np.float64).reshape(-1, len(columns))
+    zenith = found[:, 1] if vertical == "zenith_deg" else 90 - found[:, 1]
+    if "gain_dbi" in names:
+        _check_decibels(path, found[:, 2])
+        amplitude: Inexact[np.ndarray, " n"] = 10 ** (found[:, 2] / 20)
+        if optional:
+            amplitude = amplitude * np.exp(1j * np.radians(found[:, 3]))
+        return _antenna(path, on_grid(path, zenith, found[:, 0], amplitude), None)
+    fields = found[:, [2, 4]] + 1j * found[:, [3, 5]]
+    theta, phi = (on_grid(path, zenith, found[:, 0], fields[:, i]) for i in range(2))
+    return _antenna(path, theta, phi)
+
+
+def _read_archive(path: Path) -> Antenna:
+    arrays = read_arrays(path, "an antenna pattern", "export it again", ("e_theta", "e_phi", "zenith", "azimuth"))
+    if missing := [name for name in ("e_theta", "e_phi", "zenith", "azimuth") if name not in arrays]:
+        raise UserError(f"{path} has no array {', '.join(missing)}; it needs e_theta, e_phi, zenith and azimuth (radians)")
+    angles = [np.degrees(np.asarray(arrays[name], np.float64).reshape(-1)) for name in ("zenith", "azimuth")]
+    shape = tuple(map(len, angles))
+    zenith, azimuth = (angle.reshape(-1) for angle in np.meshgrid(*angles, indexing="ij"))
+    fields = []
+    for name in ("e_theta", "e_phi"):
+        if arrays[name].shape != shape or arrays[name].dtype.kind not in "fc":
+            raise UserError(f"{name} of {path} has shape {arrays[name].shape}; give numbers of shape {shape}, like the angles")
+        fields.append(on_grid(path, zenith, azimuth, np.asarray(arrays[name], np.complex128).reshape(-1)))
+    return _antenna(path, *fields)
+
+
+def _read_msi(path: Path) -> Antenna:
+    lines = [line.split() for line in read_text(path).splitlines()]
+    head = {words[0].upper(): words[1:] for words in lines if words and re.match("[A-Za-z]", words[0])}
+    try:
+        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else DIPOLE_DBI)
+        horizontal, vertical = (_cut(lines, name) for name in ("HORIZONTAL", "VERTICAL"))
+    except (KeyError, IndexError, ValueError):
+        raise UserError(
+            f"{path} is not an MSI Planet file; it needs GAIN, and below HORIZONTAL 360 and VERTICAL 360 360 lines each of "
+            "an angle and an attenuation"
+        ) from None
+    _check_decibels(path, np.concatenate([gain - horizontal, gain - vertical]))
+    zenith, azimuth = np.arange(181), np.arange(CUT)
+    attenuation = vertical[(zenith[:, None] - 90) % CUT] + horizontal[-azimuth % CUT]
+    return tabulated(10 ** ((gain - attenuation) / 20), None)
+
+
+def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
+    """Returns the attenuations (dB) of a cut, by degree; raises a `ValueError` unless there is one for every degree."""
+    start = next(i for i, words in enumerate([*lines, [name, ""]]) if words and words[0].upper() == name) + 1
+    found = np.full(CUT, np.nan)
+    for angle, value, *_ in lines[start : start + CUT]:
+        if float(angle) % 1:
+            raise ValueError("an angle between two degrees")
+        found[int(float(angle)) % CUT] = float(value)
+    if not np.isfinite(found).all():
+        raise ValueError("an angle without a value")
+    return found
+
+
+def _check_decibels(path: Path, values: Float[np.ndarray, " n"]) -> None:
+    if not (values < LARGEST_DBI).all():
+        raise UserError(f"{path} has gains beyond {LARGEST_DBI:g} dBi; give decibels relative to an isotropic antenna")
+
+
+def on_grid(
+    path: Path, zenith_deg: Float[np.ndarray, " n"], azimuth_deg: Float[np.ndarray, " n"], values: Inexact[np.ndarray, " n"]
+) -> Inexact[np.ndarray, "zenith azimuth"]:
+    """Returns values of directions in any order on their regular grid: zenith angles 0..180 degrees, azimuths from 0 without
+    360.
+
+    Raises:
+        UserError: the directions are not such a grid, or values are not finite.
+    """
+    azimuth_deg = np.round(azimuth_deg, 6) % 360
+    zeniths, azimuths = np.unique(np.round(zenith_deg, 6)), np.unique(azimuth_deg)
+    regular = len(zeniths) > 1 and len(azimuths) > 1
+    for angles, last in ((zeniths, 180), (azimuths, 360 - 360 / max(len(azimuths), 1))):
+        regular = regular and bool(np.abs(angles - np.linspace(0, last, len(angles))).max() < REGULAR)
+    if not regular:
+        raise UserError(
+            f"{path} has no regular grid over the whole sphere; give zenith angles from 0 to 180 and azimuths from 0 to 360 "
+            "degrees, at equal distances"
+        )
+    row, column = np.searchsorted(zeniths, np.round(zenith_deg, 6)), np.searchsorted(azimuths, azimuth_deg)
+    table = np.full((len(zeniths), len(azimuths)), np.nan, values.dtype)
+    table[row, column] = values
+    if not np.isfinite(table).all():
+        raise UserError(f"{path} lacks a finite value in some directions of its grid; give one for every direction")
+    return table
+
+
+def _antenna(
+    path: Path, theta: Inexact[np.ndarray, "zenith azimuth"], phi: Inexact[np.ndarray, "zenith azimuth"] | None
+) -> Antenna:
+    """Returns the antenna of amplitude gains (without `phi`), or of fields in any unit, which are scaled."""
+    if phi is not None:
+        power = np.abs(theta) ** 2 + np.abs(phi) ** 2
+        mean = float(np.sum(power.mean(1) * zenith_weights(len(power))))
+        if not mean > 0:
+            raise UserError(f"{path} has no field in any direction; export it again")
+        theta, phi = theta / np.sqrt(mean), phi / np.sqrt(mean)
+    try:
+        return tabulated(theta, phi if phi is not None and np.any(phi) else None)
+    except ValueError as error:
+        raise UserError(f"{path} has {error}") from error
