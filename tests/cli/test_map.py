@@ -3,6 +3,7 @@
 import json
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call
@@ -13,6 +14,7 @@ from PIL import Image
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.inference.evaluate_quantities import domain_of
+from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.radio_map import BEST_BEAM, cut_at, pieces, plane_over
 from wbgs_jax.radio.array import codebook
@@ -88,6 +90,28 @@ def test_a_map_marks_places_without_confidence(runs, tmp_path):
         within = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
         assert found["no_confidence"].dtype == bool and found["no_confidence"].shape == found["power_db"].shape[1:]
         np.testing.assert_array_equal(found["no_confidence"][~within], True)
+
+
+def test_a_map_holds_intervals_only_within_the_room_and_the_band(runs, tmp_path):
+    out = tmp_path / "wide.npz"
+    arrays = (np.ones((1, 3)), np.zeros(4), np.ones(4), np.zeros(5), 0.5, 1.0, 0.9)
+    write_confidence(runs["wave"], None, PowerConfidence(*(jnp.asarray(a, jnp.float32) for a in arrays)))
+    low, high = domain_of(load_trained(runs["wave"]).dataset()).box[:, :2]
+    area = f"{low[0] - 1},{low[1]}:{high[0]},{high[1]}"
+    result = ask(runs, "wave", "--ghz", 0.5, 28, "--area", area, "--step", 0.5, "--out", out)
+    write_confidence(runs["wave"], None)
+    (line,) = (line for line in result.err.splitlines() if "prediction interval" in line)
+    with np.load(out) as found:
+        missing, marked = np.isnan(found["within_db"]), found["no_confidence"]
+        assert np.isfinite(found["power_db"]).all()
+        np.testing.assert_array_equal(missing, np.isnan(found["expected_error_db"]))
+    assert missing[0].all() and not missing[1].all()  # no data below 1 GHz
+    np.testing.assert_array_equal(missing[1], marked)
+    assert marked[:, 0].all()
+    assert (
+        line
+        == f"warning: {missing.sum()} of {missing.size} predictions have no prediction interval; the interval is NaN in files"
+    )
 
 
 def test_another_receiver_has_another_map(runs, tmp_path):

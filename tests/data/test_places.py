@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -97,8 +99,28 @@ def test_no_place_is_none(n):
 def test_arrays_of_an_answer_lose_their_confidence_there_alone():
     domain = Domain("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11))
     answer = {"pas": np.ones((2, 90, 360), np.float32), "expected": np.full((2, 3), 0.9, np.float32)}
-    found = domain.without_intervals(answer, np.array([[1.0, 1, 1], [500, 0, 1]]))
+    found = domain.without_intervals(answer, np.array([[1.0, 1, 1], [500, 0, 1]]), np.full(2, 2e9))
     np.testing.assert_array_equal(found["pas"], answer["pas"])
     np.testing.assert_array_equal(found["expected"], np.array([[0.9] * 3, [np.nan] * 3], np.float32))
     assert found["expected"].dtype == np.float32
-    assert domain.without_intervals({"pas": answer["pas"]}, np.zeros((2, 3))).keys() == {"pas"}
+    assert domain.without_intervals({"pas": answer["pas"]}, np.zeros((2, 3)), np.ones(2)).keys() == {"pas"}
+
+
+def test_frequencies_beyond_the_trained_band_have_no_interval():
+    domain = Domain("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11))
+    hertz = np.array([0.9e9, 1e9, 1e9 * (1 - 1e-9), 1e11, 1.01e11])
+    np.testing.assert_array_equal(domain.out_of_band(hertz), [True, False, False, False, True])
+    places = np.array([[1.0, 1, 1], [500, 0, 1]])
+    found = domain.without_intervals({"within_db": np.ones((2, 5))}, places, hertz, paired=False)["within_db"]
+    np.testing.assert_array_equal(np.isnan(found), [domain.out_of_band(hertz), [True] * 5])
+
+
+def test_compiled_code_finds_the_same_places(rng):
+    centre = np.array([1.0, 1, 1])
+    ball = ClosedBody("ball", at(trimesh.creation.icosphere(2, 0.5), *centre).triangles)
+    domain = Domain("room", np.array([[0.0, 0, 0], [4, 3, 2]]), (1e9, 1e11), 0.0, (ball,))
+    places = rng.uniform(-0.5, 2.5, (400, 3)).astype(np.float32)
+    clear = np.abs(np.linalg.norm(places - centre, axis=1) - 0.5) > 0.03
+    found = jax.jit(lambda points: domain.outside(points, jnp))(places)
+    np.testing.assert_array_equal(found[clear], domain.outside(places)[clear])
+    assert 0.1 < found.mean() < 0.9

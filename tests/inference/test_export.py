@@ -104,9 +104,15 @@ def test_all_outputs_and_their_intervals(tmp_path):
         for name, values in expected.items():
             known = np.isfinite(values)
             assert known.any() and found[name].shape == values.shape
+            np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(values), err_msg=name)
             np.testing.assert_allclose(np.asarray(found[name])[known], values[known], rtol=1e-3, atol=2e-4, err_msg=name)
             compared.add(name)
     assert compared == {"pas", "expected", "power_db", "expected_error_db", "within_db", "snapshots"} == set(found)
+    away = load_exported(tmp_path / "field.zip").observe(TX + 99, HZ)
+    beyond = load_exported(tmp_path / "field.zip").observe(TX, 2 * HZ.max())
+    for name in ("expected", "expected_error_db", "within_db"):
+        assert np.isnan(away[name]).all() and np.isnan(beyond[name]).all()
+    assert np.isfinite(away["pas"]).all() and np.isfinite(beyond["power_db"]).all()
 
 
 def test_files_of_the_first_format_are_read(tmp_path):

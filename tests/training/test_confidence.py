@@ -15,7 +15,6 @@ from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.score import calibrate_power, calibration, expectations
 from wbgs_jax.inference.intervals import (
     FILE,
-    MARGIN,
     POWER_MARGIN_DB,
     Confidence,
     Expected,
@@ -236,9 +235,21 @@ def test_blocks_say_what_single_answers_do(rng):
     for a, b in zip(expect_many(confidence(), pas, tx, f), expected_ssim(confidence(), jnp.asarray(pas), query), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4)
     found = expected_ssim(confidence(), jnp.asarray(pas), query)
-    assert (found.low < found.high).all() and (found.high <= 1 + MARGIN).all()
+    assert (found.low < found.high).all() and (found.high <= 1).all()
     distance = features(jnp.asarray(pas), query, jnp.zeros(3), jnp.asarray(tx, jnp.float32))[:, 0]
     assert (distance < np.log(0.02)).all()  # at known transmitters
+
+
+def test_expected_scores_lie_between_nothing_and_everything(rng):
+    """A transmitter at the receiver or far away has features that no validation transmitter had."""
+    pas, f = jnp.asarray(rng.uniform(0, 1, (3, 90, 360)), jnp.float32), jnp.full(3, 1e10)
+    query = Query(jnp.asarray([[0.0, 0, 0], [1e-3, 0, 0], [90.0, 0, 0]]), f)
+    for weight in (-3.0, 3.0):
+        steep = dataclasses.replace(confidence(), weights=confidence().weights.at[0].set(weight))
+        found = expected_ssim(steep, pas, query, jnp.asarray([40.0, 0, -300]))
+        for values in found:
+            assert ((values >= 0) & (values <= 1)).all()
+        assert (found.ssim == 0).any() or (found.ssim > 0.9).any()
 
 
 def test_power_counts_beyond_that_of_free_space(rng):

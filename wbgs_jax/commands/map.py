@@ -20,7 +20,7 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn, warn_of_intervals
 from wbgs_jax.inference.quantities import INTERVALS, names_for
 
 # Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
@@ -103,9 +103,9 @@ def make_maps(command: Command) -> None:
     with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
         answer = evaluate_plane(command.what, field, plane, frequencies_hz, progress.advance)
     outside = field.domain.outside(plane.positions()).reshape(len(plane.ys), len(plane.xs))
-    for name in answer.keys() & set(INTERVALS):
-        answer[name] = np.where(outside, np.nan, answer[name])
-    answer["no_confidence"] = outside
+    answer["no_confidence"] = outside | field.domain.out_of_band(frequencies_hz).all()
+    if answer.keys() & set(INTERVALS):
+        warn_of_intervals(outside | field.domain.out_of_band(frequencies_hz)[:, None, None])
     size = f"{len(plane.xs)} x {len(plane.ys)} positions at {len(frequencies_hz)} frequencies"
     if command.out:
         write_arrays(command.out, answer, field.source | {"what": command.what})

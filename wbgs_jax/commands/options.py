@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from wbgs_jax._util.cli import say
 from wbgs_jax._util.errors import UserError
@@ -123,3 +123,10 @@ def warn(
         say(f"warning: {line}")
     if len(lines) > most:
         say(f"warning: and {len(lines) - most} more of this kind")
+
+
+def warn_of_intervals(missing: Bool[np.ndarray, "*n"]) -> None:
+    """Prints one warning if some predictions have no valid prediction interval."""
+    if missing.any():
+        few = f"{missing.sum()} of {missing.size} predictions have" if missing.size > 1 else "the prediction has"
+        say(f"warning: {few} no prediction interval; the interval is NaN in files")

@@ -24,10 +24,10 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn, warn_of_intervals
 from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference import results_file
-from wbgs_jax.inference.quantities import COMPILED, QUANTITIES, Options, names_for
+from wbgs_jax.inference.quantities import COMPILED, INTERVALS, QUANTITIES, Options, names_for
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.inference.results_file import Answers, open_parts
 
@@ -222,6 +222,9 @@ def answer(command: Command, queries: Queries) -> None:
         positions, frequencies = np.unique(positions, axis=0), np.unique(frequencies)
     warn(field.domain, field.source["receiver"]["position"], positions, frequencies)
     answers = answer_blocks(command, queries, field)
+    if found := set(answers.names()) & set(INTERVALS):
+        values = answers.whole(min(found))
+        warn_of_intervals(np.isnan(values.reshape(len(values), -1)[:, 0]))
     for line in results_file.lines(command.what, answers, queries, field.source):
         say(line)
     count = f"{len(queries)} queries"

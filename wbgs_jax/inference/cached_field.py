@@ -66,7 +66,7 @@ class CachedField:
 
         query = np.asarray(positions, np.float32), np.asarray(frequencies, np.float32)
         answers = map_blocks(wanted, query, size_for(len(positions)), full=True)
-        return self.domain.without_intervals(answers, positions)
+        return self.domain.without_intervals(answers, positions, frequencies)
 
 
 def size_for(count: int) -> int:

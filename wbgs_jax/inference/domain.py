@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from wbgs_jax._util.cli import point_words
 from wbgs_jax.inference.quantities import INTERVALS
+from wbgs_jax.mesh.facets import AnyArray
 from wbgs_jax.mesh.solids import ClosedBody, inside
 from wbgs_jax.types import MIN_FREQUENCY_HZ
 
@@ -42,22 +43,44 @@ class Domain(NamedTuple):
         solids = tuple(ClosedBody(own, np.array(triangles)) for own, triangles in bodies)
         return cls(name, np.array(box), (low, high), beyond, solids)
 
-    def outside(self, positions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Returns which positions (metres) have no valid prediction interval: inside a body, or outside the training domain."""
+    def outside(self, positions: Float[AnyArray, "n 3"], xp: Any = np) -> Bool[AnyArray, " n"]:
+        """Returns which positions (metres) have no valid prediction interval: inside a body, or outside the training domain.
+        `xp` is the module of the arrays: NumPy, or `jax.numpy` in compiled code."""
         low, high = self.box
-        away = np.linalg.norm(np.maximum(np.maximum(low - positions, positions - high), 0), axis=-1)
+        away = xp.linalg.norm(xp.maximum(xp.maximum(low - positions, positions - high), 0), axis=-1)
         result = away > self.beyond + NEAR
         for body in self.bodies:
-            result |= inside(body, np.asarray(positions, np.float64))
+            result = result | inside(body, positions, xp)
         return result
 
-    def without_intervals(self, answer: dict[str, np.ndarray], positions: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-        """Returns the predictions for n queries, with NaN in place of invalid intervals."""
+    def out_of_band(self, frequencies_hz: Float[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
+        """Returns which frequencies (hertz) have no valid prediction interval: below or above all training frequencies."""
+        low, high = self.band
+        return (frequencies_hz < low * (1 - ROUNDED)) | (frequencies_hz > high * (1 + ROUNDED))
+
+    def without_intervals(
+        self,
+        answer: dict[str, np.ndarray],
+        positions: Float[np.ndarray, "tx 3"],
+        frequencies_hz: Float[np.ndarray, " tx_or_freq"],
+        paired: bool = True,
+    ) -> dict[str, np.ndarray]:
+        """Returns predictions with NaN in place of invalid intervals.
+
+        Args:
+            answer: arrays by name, with the leading axis (tx,), or (tx, freq) if not paired.
+            positions: of the transmitters, metres.
+            frequencies_hz: one for each transmitter, or those at which each is queried if not paired.
+            paired: whether the i-th transmitter is queried at the i-th frequency only.
+        """
         if not set(INTERVALS) & set(answer):
             return answer
-        nowhere = self.outside(positions)
+        outside, beyond = self.outside(positions), self.out_of_band(frequencies_hz)
+        nowhere = outside | beyond if paired else outside[:, None] | beyond
         return {
-            name: np.where(nowhere.reshape(-1, *[1] * (values.ndim - 1)), np.nan, values).astype(values.dtype)
+            name: np.where(nowhere.reshape(*nowhere.shape, *[1] * (values.ndim - nowhere.ndim)), np.nan, values).astype(
+                values.dtype
+            )
             if name in INTERVALS
             else values
             for name, values in answer.items()
@@ -83,9 +106,7 @@ class Domain(NamedTuple):
             for body, there in zip(self.bodies, within, strict=True)
             if there[number]
         ]
-        for f in frequencies_hz:
-            if band[0] * (1 - ROUNDED) <= f <= band[1] * (1 + ROUNDED):
-                continue
+        for f in frequencies_hz[self.out_of_band(frequencies_hz)]:
             if f < MIN_FREQUENCY_HZ:
                 lines.append(
                     f"{f / 1e9:g} GHz lies below {MIN_FREQUENCY_HZ / 1e9:g} GHz: ray methods assume short waves and are "

@@ -78,8 +78,8 @@ class LoadedField:
     def evaluate(
         self, what: str, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
     ) -> Answer:
-        """Returns a quantity for every transmitter at every frequency: {name with unit: values (tx, freq, ...)} and the
-        arrays of `results_file.SHARED`; for paths, the columns of a table.
+        """Returns a quantity for every transmitter at every frequency: {name with unit: values (tx, freq, ...)}, with NaN for
+        invalid intervals, and the arrays of `results_file.SHARED`; for paths, the columns of a table.
 
         Args:
             what: a name of `QUANTITIES`.
@@ -90,25 +90,25 @@ class LoadedField:
             UserError: the field does not provide this quantity.
         """
         check_quantity(what, self.trained.field, self.dataset)
-        return EVALUATE[what](self, np.asarray(tx_positions), np.asarray(frequencies_hz))
+        queries = np.asarray(tx_positions), np.asarray(frequencies_hz)
+        return self.domain.without_intervals(EVALUATE[what](self, *queries), *queries, paired=False)
 
     def answer(self, what: str, block: list[Product]) -> Answer:
-        """Returns the predictions for a block of queries: arrays whose leading axis is the queries in order, with NaN for
-        invalid intervals; or a table in the order of the queries, whose column `tx` is the index of the transmitter."""
+        """Returns the predictions (`evaluate`) for a block of queries: arrays whose leading axis is the queries in order, or a
+        table in the order of the queries, whose column `tx` is the index of the transmitter."""
         found = [self.evaluate(what, product.tx_positions, product.frequencies_hz) for product in block]
         if QUANTITIES[what].form == "table":
             for product, table in zip(block, found, strict=True):
                 table["tx"] = product.tx_numbers[table["tx"]]
             order = np.argsort(np.concatenate([table["tx"] for table in found]), kind="stable")
             return {name: np.concatenate([table[name] for table in found])[order] for name in found[0]}
-        order, positions, _ = flatten(block)
-        answers = {
+        order, _, _ = flatten(block)
+        return {
             name: values
             if name in SHARED
             else np.concatenate([own[name].reshape(-1, *own[name].shape[2:]) for own in found])[order]
             for name, values in found[0].items()
         }
-        return self.domain.without_intervals(answers, positions)
 
 
 def domain_of(dataset: Dataset) -> Domain:

@@ -34,11 +34,11 @@ from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import portable
-from wbgs_jax.inference.evaluate_quantities import known_quantities
+from wbgs_jax.inference.evaluate_quantities import domain_of, known_quantities
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
-from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
+from wbgs_jax.inference.quantities import COMPILED, INTERVALS, QUANTITIES
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.types import Query, Receiver, Transmitter
 
@@ -150,10 +150,15 @@ def _metadata(trained: TrainedField, dataset: Dataset, platforms: Sequence[str])
 def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]) -> tuple[list[str], bytes]:
     """Returns the names of the outputs, and the field with constant parameters and plan, for any number of queries."""
     frozen, names = freeze(trained, dataset.receiver()), frozen_outputs(trained, dataset)
-    frozen = frozen._replace(plan=portable(frozen.plan))
+    frozen, domain = frozen._replace(plan=portable(frozen.plan)), domain_of(dataset)
 
     def answer(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> dict[str, Array]:
-        return answer_all(frozen, Query(Transmitter(tx_position), frequency_hz), names)
+        nowhere = domain.outside(tx_position, jnp) | domain.out_of_band(frequency_hz)
+        answers = answer_all(frozen, Query(Transmitter(tx_position), frequency_hz), names)
+        return {
+            name: jnp.where(nowhere.reshape(-1, *[1] * (values.ndim - 1)), jnp.nan, values) if name in INTERVALS else values
+            for name, values in answers.items()
+        }
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)

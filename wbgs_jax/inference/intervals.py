@@ -6,7 +6,8 @@ expected absolute error and a 90 % bound on it, both in decibels.
 
 The features are selected on the validation part, and the ends of the interval are quantiles of the residuals there (split
 conformal prediction, Lei et al. 2018). The coverage is therefore valid for transmitters drawn from the same distribution as
-those of the validation part, not for others. The few mixture weights of a hybrid field were learned on the same transmitters,
+those of the validation part, not for others (`domain.Domain` excludes queries outside of the scene and of the band). An SSIM
+below 0 counts as 0, so that all expected scores and ends of intervals lie between 0 and 1. The few mixture weights of a hybrid field were learned on the same transmitters,
 for which its predictions are slightly too good.
 """
 
@@ -95,7 +96,7 @@ class ExpectedPower(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Expected SSIM of B predicted spectra."""
+    """Expected SSIM of B predicted spectra, from 0 to 1."""
 
     ssim: Float[Array, " b"]
     low: Float[Array, " b"]
@@ -160,7 +161,8 @@ def expected_ssim(
         known = known.at[:, -1].set(confidence.mean[-1])
     error = _log_error(confidence, known)
     low, high = confidence.quantiles
-    return Expected(*(1 + MARGIN - jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(high), jnp.exp(low))))
+    factors = confidence.surplus, jnp.exp(high), jnp.exp(low)
+    return Expected(*(jnp.clip(1 + MARGIN - jnp.exp(error) * factor, 0, 1) for factor in factors))
 
 
 def expected_power(

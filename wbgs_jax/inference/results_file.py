@@ -232,7 +232,7 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
                 yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
 
 
-NO_CONFIDENCE = "no prediction interval (outside the training domain, or where no antenna can be placed)"
+NO_CONFIDENCE = "no prediction interval (outside of the scene or of the trained band, or where no antenna can be placed)"
 
 
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
@@ -249,7 +249,7 @@ def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any])
         return [
             f"{link}: {NO_CONFIDENCE}"
             if np.isnan(ssim)
-            else f"{link}: expected SSIM {ssim:.2f}, {level} between {low:.2f} and {min(high, 1):.2f}"
+            else f"{link}: expected SSIM {ssim:.2f}, {level} between {low:.2f} and {high:.2f}"
             for link, (ssim, low, high) in expected
         ]
     columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))

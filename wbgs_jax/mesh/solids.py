@@ -1,9 +1,11 @@
-"""Tests which points lie inside closed bodies (NumPy)."""
+"""Tests which points lie inside closed bodies."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from wbgs_jax.mesh.facets import AnyArray
 
 CHUNK = 1_000_000
 """Maximum number of pairs of a point and a triangle whose solid angles are computed together; limits memory to about 100 MB."""
@@ -17,8 +19,11 @@ class ClosedBody(NamedTuple):
     """Corners of the triangles, metres."""
 
 
-def inside(body: ClosedBody, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Returns which points (metres) lie inside a body."""
+def inside(body: ClosedBody, points: Float[AnyArray, "n 3"], xp: Any = np) -> Bool[AnyArray, " n"]:
+    """Returns which points (metres) lie inside a body. `xp` is the module of the arrays, NumPy or `jax.numpy`."""
+    if xp is not np:
+        return xp.abs(_solid_angles(body.triangles, points, xp).sum(1)) > 2 * np.pi
+    points = np.asarray(points, np.float64)
     low, high = body.triangles.min((0, 1)), body.triangles.max((0, 1))
     result = ((points > low) & (points < high)).all(1)
     result[result] = np.abs(winding_number(body.triangles, points[result])) > 0.5
@@ -33,9 +38,11 @@ def winding_number(triangles: Float[np.ndarray, "t 3 3"], points: Float[np.ndarr
     return np.concatenate([np.zeros(0), *each]) / (4 * np.pi)
 
 
-def _solid_angles(triangles: Float[np.ndarray, "t 3 3"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n t"]:
+def _solid_angles(
+    triangles: Float[np.ndarray, "t 3 3"], points: Float[AnyArray, "n 3"], xp: Any = np
+) -> Float[AnyArray, "n t"]:
     a, b, c = (triangles[None, :, corner] - points[:, None] for corner in range(3))
-    la, lb, lc = (np.linalg.norm(one, axis=-1) for one in (a, b, c))
-    triple = np.einsum("nti,nti->nt", a, np.cross(b, c))
+    la, lb, lc = (xp.linalg.norm(one, axis=-1) for one in (a, b, c))
+    triple = xp.einsum("nti,nti->nt", a, xp.cross(b, c))
     below = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
-    return 2 * np.arctan2(triple, below)
+    return 2 * xp.arctan2(triple, below)
