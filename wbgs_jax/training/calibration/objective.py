@@ -64,6 +64,8 @@ def make_scores(
         compared: the compared quantity.
     """
 
+    by = _comparable(compared, data)
+
     @functools.cache
     def block(start: int) -> tuple[PreparedPaths, Batch]:
         """Returns the data of the block of spectra from `start` on; the last block is padded by repeating the last spectrum."""
@@ -78,7 +80,7 @@ def make_scores(
         own = tuple(np.ndim(column[0]) < 2 or any(leaf is not column[0] for leaf in column) for column in columns)
         leaves = tuple(_rows(column) if of_candidate else column[0] for of_candidate, column in zip(own, columns, strict=True))
         some = np.int32(len(candidates))
-        found = [_score(field, structure, own, leaves, some, *block(start), compared) for start in range(0, count, AT_ONCE)]
+        found = [_score(field, structure, own, leaves, some, *block(start), by) for start in range(0, count, AT_ONCE)]
         return np.concatenate([np.asarray(part) for part in found], 1)[: len(candidates), :count]
 
     return score
@@ -106,6 +108,14 @@ class Told:
     def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
         """Returns the transmitters of the first `count` spectra."""
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
+
+
+def _comparable(compared: Compared, data: TrainingData) -> Compared:
+    """Returns what is compared instead if data do not contain it, so that equal comparisons share a program."""
+    elements = 0 if data.snapshots is None else data.snapshots.shape[-1]
+    if elements == 1 or not data.has_spectra:  # the snapshot of a single element contains its power only
+        return "powers"
+    return compared if elements or compared == "powers" else "spectra"
 
 
 def _rows(column: Sequence[Array]) -> Float[np.ndarray, "..."]:
@@ -149,13 +159,11 @@ def _score(
 
     def compare(batch: Batch, params: WaveParams) -> Float[Array, ""]:
         seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
-        several = batch.snapshots if elements > 1 else None  # the snapshot of a single element contains its power only
-        if several is not None and compared == "snapshots" and seen.snapshots is not None:
-            return log_decorrelation(seen.snapshots, several)[0]
-        if several is not None and compared == "covariances" and seen.covariance is not None:
-            return surprise(seen.covariance, several)[0]
-        if batch.pas is None or compared == "powers" or elements == 1:
+        if compared == "snapshots" and batch.snapshots is not None and seen.snapshots is not None:
+            return log_decorrelation(seen.snapshots, batch.snapshots)[0]
+        if compared == "covariances" and batch.snapshots is not None and seen.covariance is not None:
+            return surprise(seen.covariance, batch.snapshots)[0]
+        if batch.pas is None or compared == "powers":
             received = batch.received_db
             assert received is not None and seen.power_db is not None, "data without powers are compared by spectra"
             unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])
