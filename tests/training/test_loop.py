@@ -4,8 +4,10 @@ import concurrent.futures
 import dataclasses
 import shutil
 import signal
+from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset, tiny_settings
@@ -20,7 +22,9 @@ from wbgs_jax.fields.wideband import WidebandField
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.training import checkpoint
 from wbgs_jax.training.batches import check_data
+from wbgs_jax.training.hooks import Edit, Hook
 from wbgs_jax.training.loop import Interrupted, Run, train
+from wbgs_jax.training.step import init_state
 from wbgs_jax.training.step import run_epoch as epoch_programs
 
 STEPS = 8
@@ -209,7 +213,7 @@ def test_the_next_size_is_compiled_before_it_is_needed(dataset, tmp_path, monkey
     monkeypatch.setattr(Run, "_run_epoch", run_epoch)
     before = run.capacity
     run.epoch()
-    run.precompilation.wait(next(iter(run.precompilation._threads)))
+    assert run.precompilation.wait(next(iter(run.precompilation._calls)))
     assert called == [(64, 0, before), (96, 2, before.scaled(1.5))] and run.precompilation.seconds > 0
     run.epoch()
     run.run_hooks()
@@ -218,6 +222,31 @@ def test_the_next_size_is_compiled_before_it_is_needed(dataset, tmp_path, monkey
     seconds = run.compile_seconds
     run.epoch()
     assert epoch_programs._cache_size() == compiled and run.compile_seconds == seconds
+
+
+@dataclass(frozen=True)
+class Calibration(Hook):
+    """A hook before the first step that changes no shape, and compiles a program for later."""
+
+    stream: int = 9
+
+    def due(self, step, steps):
+        return step == 0
+
+    def apply(self, field, params, statistics, context, step, rng):
+        context.ahead("later", lambda: jnp.zeros(3) + 1)
+        return Edit(params, (), None, {})
+
+
+def test_the_epoch_is_compiled_while_hooks_calibrate(dataset, tmp_path):
+    run = Run(dataset, *PLAIN, 0, tmp_path)
+    run.hooks = (Calibration(),)
+    run.state = init_state(run.state.params, run.optimizer, run.hooks)
+    assert run.run_hooks() and run.precompilation.wait("later")
+    assert run.precompilation.wait(run._program(run.state.params, run.capacity))
+    compiled = epoch_programs._cache_size()
+    assert run.epoch()["loss"] > 0
+    assert epoch_programs._cache_size() == compiled and run.compile_seconds == 0
 
 
 def test_a_device_that_goes_on_trains_what_one_does_that_waits(dataset, tmp_path, monkeypatch):

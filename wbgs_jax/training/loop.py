@@ -9,10 +9,10 @@ it is ready, the loop waits for it.
 """
 
 import dataclasses
-import threading
 import time
 import warnings
 from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -49,28 +49,24 @@ class Precompilation:
     """Programs that background threads compile, each once."""
 
     def __init__(self) -> None:
-        self._threads: dict[Hashable, threading.Thread] = {}
-        self._ready: set[Hashable] = set()
+        self._threads = ThreadPoolExecutor(2)
+        self._calls: dict[Hashable, Future[None]] = {}
         self.seconds = 0.0
         """Compilation time of the programs that are ready."""
 
     def begin(self, key: Hashable, call: Callable[[], object]) -> None:
         """Starts a call that compiles the programs with this key, unless it has been started before."""
-        if key not in self._threads:
-            self._threads[key] = threading.Thread(target=self._run, args=(key, call))  # no daemon: XLA must finish before exit
-            self._threads[key].start()
+        if key not in self._calls:
+            self._calls[key] = self._threads.submit(self._run, call)
 
     def wait(self, key: Hashable) -> bool:
-        """Waits for a running call, and returns whether its programs are ready."""
-        if key in self._threads:
-            self._threads[key].join()
-        return key in self._ready
+        """Waits for a call, and returns whether its programs are ready."""
+        return key in self._calls and self._calls[key].exception() is None
 
-    def _run(self, key: Hashable, call: Callable[[], object]) -> None:
+    def _run(self, call: Callable[[], object]) -> None:
         begin = time.perf_counter()
         call()
         self.seconds += time.perf_counter() - begin
-        self._ready.add(key)
 
 
 HOOKS: dict[str, Callable[[Any], Hook]] = {
@@ -246,22 +242,24 @@ class Run:
         return capacity, tuple(_shapes(params)), jax.tree.structure(self.field)
 
     def _compile_next(self) -> None:
-        """Starts compiling the epoch for the next size of the field if a change is near; only with one process and device."""
-        if self.devices.mesh is not None or jax.process_count() > 1:
-            return
+        """Starts compiling the epoch for the next size of the field if a change is near."""
         for hook in self.hooks:
             found = hook.next_size(self.state.params, self.step, self.settings.optim.steps)
-            if found is None:
-                continue
-            params, capacity, prepared = found[0], self._grown(found[1]), self.prepared
-            shapes = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
-            batches = np.zeros((self.settings.loop.epoch_steps, self.batch), np.int32)
+            if found is not None:
+                self._compile_ahead(found[0], self._grown(found[1]))
 
-            def call(shapes: Any = shapes, prepared: Any = prepared, capacity: Any = capacity, batches: Any = batches) -> None:
-                state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-                self._run_epoch(state, prepared, batches, len(batches), capacity, jnp.zeros((), bool))
+    def _compile_ahead(self, params: Any, capacity: Any) -> None:
+        """Starts compiling the epoch for parameters of these shapes; only with one process and device."""
+        if self.devices.mesh is not None or jax.process_count() > 1:
+            return
+        prepared, shapes = self.prepared, jax.eval_shape(lambda one: init_state(one, self.optimizer, self.hooks), params)
+        batches = np.zeros((self.settings.loop.epoch_steps, self.batch), np.int32)
 
-            self.precompilation.begin(self._program(params, capacity), call)
+        def call() -> None:
+            state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+            self._run_epoch(state, prepared, batches, len(batches), capacity, jnp.zeros((), bool))
+
+        self.precompilation.begin(self._program(params, capacity), call)
 
     def _grown(self, growth: float) -> Any:
         """Returns the capacity of the field after it has grown by a factor. It depends only on the capacity stored in
@@ -296,9 +294,12 @@ class Run:
         acted = False
         for number, hook in enumerate(self.hooks):
             if hook.due(self.step, self.settings.optim.steps):
+                if not self._known:  # most hooks that act before the first epoch change no shape that it depends on
+                    self._compile_ahead(self.state.params, self.capacity)
                 begin, step = time.perf_counter(), self.step
                 rng = np.random.default_rng([self.seed, hook.stream, step])
-                context = Context(self.data, self.prepared, self.dataset.train, say, self.validation_batches)
+                parts = self.data, self.prepared, self.dataset.train, say, self.validation_batches, self.precompilation.begin
+                context = Context(*parts)
                 edit = hook.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
                 check_alike(self.state, f"the parameters after {type(hook).__name__}")

@@ -2,7 +2,7 @@
 for calibration before training and selections after it. Lower scores are better."""
 
 import functools
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -21,9 +21,8 @@ from wbgs_jax.types import Batch, Links
 
 AT_ONCE = 8
 """Number of spectra that are scored together."""
-SIDE_BY_SIDE = 32, 6
-"""Numbers of candidates that are scored together. Compiling a program takes as long as scoring ten thousand candidates, so that
-only these two sizes are used."""
+MOST = 32
+"""Maximum number of candidates that one call of a program scores."""
 POWER_MARGIN_DB = 1.0
 """Error of received power that is added before the logarithm, so that accidental agreement has little effect."""
 RAREST = 1e-4
@@ -55,8 +54,7 @@ def make_scores(
     spectra: Int[Array, " n"],
     compared: Compared = "snapshots",
 ) -> Scores:
-    """Returns the function that scores candidates on spectra. Computations that depend only on leaves shared by all candidates
-    (identical array objects) are done once for all of them.
+    """Returns the function that scores candidates on spectra.
 
     Args:
         field: field.
@@ -66,6 +64,8 @@ def make_scores(
         compared: the compared quantity.
     """
 
+    by = _comparable(compared, data)
+
     @functools.cache
     def block(start: int) -> tuple[PreparedPaths, Batch]:
         """Returns the data of the block of spectra from `start` on; the last block is padded by repeating the last spectrum."""
@@ -73,18 +73,15 @@ def make_scores(
         return _looked_at(field, prepared, data, own)
 
     def score(candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
-        room = next((room for room in SIDE_BY_SIDE if room <= len(candidates)), SIDE_BY_SIDE[-1])
-        if len(candidates) > room:
-            return np.concatenate([score(candidates[:room], first), score(candidates[room:], first)])
+        if len(candidates) > MOST:
+            return np.concatenate([score(candidates[:MOST], first), score(candidates[MOST:], first)])
         structure, count = jax.tree.structure(candidates[0]), len(spectra[:first])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
-        differ = tuple(any(leaf is not column[0] for leaf in column) for column in columns)
-        differ = _as_compiled(differ, compared, candidates[0], field, block(0))
-        padded = [column + column[-1:] * (room - len(candidates)) for column in columns]
-        leaves = tuple(jnp.stack(column) if own else column[0] for own, column in zip(differ, padded, strict=True))
-        found = [_score(field, structure, differ, leaves, *block(start), compared) for start in range(0, count, AT_ONCE)]
-        together = np.concatenate([np.asarray(own) for own in found], 1)[: len(candidates), :count]
-        return together if any(differ) else np.repeat(together, len(candidates), 0)
+        own = tuple(np.ndim(column[0]) < 2 or any(leaf is not column[0] for leaf in column) for column in columns)
+        leaves = tuple(_rows(column) if of_candidate else column[0] for of_candidate, column in zip(own, columns, strict=True))
+        some = np.int32(len(candidates))
+        found = [_score(field, structure, own, leaves, some, *block(start), by) for start in range(0, count, AT_ONCE)]
+        return np.concatenate([np.asarray(part) for part in found], 1)[: len(candidates), :count]
 
     return score
 
@@ -113,18 +110,19 @@ class Told:
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
 
 
-_programs: dict[Hashable, list[tuple[bool, ...]]] = {}
-"""Masks of the leaves that differ between candidates, for all compiled programs, by everything else that programs depend on."""
+def _comparable(compared: Compared, data: TrainingData) -> Compared:
+    """Returns what is compared instead if data do not contain it, so that equal comparisons share a program."""
+    elements = 0 if data.snapshots is None else data.snapshots.shape[-1]
+    if elements == 1 or not data.has_spectra:  # the snapshot of a single element contains its power only
+        return "powers"
+    return compared if elements or compared == "powers" else "spectra"
 
 
-def _as_compiled(differ: tuple[bool, ...], compared: Compared, *trees: Any) -> tuple[bool, ...]:
-    """Returns the mask of leaves that are treated as different: those that differ, or a superset for which a program exists."""
-    shapes = ((jax.tree.structure(tree), *map(np.shape, jax.tree.leaves(tree))) for tree in trees)
-    known = _programs.setdefault((compared, *shapes), [])
-    wider = [one for one in known if all(own or not needed for own, needed in zip(one, differ, strict=True))]
-    if not wider:
-        known.append(differ)
-    return min(wider, key=sum, default=differ)
+def _rows(column: Sequence[Array]) -> Float[np.ndarray, "..."]:
+    """Returns a leaf of all candidates, padded with zeros to `MOST` rows."""
+    rows = np.zeros((MOST, *np.shape(column[0])), np.float32)
+    rows[: len(column)] = column[0] if all(leaf is column[0] for leaf in column) else [np.asarray(leaf) for leaf in column]
+    return rows
 
 
 @jax.jit
@@ -136,28 +134,36 @@ def _looked_at(
     return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
-@functools.partial(jax.jit, static_argnames=("structure", "differ", "compared"))
+@functools.partial(jax.jit, static_argnames=("structure", "own", "compared"))
 def _score(
     field: Calibratable,
     structure: jax.tree_util.PyTreeDef,
-    differ: tuple[bool, ...],
-    leaves: tuple[Array, ...],
+    own: tuple[bool, ...],
+    leaves: tuple[Any, ...],
+    count: Int[Any, ""],
     prepared: PreparedPaths,
     batches: Batch,
     compared: Compared,
-) -> Float[Array, "k m"]:
-    """Returns the scores of K candidates, whose different leaves have a leading axis; K is 1 if no leaf differs."""
+) -> Float[Array, "most m"]:
+    """Returns the scores of the first `count` candidates; the other rows are zero.
 
-    def compare(batch: Batch, leaves: tuple[Array, ...]) -> Float[Array, ""]:
-        params = jax.tree.unflatten(structure, leaves)
+    The program is the same whatever differs between candidates: compiling one takes as long as scoring ten thousand candidates,
+    and what candidates have in common is a small part of the work. On a CPU it scores one candidate after the other, which is
+    the smallest program; elsewhere it scores many side by side.
+
+    Args:
+        own: whether a leaf of the parameters has a row for each candidate; static.
+        leaves: leaves of the parameters.
+    """
+    side_by_side = 1 if jax.default_backend() == "cpu" else MOST
+
+    def compare(batch: Batch, params: WaveParams) -> Float[Array, ""]:
         seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        elements = 0 if batch.snapshots is None else batch.snapshots.shape[-1]
-        several = batch.snapshots if elements > 1 else None  # the snapshot of a single element contains its power only
-        if several is not None and compared == "snapshots" and seen.snapshots is not None:
-            return log_decorrelation(seen.snapshots, several)[0]
-        if several is not None and compared == "covariances" and seen.covariance is not None:
-            return surprise(seen.covariance, several)[0]
-        if batch.pas is None or compared == "powers" or elements == 1:
+        if compared == "snapshots" and batch.snapshots is not None and seen.snapshots is not None:
+            return log_decorrelation(seen.snapshots, batch.snapshots)[0]
+        if compared == "covariances" and batch.snapshots is not None and seen.covariance is not None:
+            return surprise(seen.covariance, batch.snapshots)[0]
+        if batch.pas is None or compared == "powers":
             received = batch.received_db
             assert received is not None and seen.power_db is not None, "data without powers are compared by spectra"
             unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])
@@ -165,13 +171,19 @@ def _score(
         unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(seen.pas - batch.pas)), ALIKE))
         return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
 
-    def one(batch: Batch) -> Float[Array, " k"]:
-        if not any(differ):
-            return compare(batch, leaves)[None]
-        axes = tuple(0 if own else None for own in differ)
-        return jax.vmap(lambda *leaves: compare(batch, leaves), axes)(*leaves)
+    def candidate(number: Int[Array, ""]) -> Float[Array, " m"]:
+        rows = (leaf[number] if of_candidate else leaf for leaf, of_candidate in zip(leaves, own, strict=True))
+        params = jax.tree.unflatten(structure, rows)
+        scores: Float[Array, " m"] = jax.vmap(lambda batch: compare(batch, params))(batches)
+        return scores
 
-    return jax.vmap(one)(batches).T
+    def some(block: Int[Array, ""], scores: Float[Array, "most m"]) -> Float[Array, "most m"]:
+        first = block * side_by_side
+        found = jax.vmap(candidate)(first + jnp.arange(side_by_side))
+        return jax.lax.dynamic_update_slice_in_dim(scores, found, first, 0)
+
+    leaves = tuple(map(jnp.asarray, leaves))
+    return jax.lax.fori_loop(0, -(-count // side_by_side), some, jnp.zeros((MOST, AT_ONCE), jnp.float32))
 
 
 def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:

@@ -7,6 +7,7 @@ Training starts from the result.
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +100,9 @@ class Search(Hook):
                 params, gain = search_gain(params, told.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
+        for compared in ("covariances", "spectra"):
+            few = told.scores(1, compared)
+            context.ahead(("scores", compared), functools.partial(few, [params]))
         if config.antenna_rounds:
             say("calibration: antennas")
             params, _ = self._antennas(params, told, report)
