@@ -82,7 +82,7 @@ def test_small_data_sets_get_fewer_steps():
         ("wrfgs", "field", {"fusion": 4}, "wrfgs.fusion"),
         ("wrfgs", "field", {"radiance_frequency": True}, "no frequency input"),
         ("wave", "field", {"max_facets": 10**6}, "wave.max-facets"),
-        ("wave", "search", {"spectra": 0}, "search.spectra"),
+        ("wave", "calibration", {"spectra": 0}, "calibration.spectra"),
         ("nerf2", "field", {"directions": 10**6}, "nerf2.directions"),
         ("nerf2", "field", {"point_octaves": -1}, "nerf2.point-octaves"),
     ],

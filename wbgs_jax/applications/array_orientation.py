@@ -22,7 +22,7 @@ from wbgs_jax.radio.array import squared_magnitude
 from wbgs_jax.radio.channel import Arrivals, decibels
 from wbgs_jax.types import Query, make_receiver
 
-Turned = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
+PowerByBoresight = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
 """Azimuth and elevation of the boresight (radians, world frame) -> power (dB) from every transmitter."""
 STEP = 0.3
 """Spacing of the directions that are tried first, radians."""
@@ -40,7 +40,7 @@ def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
     return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
 
 
-def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
+def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
     """Returns the waves that reach an isotropic element from n transmitters over all paths; its local frame is the world frame.
 
     Args:
@@ -61,14 +61,14 @@ def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters:
     return paths_of(field, params, plan, Query(places, jnp.full(len(places), frequency_hz, jnp.float32)))
 
 
-def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
+def power_when_rotated(arrived: Arrivals, pattern: str = "tr38901") -> PowerByBoresight:
     """Returns a function for the mean received power over all elements (dB) in terms of the boresight; differentiable.
 
     The powers of all paths are added, as in a mean over positions around the receiver: interference should not determine the
     orientation.
 
     Args:
-        arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`arrivals_anywhere`).
+        arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`predict_isotropic_paths`).
         pattern: of the elements: "tr38901", "dipole", "hw_dipole", or "iso", for which the orientation affects only the
             polarisation.
     """
@@ -85,8 +85,8 @@ def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
     return jax.vmap(one)
 
 
-def turn_array(
-    powers: Turned, aim: Callable[[Float[Array, "k tx"]], Float[Array, " k"]] = soft_minimum, starts: int = 4
+def rotate_array(
+    powers: PowerByBoresight, aim: Callable[[Float[Array, "k tx"]], Float[Array, " k"]] = soft_minimum, starts: int = 4
 ) -> Descended:
     """Returns the best boresights: `place` (starts, 2), azimuth and elevation in radians, the best one first, and `loss`, minus
     the objective (dB).
@@ -94,7 +94,7 @@ def turn_array(
     The best directions of a grid over the sphere that are not close together are refined by gradient steps.
 
     Args:
-        powers: of the transmitters by boresight, from `power_when_turned` or any similar function.
+        powers: of the transmitters by boresight, from `power_when_rotated` or any similar function.
         aim: objective to maximise, as in `place_antenna`.
         starts: number of starting directions of the gradient steps.
     """

@@ -45,7 +45,7 @@ def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, cou
     """Returns the beams to try for n transmitters, the most promising one first.
 
     Args:
-        predict: predicts a field's spectra, from `predictor`.
+        predict: predicts a field's spectra, from `make_predictor`.
         tx_positions: (n, 3), world frame, metres.
         frequencies_hz: (n,) or one, hertz.
         count: beams per transmitter.

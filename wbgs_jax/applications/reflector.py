@@ -36,7 +36,7 @@ NEAREST_M = 1e-3
 
 @dataclass(frozen=True)
 class Reflector:
-    """A flat rectangular metal plate between one transmitter and users. Create it with `reflector`.
+    """A flat rectangular metal plate between one transmitter and users. Create it with `make_reflector`.
 
     A pose is (5,): the plate's centre x, y, z (world frame, metres), and azimuth and elevation of its normal (radians). Two of
     its sides are horizontal.
@@ -117,7 +117,7 @@ class Reflector:
         return decibels(amplitude**2) + _friis(whole, self.frequencies_hz) + in_the_way
 
 
-def reflector(
+def make_reflector(
     transmitter: Any,
     users: Any,
     size: tuple[float, float],
@@ -196,7 +196,7 @@ def place_reflector(
     gradient steps in all five numbers, with the plate's edges smoothed less and less.
 
     Args:
-        plate: from `reflector`.
+        plate: from `make_reflector`.
         without_db: (users,), power of every user without the plate, dB (`power_at_users` at the transmitter); powers are added.
         box: (2, 3), lowest and highest corner of the possible centres, metres.
         aim: objective to maximise, as in `place_antenna`.

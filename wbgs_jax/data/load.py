@@ -82,7 +82,7 @@ def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"
     return np.concatenate([one.receiver_index + start for one, start in zip(datasets, receivers, strict=False)])
 
 
-SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
+SNAPSHOTS = "read it with its own library and hand the arrays to `wb.interchange.scene_of_snapshots` (docs/formats.md)"
 PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
 ROOM = "`wbgs-jax convert` makes a room of it for measured data, data_gen computes spectra for it (docs/own_scene.md)"
 MODELS = (".usd", ".usda", ".usdc", ".usdz", ".stl", ".dae", ".fbx", ".blend", ".3ds", ".off", ".3mf", ".abc", ".vtk", ".vtp")
@@ -92,7 +92,7 @@ KINDS = {
     ".parquet": ("a Parquet file", PATHS),
     ".mat": (
         "a MATLAB file",
-        "pass DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.scene_of_snapshots` (docs/formats.md)",
+        "pass DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.interchange.scene_of_snapshots` (docs/formats.md)",
     ),
     ".npy": (
         "a single NumPy array",

@@ -25,7 +25,7 @@ from wbgs_jax._util.pytree import from_leaves, replaced
 from wbgs_jax.config import PRESETS, Settings
 from wbgs_jax.fields.losses import LOSSES, image_loss
 from wbgs_jax.observation_kinds import only_kind
-from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
+from wbgs_jax.radio.channel import NO_PATH_DB, Arrivals
 from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene, check_query
 
 T = TypeVar("T")
@@ -456,7 +456,7 @@ def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
     received = batch.received_db
     if seen.power_db is None or received is None:
         return None
-    measured = received > NOT_HEARD_DB
+    measured = received > NO_PATH_DB
     error, count = jnp.sum(jnp.abs(seen.power_db - received) * measured), jnp.sum(measured)
     return over_all_links(error) / jnp.maximum(over_all_links(count), 1)
 

@@ -16,7 +16,7 @@ def predict_blocks(
     """Yields the spectra or powers (float32) of n queries in order, in blocks, so that the results need not fit in memory.
 
     Positions are (n, 3) in metres; frequencies are (n,) or a single one in hertz. All blocks are evaluated with the same shape,
-    so that one compilation suffices. A block has `block` queries per device; `predictor` divides it among the devices.
+    so that one compilation suffices. A block has `block` queries per device; `make_predictor` divides it among the devices.
     """
     positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))

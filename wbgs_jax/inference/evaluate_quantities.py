@@ -71,7 +71,7 @@ class LoadedField:
         """Provenance of the predictions: scene, field, step, version, receiver, and levels of the prediction intervals."""
         receiver = {name: np.asarray(getattr(self.receiver, name)).tolist() for name in ("position", "orientation")}
         origin = {name: value for name, value in self.trained.origin().items() if name in ("field", "step")}
-        learned = {"interval_level": self.trained.confidence, "power_interval_level": self.trained.power_confidence}
+        learned = {"interval_level": self.trained.intervals, "power_interval_level": self.trained.power_intervals}
         levels = {name: round(float(own.level), 4) for name, own in learned.items() if own is not None}
         return {"scene": self.dataset.name, "version": wbgs_jax.__version__, "receiver": receiver} | origin | levels
 
@@ -171,7 +171,7 @@ def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarr
     query = _queries(tx_positions, frequencies_hz)
     seen = observe_queries(at.trained, at.receiver, query)
     answer = {"pas": _shaped(seen.pas, tx_positions, frequencies_hz)}
-    confidence = for_receiver(at.trained.confidence, at.receiver)
+    confidence = for_receiver(at.trained.intervals, at.receiver)
     if confidence is not None:
         power = None if seen.power_db is None else np.asarray(seen.power_db)
         expected = expect_many(
@@ -188,7 +188,7 @@ def _snapshots(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.nda
 
 def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns received powers, dB relative to the transmitted power, and their prediction intervals if the run has them."""
-    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_confidence
+    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_intervals
     power = observe_queries(at.trained, at.receiver, query, "power_db")
     answer = {"power_db": power}
     if learned is not None:
@@ -310,7 +310,7 @@ EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
 """Functions of `quantities.QUANTITIES` by name: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> `Answer`."""
 
 
-def arrivals_of(
+def predict_paths(
     trained: TrainedField, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float
 ) -> Arrivals:
     """Returns the paths from transmitters at one frequency, as NumPy arrays with a leading axis of transmitters.

@@ -157,7 +157,7 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
             raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
 
 
-def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
+def from_paths(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
     """Returns the paths predicted by a field (`fields.base.paths_of`) from T transmitters at one frequency to a single element
     at the centre of the receiver's array.
 

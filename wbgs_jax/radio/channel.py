@@ -1,20 +1,25 @@
 """Channel quantities: received power, beamforming gain, K-factor, delay and angular spread, and correlation of snapshots.
 
-All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Arrivals` the amplitudes and
-geometry of all paths. Leading axes are batch axes.
+All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Arrivals` (`wbgs_jax.Paths`) the
+amplitudes and geometry of all paths. Leading axes are batch axes.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
 
 class Arrivals(NamedTuple):
-    """Amplitudes and geometry of K paths at a receiver."""
+    """Amplitudes and geometry of K paths at a receiver (`wbgs_jax.Paths`).
+
+    `cir`, `cfr` and `taps` are the impulse response, the frequency response and the taps of the channel from the transmitter to
+    an element at the array's centre, with the definitions of Sionna RT's `Paths` and for one instant.
+    """
 
     amplitude: Complex[Array, "*b k"]
     """Complex amplitude at the array's centre, including the carrier phase; 0 for padding."""
@@ -37,12 +42,96 @@ class Arrivals(NamedTuple):
     points: Float[Array, "*b k 5 3"] | None = None
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
 
+    def cir(self, normalize_delays: bool = True) -> tuple[Complex[Array, "*b k"], Float[Array, "*b k"]]:
+        """Returns the impulse response: sum over k of a_k delta(t - tau_k), in complex baseband around the carrier.
+
+        Args:
+            normalize_delays: whether the delays of every link are counted from its first path.
+
+        Returns:
+            Amplitudes a (*b, k), with the phase of the carrier at every path's full length, and 0 for padding; delays tau
+            (*b, k), seconds, and -1 for padding.
+        """
+        amplitude = jnp.asarray(self.amplitude)
+        valid, tau = amplitude != 0, jnp.asarray(self.length) / SPEED_OF_LIGHT
+        if normalize_delays:
+            first = jnp.min(jnp.where(valid, tau, jnp.inf), -1, keepdims=True)
+            tau = tau - jnp.where(jnp.isfinite(first), first, 0)
+        return amplitude, jnp.where(valid, tau, -1)
+
+    def cfr(
+        self, frequencies_hz: Float[Array, " f"], normalize_delays: bool = True, normalize: bool = False
+    ) -> Complex[Array, "*b f"]:
+        """Returns the frequency response in complex baseband: sum over k of a_k exp(-2 pi j f tau_k).
+
+        The amplitudes are those at the carrier: over a band in which materials change, query the field at every frequency.
+
+        Args:
+            frequencies_hz: relative to the carrier, such as those of OFDM subcarriers.
+            normalize_delays: whether the delays of every link are counted from its first path.
+            normalize: whether the mean of |H|^2 over the frequencies is 1 for every link (links without paths stay 0).
+
+        Returns:
+            H (*b, f), relative to the transmitted amplitude unless it is normalised.
+
+        Example:
+            >>> import jax.numpy as jnp, wbgs_jax as wb
+            >>> one = wb.Paths(jnp.array([1.0 + 0j, 0.5]), jnp.zeros((2, 3)), jnp.array([3.0, 3.0 + 299.792458]))
+            >>> [round(float(abs(h)), 3) for h in one.cfr(jnp.array([0.0, 0.5e6]))]  # one path is a microsecond later
+            [1.5, 0.5]
+        """
+        a, tau = self.cir(normalize_delays)
+        cycles = jnp.asarray(frequencies_hz, tau.dtype)[:, None] * tau[..., None, :]
+        response = jnp.sum(a[..., None, :] * jnp.exp(-2j * jnp.pi * (cycles - jnp.round(cycles))), -1)
+        return _with_energy(response, response.shape[-1]) if normalize else response
+
+    def taps(
+        self,
+        bandwidth_hz: float,
+        l_min: int = -6,
+        l_max: int | None = None,
+        normalize_delays: bool = True,
+        normalize: bool = False,
+    ) -> Complex[Array, "*b taps"]:
+        """Returns the taps of the channel sampled at the bandwidth, by sinc interpolation: h_l = sum over k of
+        a_k sinc(l - W tau_k).
+
+        Args:
+            bandwidth_hz: bandwidth W; taps are 1 / W apart.
+            l_min: index of the first tap; negative, because a sinc begins before its path arrives.
+            l_max: index of the last tap; by default 6 taps after the last path, which is not possible under `jax.jit`.
+            normalize_delays: whether the delays of every link are counted from its first path.
+            normalize: whether the sum of |h_l|^2 is 1 for every link (links without paths stay 0).
+
+        Returns:
+            h (*b, l_max - l_min + 1), relative to the transmitted amplitude unless it is normalised.
+
+        Example:
+            >>> import jax.numpy as jnp, wbgs_jax as wb
+            >>> one = wb.Paths(jnp.array([1.0 + 0j, 0.5]), jnp.zeros((2, 3)), jnp.array([3.0, 3.0 + 299.792458]))
+            >>> [round(float(abs(h)), 3) for h in one.taps(2e6, l_min=0, l_max=3)]  # one path is two samples later
+            [1.0, 0.0, 0.5, 0.0]
+        """
+        a, tau = self.cir(normalize_delays)
+        last = int(np.ceil(bandwidth_hz * float(jnp.max(tau, initial=0)))) + 6 if l_max is None else l_max
+        index = jnp.arange(l_min, last + 1, dtype=tau.dtype)
+        taps = jnp.sum(a[..., None, :] * jnp.sinc(index[:, None] - bandwidth_hz * tau[..., None, :]), -1)
+        return _with_energy(taps, 1) if normalize else taps
+
+
+def _with_energy(values: Complex[Array, "*b n"], energy: float) -> Complex[Array, "*b n"]:
+    """Returns values scaled so that their squared magnitudes sum to `energy` along the last axis; zeros stay zeros."""
+    strongest = jnp.max(jnp.abs(values), -1, keepdims=True)
+    relative = values / jnp.where(strongest > 0, strongest, 1)  # squares of faint amplitudes would underflow
+    total = jnp.sum(squared_magnitude(relative), -1, keepdims=True)
+    return relative * jnp.sqrt(energy / jnp.where(total > 0, total, 1))
+
 
 FAINTEST = 1e-30
 """Amplitude that counts as zero; its square would underflow in single precision."""
 SMALLEST = 1e-30
 """Power that counts as zero, so that decibels stay finite."""
-NOT_HEARD_DB = -250.0
+NO_PATH_DB = -250.0
 """Received powers at or below this value (dB) mean that no path was found; they do not measure a weak one."""
 
 

@@ -92,7 +92,7 @@ class Asker:
         self.loaded, self.trained, self.dataset, self.receiver = loaded, loaded.trained, loaded.dataset, loaded.receiver
         self.plan = loaded.plan
         self._neighbours, self._confidence = (
-            for_receiver(learned, self.receiver) for learned in (self.trained.neighbours, self.trained.confidence)
+            for_receiver(learned, self.receiver) for learned in (self.trained.correction, self.trained.intervals)
         )
         self._spectra = self._links_with_spectra()
         self._samples: dict[int, Sample] = {}
