@@ -36,6 +36,7 @@ from .inference.predictor import make_power_predictor as make_power_predictor
 from .inference.predictor import make_predictor as make_predictor
 from .inference.trained_field import TrainedField as TrainedField
 from .inference.trained_field import at_receiver as at_receiver
+from .radio.channel import Paths as Paths
 from .training.run_folder import load_trained as load_trained
 from .types import Links as Links
 from .types import Mesh as Mesh

@@ -241,11 +241,11 @@ def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
 
     types = {name: type(section) for name, section in sections(default, field_name).items()}
     try:
-        present: dict[str, dict[str, Any]] = {}
+        present: dict[str, dict[str, Any]] = {RENAMED.get(section, section): {} for section in values}
         for section, content in values.items():
             for name, value in content.items():
                 section_now, _, name_now = present_name(f"{section}.{name}").partition(".")
-                present.setdefault(section_now, {})[name_now] = value
+                present[section_now][name_now] = value
         built = {name: build(types[name], value) for name, value in present.items()}
         return from_sections({name: built[name] for name in types}, default, field_name)
     except (KeyError, TypeError, AttributeError) as error:

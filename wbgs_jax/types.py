@@ -201,6 +201,13 @@ def make_receiver(
         element_positions: (elements, 3) in the local frame; by default the 4x4 half-wavelength array in the local y-z plane.
         unit: of the element positions.
         pattern: of the elements, a name in `radio.antenna.PATTERN_EXPONENTS`; empty for isotropic ones.
+
+    Returns:
+        The receiver, without a leading axis.
+
+    Example:
+        >>> make_receiver([0.0, 0.0, 2.0]).element_positions.shape
+        (16, 3)
     """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
@@ -210,12 +217,31 @@ def make_receiver(
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
-    """Returns receivers with the same number of elements and the same unit as one, with a leading axis on every array."""
+    """Returns receivers with the same number of elements and the same unit as one, with a leading axis on every array.
+
+    Args:
+        receivers: one or more.
+
+    Returns:
+        The receivers, with arrays (r, ...).
+    """
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
 def make_query(tx_position: Any, frequency_hz: Any) -> Query:
-    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz."""
+    """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz.
+
+    Args:
+        tx_position: world frame, metres.
+        frequency_hz: of the carriers.
+
+    Returns:
+        Positions (b, 3) and frequencies (b,).
+
+    Example:
+        >>> make_query([[0.0, 0.0, 1.5], [1.0, 0.0, 1.5]], 28e9).frequency_hz.shape
+        (2,)
+    """
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
     frequency = jnp.broadcast_to(jnp.asarray(frequency_hz, jnp.float32), position.shape[:1])
     return Query(position, frequency)

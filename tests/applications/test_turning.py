@@ -14,7 +14,7 @@ from wbgs_jax.applications.array_orientation import (
     predict_isotropic_paths,
     rotate_array,
 )
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.types import Query, make_receiver
 
@@ -33,7 +33,7 @@ def waves(directions, powers):
     k = jnp.asarray(directions, jnp.float32)[:, None]
     amplitude = jnp.sqrt(jnp.asarray(powers, jnp.float32))[:, None].astype(jnp.complex64)
     polarised = jnp.stack([amplitude, jnp.zeros_like(amplitude)], -1)
-    return Arrivals(amplitude, k, jnp.ones(amplitude.shape), polarised=polarised)
+    return Paths(amplitude, k, jnp.ones(amplitude.shape), polarised=polarised)
 
 
 def test_elements_look_where_the_angles_say_and_stay_level(rng):

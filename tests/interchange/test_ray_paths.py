@@ -15,7 +15,7 @@ from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_paths, from_
 from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 
 
 def assert_same(one, other):
@@ -85,7 +85,7 @@ def line_of_sight(tx, rx, frequency_hz):
     one = {"amplitude": amplitude, "direction": -direction, "length": length, "departure": direction, "arrival": direction}
     met = np.zeros((len(tx), 1, 5), int)
     points = np.repeat(np.asarray(tx, float)[:, None, None], 5, -2)
-    return Arrivals(**{name: values[:, None] for name, values in one.items()}, interaction=met, points=points)
+    return Paths(**{name: values[:, None] for name, values in one.items()}, interaction=met, points=points)
 
 
 def test_snapshots_of_a_line_of_sight(rng, tmp_path):

@@ -19,7 +19,7 @@ from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.radio.antenna import Antenna, antenna_field, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
-from wbgs_jax.radio.channel import Arrivals, decibels
+from wbgs_jax.radio.channel import Paths, decibels
 from wbgs_jax.types import Query, make_receiver
 
 PowerByBoresight = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
@@ -35,12 +35,19 @@ HIGHEST = 1.55
 
 def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
     """Returns the quaternion (wxyz) of a receiver whose +x, the boresight of directive elements, has this azimuth and elevation
-    (radians, world frame) and whose y axis stays horizontal."""
+    (radians, world frame) and whose y axis stays horizontal.
+
+    Args:
+        angles: azimuth and elevation, radians.
+
+    Returns:
+        Unit quaternion (4,), for `make_receiver(orientation=...)`.
+    """
     (ca, ce), (sa, se) = jnp.cos(angles / 2), jnp.sin(angles / 2)
     return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
 
 
-def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
+def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Paths:
     """Returns the waves that reach an isotropic element from n transmitters over all paths; its local frame is the world frame.
 
     Args:
@@ -49,6 +56,9 @@ def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmi
         receiver: (3,), world frame, metres.
         transmitters: (n, 3), world frame, metres.
         frequency_hz: hertz.
+
+    Returns:
+        `wbgs_jax.Paths` with arrays (n, k, ...).
 
     Raises:
         UserError: the field predicts no paths, or only at the receivers it was trained for.
@@ -61,7 +71,7 @@ def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmi
     return paths_of(field, params, plan, Query(places, jnp.full(len(places), frequency_hz, jnp.float32)))
 
 
-def power_when_rotated(arrived: Arrivals, pattern: str = "tr38901") -> PowerByBoresight:
+def power_when_rotated(arrived: Paths, pattern: str = "tr38901") -> PowerByBoresight:
     """Returns a function for the mean received power over all elements (dB) in terms of the boresight; differentiable.
 
     The powers of all paths are added, as in a mean over positions around the receiver: interference should not determine the
@@ -71,6 +81,9 @@ def power_when_rotated(arrived: Arrivals, pattern: str = "tr38901") -> PowerByBo
         arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`predict_isotropic_paths`).
         pattern: of the elements: "tr38901", "dipole", "hw_dipole", or "iso", for which the orientation affects only the
             polarisation.
+
+    Returns:
+        The function: boresights (k, 2), azimuth and elevation in radians -> powers (k, tx), dB.
     """
     assert arrived.polarised is not None, "arrivals of traced paths have polarised amplitudes"
     direction, amplitude = arrived.direction, arrived.polarised
@@ -97,6 +110,9 @@ def rotate_array(
         powers: of the transmitters by boresight, from `power_when_rotated` or any similar function.
         aim: objective to maximise, as in `place_antenna`.
         starts: number of starting directions of the gradient steps.
+
+    Returns:
+        `place` (starts, 2), radians, and `loss` (starts,), dB.
     """
     sphere = np.array([[-np.pi, -HIGHEST], [np.pi, HIGHEST]])
     tried = jnp.asarray(grid_over(sphere, STEP))

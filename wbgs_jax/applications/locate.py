@@ -146,6 +146,9 @@ def make_locator(
         starts: number of grid points that are refined.
         known_power: whether the transmitted power is known. If not, powers are compared up to a common offset in decibels.
 
+    Returns:
+        The locator; its result for an observation is a `Located`.
+
     Raises:
         UserError: the field does not predict this kind of observation.
     """

@@ -137,6 +137,9 @@ def make_reflector(
         field, params: a trained field that predicts paths, used for the walls between the plate and the ends; by default there
             are no walls. Every end is planned and compiled separately: a dozen take a minute.
 
+    Returns:
+        The plate; `power_db` is the function of its pose.
+
     Raises:
         UserError: a side is not longer than 0, or the field predicts no paths, or only at the receivers it was trained for.
     """
@@ -156,6 +159,9 @@ def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any
         field, params: a trained field that predicts paths, of which the receiver-independent part is used.
         ends: (ends, 3), world frame, metres.
         frequencies_hz: (f,) or one, hertz.
+
+    Returns:
+        The function: positions (k, 3) in metres and a smoothing length in metres -> powers (k, ends), dB.
 
     Raises:
         UserError: the field predicts no paths, or only at the receivers it was trained for.
@@ -202,6 +208,9 @@ def place_reflector(
         aim: objective to maximise, as in `place_antenna`.
         step: grid spacing, metres.
         starts: number of starting poses of the gradient steps.
+
+    Returns:
+        `place` (starts, 5), metres and radians (`Reflector`), and `loss` (starts,), dB.
     """
     before = 10 ** (jnp.asarray(without_db, jnp.float32) / 10)
     centres = grid_over(np.asarray(box, np.float32), step)

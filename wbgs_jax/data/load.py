@@ -157,7 +157,15 @@ def load_dataset(
     """Loads a dataset from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
     or from several of one scene, separated by commas, as one dataset with several receivers.
 
-    The other arguments are for folders that do not record them (`wbgs_jax.data.image_folder.load_layout`); scene files do.
+    Args:
+        source: number or name of a released scene, a file, a folder, or several of them separated by commas.
+        frequency_hz: hertz, of a folder that does not record it.
+        seed: of the split of a folder that has none.
+        test_fraction: fraction of the transmitters for testing in that split.
+        convention: order of the rows of a folder's images; by default the recorded one, or what the images suggest.
+
+    Returns:
+        The data set: positions in metres (world frame), frequencies in hertz, observations and splits.
 
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.

@@ -209,8 +209,19 @@ def evaluate(
 ) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
+    Args:
+        trained: a trained field.
+        dataset: the data of its run, or others of the same kind.
+        part: "test" or "validation".
+
+    Returns:
+        The report, {figure: value}, and the spectra (n, 90, 360) in the order of the held-out links.
+
     Raises:
         UserError: nothing is held out, or the field does not predict the kind of observation in the data.
+
+    Example:
+        >>> report, spectra = evaluate(trained, trained.dataset())  # doctest: +SKIP
     """
     index = held_out(dataset, part)
     tested = part == "test"

@@ -112,7 +112,11 @@ def export_field(
 ) -> None:
     """Writes a trained field to one file (a zip archive) that runs on all of `platforms`, a selection of `PLATFORMS`.
 
-    `dataset` is the training data; it is loaded if it is not passed.
+    Args:
+        trained: a trained field.
+        path: of the file.
+        platforms: those on which the file is to run.
+        dataset: the training data; loaded if not passed.
 
     Raises:
         UserError: a platform is unknown, the file cannot be written, or the run's data are missing.
@@ -177,6 +181,12 @@ def _no_source_locations() -> Iterator[None]:
 
 def load_exported(path: Path | str) -> ExportedField:
     """Returns a field that `export_field` wrote. The model's code is not needed.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The field, called like the result of `make_predictor`, with its `metadata`.
 
     Raises:
         UserError: the file is missing, damaged, not an exported field, or of an unsupported version.

@@ -154,6 +154,9 @@ def expected_ssim(
         pas: the predicted spectra.
         query: the queries.
         power_db: the received powers predicted by the field; if omitted, the mean of the feature that depends on them is used.
+
+    Returns:
+        Expected SSIM and the two ends of its prediction interval (b,).
     """
     known = features(pas, query, confidence.rx_position, confidence.tx_position, power_db)
     if power_db is None:
@@ -173,6 +176,9 @@ def expected_power(
         power_db: the predicted powers.
         query: the queries.
         rx_position: position of the receiver, or one per query, world frame, metres.
+
+    Returns:
+        Expected absolute error and the bound of the prediction interval (b,), dB.
     """
     error = _log_error(confidence, power_features(power_db, query, rx_position, confidence.tx_position))
     bounds = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))

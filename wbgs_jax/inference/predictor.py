@@ -40,6 +40,19 @@ def make_predictor(trained: TrainedField, receiver: Receiver | None = None) -> P
     receiver of the training data, which are read to obtain it; for a receiver that is not in the training data, call
     `at_receiver` first. The function is compiled for every new number of queries; `batching.predict_many` keeps that number
     fixed.
+
+    Args:
+        trained: a trained field.
+        receiver: by default the first one of the training data.
+
+    Returns:
+        The function; for positions (b, 3) or (3,) in metres and frequencies in hertz it returns spectra (b, 90, 360) or (90,
+        360).
+
+    Example:
+        >>> predict = make_predictor(load_trained("runs/try"))  # doctest: +SKIP
+        >>> predict([1.0, 0.5, 1.5], [2.4e9, 28e9]).shape  # doctest: +SKIP
+        (2, 90, 360)
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
     plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.correction, receiver)
@@ -49,6 +62,13 @@ def make_predictor(trained: TrainedField, receiver: Receiver | None = None) -> P
 def make_power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> received power relative to the transmitted
     power (dB); otherwise as `make_predictor`.
+
+    Args:
+        trained: a trained field.
+        receiver: by default the first one of the training data.
+
+    Returns:
+        The function; powers (b,), or () for one position.
 
     Raises:
         UserError: the field does not predict power, or was trained on spectra, which have no scale.

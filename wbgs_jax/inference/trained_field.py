@@ -124,7 +124,15 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
 
     For a receiver of its data, the field is returned unchanged. For any other receiver, its receiver-independent part (the
     coherent field) is returned, without residual kriging or mixture and without prediction intervals, for which there are no
-    measurements at that receiver. `dataset` is the training data, if they are already loaded.
+    measurements at that receiver.
+
+    Args:
+        trained: a trained field.
+        receiver: the receiver to be predicted for.
+        dataset: the training data; loaded if not passed.
+
+    Returns:
+        The field for this receiver.
 
     Raises:
         UserError: no part of the field is receiver-independent.

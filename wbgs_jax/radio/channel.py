@@ -1,7 +1,7 @@
 """Channel quantities: received power, beamforming gain, K-factor, delay and angular spread, and correlation of snapshots.
 
-All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Arrivals` (`wbgs_jax.Paths`) the
-amplitudes and geometry of all paths. Leading axes are batch axes.
+All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Paths` the amplitudes and
+geometry of all paths. Leading axes are batch axes.
 """
 
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from jaxtyping import Array, Complex, Float, Int
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
 
-class Arrivals(NamedTuple):
-    """Amplitudes and geometry of K paths at a receiver (`wbgs_jax.Paths`).
+class Paths(NamedTuple):
+    """Amplitudes and geometry of K paths at a receiver.
 
     `cir`, `cfr` and `taps` are the impulse response, the frequency response and the taps of the channel from the transmitter to
     an element at the array's centre, with the definitions of Sionna RT's `Paths` and for one instant.
@@ -119,7 +119,11 @@ class Arrivals(NamedTuple):
         return _with_energy(taps, 1) if normalize else taps
 
 
-def _with_energy(values: Complex[Array, "*b n"], energy: float) -> Complex[Array, "*b n"]:
+Arrivals = Paths
+"""The same class, by the name that `propagation` and the coherent field still use, where `Paths` are traced points."""
+
+
+def _with_energy(values: Complex[Array, "*b n"], energy: int) -> Complex[Array, "*b n"]:
     """Returns values scaled so that their squared magnitudes sum to `energy` along the last axis; zeros stay zeros."""
     strongest = jnp.max(jnp.abs(values), -1, keepdims=True)
     relative = values / jnp.where(strongest > 0, strongest, 1)  # squares of faint amplitudes would underflow
@@ -141,7 +145,14 @@ def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss."""
+    """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss.
+
+    Args:
+        snapshot: complex voltages of the elements, relative to the transmitted amplitude.
+
+    Returns:
+        Decibels (*b,).
+    """
     return decibels(jnp.mean(squared_magnitude(snapshot), -1))
 
 
@@ -152,6 +163,13 @@ def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]
     Args:
         distance: metres.
         frequency_hz: of the carrier.
+
+    Returns:
+        Decibels (*b,), negative beyond a tenth of a wavelength.
+
+    Example:
+        >>> round(float(free_space_db(jnp.array(10.0), jnp.array(2.4e9))), 1)
+        -60.1
     """
     return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
 
@@ -184,15 +202,29 @@ def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Arr
     return decibels(peak**2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
 
 
-def k_factor_db(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the Rician K-factor: the power of the strongest path over that of all others (dB)."""
+def k_factor_db(arrivals: Paths) -> Float[Array, "*b"]:
+    """Returns the Rician K-factor: the power of the strongest path over that of all others (dB).
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Decibels (*b,).
+    """
     power = squared_magnitude(arrivals.amplitude)
     strongest = jnp.max(power, -1)
     return decibels(strongest / jnp.maximum(jnp.sum(power, -1) - strongest, SMALLEST))
 
 
-def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the power-weighted r.m.s. delay spread (seconds)."""
+def delay_spread_s(arrivals: Paths) -> Float[Array, "*b"]:
+    """Returns the power-weighted r.m.s. delay spread (seconds).
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Seconds (*b,); 0 with a single path.
+    """
     power = squared_magnitude(arrivals.amplitude)
     weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
     delay = arrivals.length / SPEED_OF_LIGHT
@@ -200,9 +232,16 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
     return jnp.sqrt(jnp.sum(weight * (delay - mean) ** 2, -1))
 
 
-def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
+def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
     """Returns the power-weighted circular spreads of azimuth and zenith of arrival (in this order) in the receiver's frame,
-    degrees (3GPP TR 38.901, annex A); 0 without any path."""
+    degrees (3GPP TR 38.901, annex A); 0 without any path.
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Azimuth and zenith spread (*b, 2), degrees.
+    """
     power = squared_magnitude(arrivals.amplitude)
     total = jnp.sum(power, -1, keepdims=True)
     weight = power / jnp.maximum(total, SMALLEST)
@@ -215,7 +254,7 @@ def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
 
 
 def doppler_hz(
-    arrivals: Arrivals, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
+    arrivals: Paths, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
 ) -> Float[Array, "*b k"]:
     """Returns the Doppler shifts of all paths (hertz).
 
@@ -223,6 +262,9 @@ def doppler_hz(
         arrivals: of traced paths, with directions of departure and arrival.
         frequency_hz: of the carrier.
         tx_velocity, rx_velocity: metres per second, world frame.
+
+    Returns:
+        Hertz (*b, k), positive if the path gets shorter.
     """
     assert arrivals.departure is not None and arrivals.arrival is not None, (
         "only arrivals of traced paths have these directions"
@@ -240,13 +282,20 @@ def unit_snapshots(
 
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot."""
+    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot.
+
+    Args:
+        a, b: complex voltages of the same elements.
+
+    Returns:
+        Values (*b,) from 0 to 1.
+    """
     # Computed from unit vectors: the squared product of weak snapshots would underflow in single precision.
     (unit_a, _), (unit_b, _) = unit_snapshots(a), unit_snapshots(b)
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 
-def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
+def added_powers(arrivals: Paths, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
     """Returns the spectrum, scaled to a maximum of 1, that an array measures of one transmitter if the powers of its paths are
     added instead of their amplitudes. Element positions are in wavelengths."""
     strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))
