@@ -146,7 +146,7 @@ OLD_CALIBRATION = {
     "clutter_spectra": "absorption_spectra",
     "clutter_steps": "absorption_steps",
 }
-"""Settings of version 0.2, in the section `search`, with their present names."""
+"""Earlier names of settings, in the section `search`, with their present names."""
 
 
 def test_the_calibration_of_an_old_run_is_read():

@@ -87,6 +87,6 @@ _RENAMED = {
     "turn_array": "applications.rotate_array",
     "wave": "coherent",
 }
-"""Names of version 0.2 with those that replace them."""
+"""Earlier names with those that replace them; they work, and warn, for one release."""
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__, _RENAMED)

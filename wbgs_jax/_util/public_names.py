@@ -1,7 +1,7 @@
 """Public names of a package: loaded when they are first used, listed in the `__init__.pyi` beside its `__init__.py`.
 
-A stub holds the names once, for the runtime, for type checkers and for the documentation (docs/make_api.py). Names of earlier
-releases lead to the present ones and warn.
+A stub holds the names once, for the runtime, for type checkers and for the documentation (docs/make_api.py). Earlier names
+lead to the present ones and warn.
 """
 
 import ast
@@ -40,7 +40,7 @@ def attach(
     Args:
         package: `__name__` of the package.
         file: its `__file__`.
-        renamed: names of the previous release, each with the present one, such as "radio.cbf"; their use warns.
+        renamed: earlier names, each with the present one, such as "radio.cbf"; their use warns.
     """
     names = read_stub(package, file)
 
@@ -63,5 +63,5 @@ def attach(
 
 
 def warn_renamed(old: str, new: str, stacklevel: int = 3) -> None:
-    """Warns that a name of the previous release is used; `stacklevel` counts frames as `warnings.warn` does."""
+    """Warns that an earlier name is used; `stacklevel` counts frames as `warnings.warn` does."""
     warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=stacklevel)

@@ -98,19 +98,19 @@ class TrainedField:
 
     @property
     def neighbours(self) -> Beside:
-        """`correction` by its name in version 0.2."""
+        """`correction` by its earlier name."""
         warn_renamed("wbgs_jax.TrainedField.neighbours", "correction")
         return self.correction
 
     @property
     def confidence(self) -> Confidence | None:
-        """`intervals` by its name in version 0.2."""
+        """`intervals` by its earlier name."""
         warn_renamed("wbgs_jax.TrainedField.confidence", "intervals")
         return self.intervals
 
     @property
     def power_confidence(self) -> PowerConfidence | None:
-        """`power_intervals` by its name in version 0.2."""
+        """`power_intervals` by its earlier name."""
         warn_renamed("wbgs_jax.TrainedField.power_confidence", "power_intervals")
         return self.power_intervals
 
