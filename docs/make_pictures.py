@@ -43,7 +43,7 @@ def draw_array() -> Figure:
     """Returns the array in its frame, with one direction and its angles."""
     figure = Figure(figsize=(6.4, 4.8))
     axis = figure.add_axes((0, 0, 1, 1), projection="3d")
-    axis.scatter(*wb.planar_array().T, color=colormaps["viridis"](0.3), s=36, depthshade=False)
+    axis.scatter(*wb.radio.planar_array().T, color=colormaps["viridis"](0.3), s=36, depthshade=False)
     for vector, name in zip(np.eye(3), ("x, where the array looks", "y", "z, zenith of the spectrum"), strict=True):
         axis.quiver(0, 0, 0, *(1.5 * vector), color="black", arrow_length_ratio=0.07)
         axis.text(*(1.6 * vector + [0, 0, 0.04 if vector[2] else -0.15]), name, ha="center")
@@ -85,8 +85,8 @@ def draw_conventions() -> Figure:
         axis.set_axis_off()
         axis.view_init(20, 40)
         flat = figure.add_subplot(2, 2, 2 * row + 2)
-        wave = wb.steering_vector(jnp.asarray(elements), jnp.asarray(towards, jnp.float32))
-        pas = np.asarray(wb.snapshot_to_pas(wave, jnp.asarray(elements)))
+        wave = wb.radio.steering_vector(jnp.asarray(elements), jnp.asarray(towards, jnp.float32))
+        pas = np.asarray(wb.radio.snapshot_to_pas(wave, jnp.asarray(elements)))
         if name == "zenith":
             show_pas(flat, pas, "image in the folder")
             continue
@@ -101,8 +101,8 @@ def draw_plane_wave() -> Figure:
     figure = Figure(figsize=(10, 3.1), layout="constrained")
     wave = direction(40.0, 60.0)
     for axis, side in zip(figure.subplots(1, 2), (4, 8), strict=True):
-        elements = jnp.asarray(wb.planar_array(side, side), jnp.float32)
-        pas = wb.snapshot_to_pas(wb.steering_vector(elements, wave), elements)
+        elements = jnp.asarray(wb.radio.planar_array(side, side), jnp.float32)
+        pas = wb.radio.snapshot_to_pas(wb.radio.steering_vector(elements, wave), elements)
         picture = show_pas(axis, pas, f"{side} x {side} elements")
         axis.plot(40, 60, "o", mec="white", mfc="none", ms=12, mew=2)
         axis.plot(140, 60, "s", mec="white", mfc="none", ms=12, mew=2)
@@ -112,14 +112,14 @@ def draw_plane_wave() -> Figure:
     return figure
 
 
-def made_up_gaussians(count: int = 14) -> wb.Gaussians:
+def made_up_gaussians(count: int = 14) -> wb.splat.Gaussians:
     """Returns elongated Gaussians around a receiver at the origin."""
     rng = np.random.default_rng(4)
     azimuth, zenith = rng.uniform(-2.9, 2.9, count), rng.uniform(0.5, 1.45, count)
     means = rng.uniform(1.5, 4, (count, 1)) * np.asarray(angles_to_direction(jnp.asarray(azimuth), jnp.asarray(zenith)))
     scales = np.log(rng.uniform([0.05, 0.1, 0.2], [0.15, 0.3, 0.6], (count, 3)))
     arrays = means, scales, rng.normal(size=(count, 4)), np.zeros(count)
-    return wb.Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
+    return wb.splat.Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
 def draw_splatting() -> Figure:
@@ -135,8 +135,8 @@ def draw_splatting() -> Figure:
         space.plot(*np.stack([0 * mean, mean]).T, ":", color="grey", linewidth=0.8)
     space.set(title="Gaussians around the receiver (triangle)", xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     flat = figure.add_subplot(1, 2, 2)
-    plan = wb.geometry_plan(gaussians, receiver)
-    image = wb.render_splats(plan, attenuation=jnp.full((n, 1), 0.9), signal=signal)[0]
+    plan = wb.splat.geometry_plan(gaussians, receiver)
+    image = wb.splat.render_splats(plan, attenuation=jnp.full((n, 1), 0.9), signal=signal)[0]
     picture = show_pas(flat, image, "the same, projected and blended")
     for degrees in np.rad2deg(np.stack(direction_to_angles(gaussians.means), -1)):
         flat.plot(*degrees, "+", color="white")
@@ -146,8 +146,8 @@ def draw_splatting() -> Figure:
 
 def two_paths(frequency_hz: float, longer: float):
     """Returns the snapshots (2, 16) of two plane waves of equal strength, the second one `longer` metres behind."""
-    elements = jnp.asarray(wb.planar_array(), jnp.float32)
-    steering = wb.steering_vector(elements, jnp.stack([direction(-10.0, 55.0), direction(20.0, 75.0)]))
+    elements = jnp.asarray(wb.radio.planar_array(), jnp.float32)
+    steering = wb.radio.steering_vector(elements, jnp.stack([direction(-10.0, 55.0), direction(20.0, 75.0)]))
     turn = jnp.exp(-2j * jnp.pi * frequency_hz / SPEED_OF_LIGHT * jnp.array([0.0, longer]))
     return steering * turn[:, None]
 
@@ -155,15 +155,15 @@ def two_paths(frequency_hz: float, longer: float):
 def draw_coherent() -> Figure:
     """Returns spectra of two paths whose lengths differ by nothing, a third and half of a wavelength, and without phases."""
     figure = Figure(figsize=(10, 4.4), layout="constrained")
-    elements = jnp.asarray(wb.planar_array(), jnp.float32)
+    elements = jnp.asarray(wb.radio.planar_array(), jnp.float32)
     axes = figure.subplots(2, 2).ravel()
     millimetres = 1e3 * SPEED_OF_LIGHT / GHZ
     for axis, share in zip(axes, (0.0, 1 / 3, 1 / 2), strict=False):
         waves = two_paths(GHZ, share * SPEED_OF_LIGHT / GHZ)
         name = f"phases known, second path {share * millimetres:.1f} mm longer"
-        picture = show_pas(axis, wb.snapshot_to_pas(waves.sum(0), elements), name)
-    steering = wb.steering_vector(elements, jnp.asarray(wb.pas_directions(), jnp.float32))
-    blind = jnp.sqrt(jnp.sum(wb.cbf(two_paths(GHZ, 0.0), steering) ** 2, 0))
+        picture = show_pas(axis, wb.radio.snapshot_to_pas(waves.sum(0), elements), name)
+    steering = wb.radio.steering_vector(elements, jnp.asarray(wb.radio.pas_directions(), jnp.float32))
+    blind = jnp.sqrt(jnp.sum(wb.radio.cbf(two_paths(GHZ, 0.0), steering) ** 2, 0))
     show_pas(axes[3], blind / blind.max(), "phases unknown: powers added")
     for axis in axes[:2]:
         axis.set_xlabel("")
@@ -186,10 +186,10 @@ def draw_paths() -> Figure:
     """Returns the paths of one transmitter in a room, from above, and the spectrum of their sum."""
     figure = Figure(figsize=(10, 3.8), layout="constrained", dpi=100)
     plan_view, flat = figure.subplots(1, 2, width_ratios=(1.1, 1))
-    field = wb.wave.make_field(box_mesh())
+    field = wb.coherent.make_field(box_mesh())
     params, receiver = field.init(jax.random.key(0)), wb.make_receiver([0.8, 1.0, 1.0])
     plan, query = field.plan(params, receiver), wb.make_query([4.6, 3.0, 1.8], GHZ)
-    traced = jax.tree.map(lambda a: np.asarray(a[0]), wb.wave.trace(plan, query.tx_position).specular)
+    traced = jax.tree.map(lambda a: np.asarray(a[0]), wb.coherent.trace(plan, query.tx_position).specular)
     for points, alive, types in zip(traced.points, traced.alive, traced.interaction_type, strict=True):
         order = int((types == 2).sum())
         if alive and order < 3 and np.ptp(points[:, 2]) < 1:  # those that stay between floor and ceiling, seen from above
@@ -199,7 +199,7 @@ def draw_paths() -> Figure:
         name = ("line of sight", "one reflection", "two reflections")[order]
         plan_view.plot([], [], style, color=colormaps["viridis"](0.05 + 0.32 * order), label=name)
     draw_room(plan_view, np.asarray(receiver.position), np.asarray(query.tx_position[0]))
-    picture = show_pas(flat, wb.wave.render(params, plan, query)[0], "what the array sees at 28 GHz")
+    picture = show_pas(flat, wb.coherent.render(params, plan, query)[0], "what the array sees at 28 GHz")
     figure.colorbar(picture, ax=flat, label="normalised amplitude")
     return figure
 

@@ -123,7 +123,7 @@ def make_row(case: Case, seed: int, runs: Path) -> Row:
     truth = np.asarray(dataset.pas(dataset.test))
     alone = ssim(predict_spectra(trained.field, trained.params, dataset, dataset.test), truth)
     medians = {name: own["median_ssim"] for name, own in report["baselines"].items()}
-    medians["kriging"] = float(np.median(ssim(kriged(dataset, dataset.test, trained.neighbours), truth)))
+    medians["kriging"] = float(np.median(ssim(kriged(dataset, dataset.test, trained.correction), truth)))
     sure = report.get("confidence")
     shutil.rmtree(folder, ignore_errors=True)
     return {
@@ -135,7 +135,7 @@ def make_row(case: Case, seed: int, runs: Path) -> Row:
         "median_ssim": report["median_ssim"],
         "alone": float(np.median(alone)),
         "simple": medians,
-        "field_answers_alone": trained.neighbours is None,
+        "field_answers_alone": trained.correction is None,
         "level": None if sure is None else sure["level"],
         "coverage": None if sure is None else sure["coverage"],
         "expected": None if sure is None else sure["expected"],

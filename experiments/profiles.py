@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 Changes = Mapping[str, Mapping[str, Any]]
-"""Section of the settings ("field", "optim", "density", "search", "loop"): what differs."""
+"""Section of the settings ("field", "optim", "density", "calibration", "loop"): what differs."""
 
 
 @dataclass(frozen=True)

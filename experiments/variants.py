@@ -120,8 +120,8 @@ VOLUME = {
 _NO_EDGES: dict[str, object] = {"diffracted_tried": 1, "diffracted_kept": 1}
 _NO_MATERIALS = {"materials_lr": 0.0, "thickness_lr": 0.0}
 _UNTRAINED = _NO_MATERIALS | {"corrections_lr": 0.0}
-_NO_SEARCH: Changes = {"search": {"rounds": 0}}
-AS_IT_IS: Changes = {"search": {"geometry": False, "absent_spectra": 0, "clutter_spectra": 0}}
+_NO_SEARCH: Changes = {"calibration": {"rounds": 0}}
+AS_IT_IS: Changes = {"calibration": {"geometry": False, "spurious_spectra": 0, "absorption_spectra": 0}}
 """The mesh is believed: nothing in it is moved, left out or missed."""
 COHERENT = {
     "phase_blind": Variant({"field": {"coherent": False}, **_NO_SEARCH}),  # phases would name the materials
@@ -178,7 +178,7 @@ def uncorrected(fault: str) -> str:
     return f"uncorrected_{fault}".rstrip("_")
 
 
-_UNCORRECTED: Changes = {"search": {**AS_IT_IS["search"], "tuning_spectra": 0}}
+_UNCORRECTED: Changes = {"calibration": {**AS_IT_IS["calibration"], "array_gain_spectra": 0}}
 UNCORRECTED = {
     uncorrected(name): dataclasses.replace(variant, changes=_UNCORRECTED) for name, variant in {"": Variant(), **FAULTS}.items()
 }

@@ -7,7 +7,7 @@ import pytest
 from builders.synthetic import tiny_settings
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.config import PRESETS, changed, check, from_dict, from_sections, limit_steps, sections, to_dict
+from wbgs_jax.config import PRESETS, changed, check, from_dict, from_sections, limit_steps, present_option, sections, to_dict
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.fields.base import check_config
 
@@ -82,7 +82,7 @@ def test_small_data_sets_get_fewer_steps():
         ("wrfgs", "field", {"fusion": 4}, "wrfgs.fusion"),
         ("wrfgs", "field", {"radiance_frequency": True}, "no frequency input"),
         ("wave", "field", {"max_facets": 10**6}, "wave.max-facets"),
-        ("wave", "search", {"spectra": 0}, "search.spectra"),
+        ("wave", "calibration", {"spectra": 0}, "calibration.spectra"),
         ("nerf2", "field", {"directions": 10**6}, "nerf2.directions"),
         ("nerf2", "field", {"point_octaves": -1}, "nerf2.point-octaves"),
     ],
@@ -132,3 +132,49 @@ def test_some_settings_are_changed_and_all_others_stay():
     assert dataclasses.replace(after.field, width=SETTINGS.field.width) == SETTINGS.field
     with pytest.raises(TypeError, match="no_such_setting"):
         changed(SETTINGS, {"optim": {"no_such_setting": 1}})
+
+
+OLD_CALIBRATION = {
+    "sure": "n_sigma",
+    "antenna_sure": "antenna_n_sigma",
+    "absent_spectra": "spurious_spectra",
+    "absent_glance": "spurious_glance",
+    "ideal_spectra": "propagation_spectra",
+    "tuning_spectra": "array_gain_spectra",
+    "geometry_doubt": "geometry_position_std",
+    "placement_spectra": "position_std_spectra",
+    "clutter_spectra": "absorption_spectra",
+    "clutter_steps": "absorption_steps",
+}
+"""Earlier names of settings, in the section `search`, with their present names."""
+
+
+def test_the_calibration_of_an_old_run_is_read():
+    settings = changed(
+        get_field("wave").presets["cpu"], {"calibration": {"n_sigma": 2.5, "geometry": False, "absorption_steps": 7}}
+    )
+    values = to_dict(settings, "wave")
+    old = {new: name for name, new in OLD_CALIBRATION.items()}
+    values["search"] = {old.get(name, name): value for name, value in values.pop("calibration").items()}
+    assert {"sure", "clutter_steps", "rounds"} <= values["search"].keys()
+    assert from_dict(json.loads(json.dumps(values)), get_field("wave").presets["cpu"], "wave") == settings
+
+
+@pytest.mark.parametrize(
+    ("word", "present"),
+    [
+        *((f"--search.{old}", f"--calibration.{new}") for old, new in OLD_CALIBRATION.items()),
+        ("--search.no-geometry", "--calibration.no-geometry"),
+        ("--search.sure=3", "--calibration.n-sigma=3"),
+        ("--calibration.n-sigma", "--calibration.n-sigma"),
+        ("--wave.clutter-cells", "--wave.clutter-cells"),
+        ("--out=runs/search.sure", "--out=runs/search.sure"),
+        ("--out", "--out"),
+        ("search.sure", "search.sure"),
+    ],
+)
+def test_an_old_option_is_the_present_one(word, present):
+    assert present_option(word.replace("_", "-") if word.startswith("--s") else word) == present.replace("_", "-")
+    calibration = sections(get_field("wave").presets["cpu"], "wave")["calibration"]
+    if present.startswith("--calibration.") and present[-8:] != "geometry":
+        assert hasattr(calibration, present[len("--calibration.") :].partition("=")[0].replace("-", "_"))

@@ -29,7 +29,7 @@ sys.path.insert(0, "tests")
 from builders.untrained import make_coherent_run, make_run
 import wbgs_jax as wb
 for make in (make_run, make_coherent_run):
-    predict = wb.predictor(wb.load_trained(make(Path(sys.argv[1]) / make.__name__)))
+    predict = wb.make_predictor(wb.load_trained(make(Path(sys.argv[1]) / make.__name__)))
     for tx in ([1.0, 0.5, 1.5], np.array([1.0, 0.5, 1.5]), jax.numpy.array([1.0, 0.5, 1.5])):
         pas = predict(tx, [28e9])
         assert pas.dtype == np.float32 and pas.shape == (1, 90, 360) and 0 < pas.max() <= 1

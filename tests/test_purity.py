@@ -35,7 +35,7 @@ query, receiver = wb.make_query((1.5, 1.2, 1.4), 5e9), wb.make_receiver((0.5, 0.
 small = dict(width=4, depth=2, skip=1, radiance_widths=(4,))
 
 points = np.random.default_rng(0).uniform(1, 2, (5, 3)).astype(np.float32)
-config = wb.WidebandConfig(gaussian_octaves=1, tx_octaves=1, **small)
+config = wb.wideband.WidebandConfig(gaussian_octaves=1, tx_octaves=1, **small)
 splatted = wb.wideband.make_field(wb.Surface(jnp.asarray(points), jnp.full(5, 0.2)), config)
 
 volume = Nerf2Field(jnp.array([[0.0, 0, 0], [2, 2, 2]]), Nerf2Config(samples=2, directions=4, **small))
@@ -45,12 +45,13 @@ corners = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0], [0, 0, 2], [3, 0
 faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 5], [0, 5, 4]], np.int32)
 part = np.array([0, 0, 1, 1], np.int32)
 few = dict(specular_tried=8, specular_kept=4, diffracted_tried=4, diffracted_kept=2, mirror_areas=(0.0,))
-coherent = wb.wave.make_field(wb.Mesh(*map(jnp.asarray, (corners, faces, part, part)), jnp.zeros(2)), wb.WaveConfig(**few))
+mesh = wb.Mesh(*map(jnp.asarray, (corners, faces, part, part)), jnp.zeros(2))
+coherent = wb.coherent.make_field(mesh, wb.coherent.WaveConfig(**few))
 
 for field in (splatted, volume, coherent):
     params = field.init(jax.random.key(0))
     plan = type(field).plan if field is coherent else jax.jit(type(field).plan, static_argnames="capacity")
-    plan = plan(field, params, receiver, capacity=wb.TileLimits(4096, 1024) if field is splatted else None)
+    plan = plan(field, params, receiver, capacity=wb.splat.TileLimits(4096, 1024) if field is splatted else None)
     pas = jax.jit(type(field).render)(field, params, plan, query).pas
     assert pas.shape == (1, 90, 360) and float(pas.max()) > 0.01 and bool(jnp.isfinite(pas).all()), field.name
 """

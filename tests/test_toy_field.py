@@ -256,7 +256,7 @@ def test_it_is_used_as_a_library(trained, tmp_path):
     slopes = jax.grad(lambda params: wb.pas(result.field, params, receiver, query).sum())(result.params)
     np.testing.assert_array_equal(slopes["image"], np.arange(3)[:, None, None] == np.ones((90, 360)))
 
-    predict = wb.predictor(by_command, receiver)
+    predict = wb.make_predictor(by_command, receiver)
     np.testing.assert_array_equal(wb.predict_many(predict, dataset.tx_positions[:5], 5e9, block=2), np.tile(pas, (5, 1, 1)))
     report, predicted = evaluate(by_command, dataset, "validation")
     of = dataset.receiver_index[dataset.validation]

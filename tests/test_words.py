@@ -116,4 +116,4 @@ def test_other_words_are_found(source):
 
 def test_names_and_placeholders_are_not_text():
     assert not list(flaws("heard = told(f'received {heard} dB')  # `nobody` returns it\n"))
-    assert not list(flaws("x['clutter'] = 'use --search.clutter-spectra 0'\n"))
+    assert not list(flaws("x['clutter'] = 'use --calibration.absorption-spectra 0'\n"))

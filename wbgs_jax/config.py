@@ -16,6 +16,37 @@ FEWEST_STEPS, STEPS_A_SPECTRUM = 600, 8
 """Lower bounds on `OptimConfig.min_steps` when spectra are few: in total, and per spectrum."""
 
 
+RENAMED: Mapping[str, str] = {
+    "search.sure": "calibration.n_sigma",
+    "search.antenna_sure": "calibration.antenna_n_sigma",
+    "search.absent_spectra": "calibration.spurious_spectra",
+    "search.absent_glance": "calibration.spurious_glance",
+    "search.ideal_spectra": "calibration.propagation_spectra",
+    "search.tuning_spectra": "calibration.array_gain_spectra",
+    "search.geometry_doubt": "calibration.geometry_position_std",
+    "search.placement_spectra": "calibration.position_std_spectra",
+    "search.clutter_spectra": "calibration.absorption_spectra",
+    "search.clutter_steps": "calibration.absorption_steps",
+    "search": "calibration",
+}
+"""Settings (SECTION.NAME) and sections of earlier versions with their present names, for stored runs and command lines."""
+
+
+def present_name(name: str) -> str:
+    """Returns the present name of a setting, SECTION.NAME, which may be that of an earlier version."""
+    section, _, rest = name.partition(".")
+    return RENAMED.get(name) or f"{RENAMED.get(section, section)}.{rest}"
+
+
+def present_option(argument: str) -> str:
+    """Returns a word of a command line with the present name of the setting in it, such as --calibration.n-sigma=3 for
+    --search.sure=3; other words are returned unchanged."""
+    option, equals, value = argument.partition("=")
+    if not option.startswith("--") or "." not in option:
+        return argument
+    return f"--{present_name(option[2:].replace('-', '_'))}".replace("_", "-") + equals + value
+
+
 def setting(default: Any, before: Any) -> Any:
     """Returns a dataclass setting with its value in files written before the setting existed."""
     return dataclasses.field(default=default, metadata={"before": before})
@@ -70,7 +101,7 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class CalibrationConfig:
     """Calibration of materials, antennas and geometry before the first step (training/calibration/pipeline.py)."""
 
     rounds: int = 3
@@ -83,21 +114,21 @@ class SearchConfig:
     """Training spectra up to a frequency, used for thicknesses that the scene does not specify ..."""
     thickness_glance: int = 48
     """... and the first of them, used to narrow down the candidate slabs."""
-    sure: float = 2.0
-    """n_sigma: standard errors by which learned properties must fit better than every listed material to be kept."""
+    n_sigma: float = 2.0
+    """Standard errors by which learned properties must fit better than every listed material to be kept."""
     antenna_rounds: int = 2
     """Maximum number of passes over the antennas of both ends; 0 disables the calibration of antennas."""
     antenna_spectra: int = 96
     """Training spectra used for antennas."""
-    antenna_sure: float = 3.0
-    """n_sigma: standard errors by which another antenna must fit better to replace the current one."""
-    absent_spectra: int = 768
+    antenna_n_sigma: float = 3.0
+    """Standard errors by which another antenna must fit better to replace the current one."""
+    spurious_spectra: int = 768
     """Training spectra of low frequencies used to find spurious bodies of the mesh; 0 disables this ..."""
-    absent_glance: int = 96
+    spurious_glance: int = 96
     """... and the first of them, used to narrow down the candidate bodies."""
-    ideal_spectra: int = 96
+    propagation_spectra: int = 96
     """Training spectra used for the propagation options, such as effects that ray tracers leave out."""
-    tuning_spectra: int = 320
+    array_gain_spectra: int = 320
     """Training spectra used to calibrate the array gains; 0 disables this."""
     geometry: bool = True
     """Whether surfaces of an inaccurate mesh are displaced."""
@@ -105,7 +136,7 @@ class SearchConfig:
     """Snapshots used in every step of this alignment ..."""
     geometry_steps: int = 240
     """... or, if only spectra are available, steps at every frequency."""
-    geometry_doubt: float = 5e-4
+    geometry_position_std: float = 5e-4
     """Metres: surfaces are displaced if the spectra are explained best by a larger position_std than this."""
     geometry_tx: int = 640
     """Transmitters used at first for the alignment; all of them once surfaces are roughly in place."""
@@ -113,11 +144,11 @@ class SearchConfig:
     """Prior standard deviation of the displacement of surfaces, metres."""
     geometry_spectra: int = 64
     """Training spectra used to name materials between alignment steps."""
-    placement_spectra: int = 96
+    position_std_spectra: int = 96
     """Training spectra used to estimate the remaining position_std."""
-    clutter_spectra: int = 1024
+    absorption_spectra: int = 1024
     """Training spectra used to decide whether an absorption grid fitted to the others is kept; 0 disables the grid."""
-    clutter_steps: int = 800
+    absorption_steps: int = 800
     """Steps of the fit of the absorption grid."""
 
 
@@ -147,7 +178,7 @@ class Settings:
     loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     density: DensityConfig | None = None
     """Settings of density control, for fields that use it."""
-    search: SearchConfig | None = None
+    calibration: CalibrationConfig | None = None
     """Settings of the calibration, for fields that use it."""
 
 
@@ -195,7 +226,8 @@ def to_dict(settings: Settings, field_name: str) -> dict[str, Any]:
 
 
 def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
-    """Returns settings from the values of `to_dict`; `default` provides the types of all sections.
+    """Returns settings from the values of `to_dict`, also of an earlier version (`RENAMED`); `default` provides the types of
+    all sections.
 
     Raises:
         UserError: names are unknown or missing, as in settings of another version.
@@ -209,7 +241,12 @@ def from_dict(values: Any, default: Settings, field_name: str) -> Settings:
 
     types = {name: type(section) for name, section in sections(default, field_name).items()}
     try:
-        built = {name: build(types[name], value) for name, value in values.items()}
+        present: dict[str, dict[str, Any]] = {RENAMED.get(section, section): {} for section in values}
+        for section, content in values.items():
+            for name, value in content.items():
+                section_now, _, name_now = present_name(f"{section}.{name}").partition(".")
+                present[section_now][name_now] = value
+        built = {name: build(types[name], value) for name, value in present.items()}
         return from_sections({name: built[name] for name in types}, default, field_name)
     except (KeyError, TypeError, AttributeError) as error:
         raise UserError(f"these settings belong to another version of wbgs-jax ({error}); start a new run") from error
@@ -242,7 +279,7 @@ def check(settings: Settings) -> None:
         "loop.checkpoint-every": loop.checkpoint_every,
         "loop.keep-checkpoints": loop.keep_checkpoints,
     }
-    check_positive(positive | ({"search.spectra": settings.search.spectra} if settings.search else {}))
+    check_positive(positive | ({"calibration.spectra": settings.calibration.spectra} if settings.calibration else {}))
     if optim.steps % loop.epoch_steps:
         raise UserError(
             f"--optim.steps {optim.steps} is not a multiple of --loop.epoch-steps {loop.epoch_steps}; change one of them"

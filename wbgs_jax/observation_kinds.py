@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Shaped
 
 from wbgs_jax.radio.array import PAS_SHAPE, cbf, normalise, snapshot_to_pas
-from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
+from wbgs_jax.radio.channel import NO_PATH_DB, received_power_db
 
 Observations = dict[str, Shaped[Array, "n ..."]]
 """Observations of n links by the name of their kind (`KINDS`)."""
@@ -174,8 +174,8 @@ register_kind(
         np.float32,
         (),
         to_power=lambda values: values,
-        measured=lambda values: values > NOT_HEARD_DB,  # False for NaN
+        measured=lambda values: values > NO_PATH_DB,  # False for NaN
         fault=lambda values: "infinity, or only NaN" if np.isinf(values).any() or np.isnan(values).all() else "",
-        silence=NOT_HEARD_DB,
+        silence=NO_PATH_DB,
     )
 )

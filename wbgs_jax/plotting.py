@@ -25,7 +25,7 @@ from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.inference.quantities import QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 
 SHOWN = 6
 """Maximum number of spectra in a plot."""
@@ -277,7 +277,7 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
     values = answer[quantity.outputs[0]]
     if quantity.name == "best-beam":
         return answer["beam_azimuth_deg"][values]
-    received = values > NOT_HEARD_DB if quantity.name == "power" else np.ones(values.shape, bool)
+    received = values > NO_PATH_DB if quantity.name == "power" else np.ones(values.shape, bool)
     drawn = quantity.scale * np.where(received, values, np.nan)
     return drawn[..., 0] if drawn.ndim > 3 else drawn
 

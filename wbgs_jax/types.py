@@ -246,6 +246,13 @@ def make_receiver(
         unit: of the element positions.
         pattern: of the elements, a name in `radio.antenna.PATTERN_EXPONENTS`; empty for isotropic ones.
         antenna: of the elements, instead of a named pattern.
+
+    Returns:
+        The receiver, without a leading axis.
+
+    Example:
+        >>> make_receiver([0.0, 0.0, 2.0]).element_positions.shape
+        (16, 3)
     """
     elements = planar_array() if element_positions is None else element_positions
     quaternion = np.asarray(orientation, np.float64)
@@ -255,7 +262,14 @@ def make_receiver(
 
 
 def stack_receivers(receivers: list[Receiver]) -> Receiver:
-    """Returns receivers with the same number of elements and the same unit as one, with a leading axis on every array."""
+    """Returns receivers with the same number of elements and the same unit as one, with a leading axis on every array.
+
+    Args:
+        receivers: one or more.
+
+    Returns:
+        The receivers, with arrays (r, ...).
+    """
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
 
 
@@ -272,11 +286,18 @@ def make_query(
     """Returns a float32 batch of queries from positions (b, 3) or (3,) in metres and frequencies (b,) or one in hertz.
 
     Args:
-        tx_position: of the transmitters, world frame.
+        tx_position: of the transmitters, world frame, metres.
         frequency_hz: of the carriers.
         orientation, velocity, antenna, power_dbm: further properties of the transmitters (`Transmitter`), one for all or one
             for each.
         time_s: seconds, one or (b,).
+
+    Returns:
+        Positions (b, 3) and frequencies (b,), and the further properties with a leading axis of b where given.
+
+    Example:
+        >>> make_query([[0.0, 0.0, 1.5], [1.0, 0.0, 1.5]], 28e9).frequency_hz.shape
+        (2,)
     """
     position = jnp.atleast_2d(jnp.asarray(tx_position, jnp.float32))
     count = position.shape[0]

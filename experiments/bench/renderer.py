@@ -18,8 +18,8 @@ import numpy as np
 
 from experiments.bench.scene import Scene, random_scene, temporary_gb
 from experiments.bench.timing import Effort, Report, Seconds, interleaved
-from wbgs_jax import project
 from wbgs_jax._util.cli import say
+from wbgs_jax.splat import project
 
 HAS_TORCH = importlib.util.find_spec("torch") is not None
 OTHERS_LARGEST = 8

@@ -8,17 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wbgs_jax import (
-    Gaussians,
-    Receiver,
-    TileLimits,
-    geometry_plan,
-    make_receiver,
-    measure_limits,
-    project,
-    render_dense,
-    render_splats,
-)
+from wbgs_jax import Receiver, make_receiver
+from wbgs_jax.splat import Gaussians, TileLimits, geometry_plan, measure_limits, project, render_dense, render_splats
 from wbgs_jax.splat.tiles import Tiling
 
 Render = Callable[[Gaussians, Float[Array, "n b"], Float[Array, "n b"]], Float[Array, "b 90 360"]]

@@ -31,13 +31,13 @@ from wbgs_jax.training.loop import make_hook
 
 ON_THE_HOST = frozenset(
     """
-    arrivals_anywhere arrivals_of as_deepmimo at_receiver cell_means choose_beams export_field from_arrivals
-    from_deepmimo from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings load_room
-    load_scene load_trained load_walls locator make_mesh make_query make_receiver make_surface map_queries measure_limits
-    pas_directions place_reflector planar_array power_at_users power_predictor power_when_turned predict_blocks
-    predict_many predict_map predictor pytree rank_beams read_deepmimo read_gaussians register save_paths
-    save_scene scene_of_paths scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers
-    surface_from_points write_deepmimo write_gaussians
+    as_deepmimo at_receiver cell_means choose_beams default_field evaluate export_field field_names from_deepmimo
+    from_paths from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings
+    load_room load_scene load_trained load_walls make_locator make_mesh make_power_predictor make_predictor make_query
+    make_receiver make_surface map_queries measure_limits pas_directions place_reflector planar_array power_at_users
+    power_when_rotated predict_blocks predict_isotropic_paths predict_many predict_map predict_paths pytree rank_beams
+    read_deepmimo read_gaussians register save_paths save_scene scene_of_paths scene_of_sionna scene_of_snapshots
+    score_beams stack_receivers static straight_powers surface_from_points train_field write_deepmimo write_gaussians
     """.split()  # noqa: SIM905
 )
 """Public functions that read and write, prepare, or make the functions that a device runs: those of the predictors, the locator
@@ -65,7 +65,7 @@ class Case:
     """A pure function with its inputs."""
 
     name: str
-    """As `wb` has it: render_splats, wave.snapshots; of a field its part behind a colon: loss:hybrid."""
+    """As `wb` has it: render_splats, coherent.snapshots; of a field its part behind a colon: loss:hybrid."""
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     differentiable: tuple[int, ...] = (0,)
@@ -112,12 +112,12 @@ def splatting(small: bool = False) -> list[Case]:
     planned = scene.gaussians, scene.attenuation, scene.signal
 
     def plan(gaussians: Any) -> Any:
-        made = wb.geometry_plan(gaussians, receiver, limits)
+        made = wb.splat.geometry_plan(gaussians, receiver, limits)
         jobs = [leaf for name, leaf in vars(made.jobs).items() if name not in ("slots", "tiling")]
         return made.splats, jobs  # the slots are zeros on a CPU
 
     return [
-        Case("project", lambda gaussians: wb.project(gaussians, receiver), (scene.gaussians,)),
+        Case("project", lambda gaussians: wb.splat.project(gaussians, receiver), (scene.gaussians,)),
         Case("geometry_plan", plan, (scene.gaussians,)),
         Case("render_splats", scene.tiled, planned, (0, 1, 2)),
         Case("render_dense", scene.dense, planned, (0, 1, 2)),
@@ -127,7 +127,7 @@ def splatting(small: bool = False) -> list[Case]:
 def _small_scene() -> RandomScene:
     """Returns few Gaussians, whose tile lists have no room to spare: every job in them is interpreted, empty or not."""
     scene = random_scene(FEW, B, SEED)
-    jobs = wb.geometry_plan(scene.gaussians, scene.receiver, scene.limits).jobs
+    jobs = wb.splat.geometry_plan(scene.gaussians, scene.receiver, scene.limits).jobs
     exact = {"entries": int(jobs.required_entries), "jobs": int(jobs.required_jobs)}
     return dataclasses.replace(scene, limits=dataclasses.replace(scene.limits, **exact))
 
@@ -135,17 +135,17 @@ def _small_scene() -> RandomScene:
 def arrays() -> list[Case]:
     """Returns the cases of the antenna array."""
     rng = np.random.default_rng(SEED)
-    elements = jnp.asarray(wb.planar_array(), jnp.float32)
+    elements = jnp.asarray(wb.radio.planar_array(), jnp.float32)
     snapshot = jnp.asarray(rng.normal(size=(B, 16)) + 1j * rng.normal(size=(B, 16)), jnp.complex64)
-    directions = jnp.asarray(wb.pas_directions()[::9, ::9].reshape(-1, 3), jnp.float32)
+    directions = jnp.asarray(wb.radio.pas_directions()[::9, ::9].reshape(-1, 3), jnp.float32)
 
     def beams(elements: Any, snapshot: Any) -> Any:
-        return wb.cbf(snapshot, wb.steering_vector(elements, directions))
+        return wb.radio.cbf(snapshot, wb.radio.steering_vector(elements, directions))
 
     return [
-        Case("steering_vector", wb.steering_vector, (elements, directions), (0, 1)),
+        Case("steering_vector", wb.radio.steering_vector, (elements, directions), (0, 1)),
         Case("cbf", beams, (elements, snapshot)),
-        Case("snapshot_to_pas", lambda elements, snapshot: wb.snapshot_to_pas(snapshot, elements), (elements, snapshot)),
+        Case("snapshot_to_pas", lambda elements, snapshot: wb.radio.snapshot_to_pas(snapshot, elements), (elements, snapshot)),
     ]
 
 
@@ -155,9 +155,9 @@ def images() -> list[Case]:
     pictures = [jnp.asarray(rng.random((B, 90, 360)), jnp.float32) for _ in range(2)]
     places, hertz = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32), jnp.asarray([1e9, 28e9, 94e9], jnp.float32)
     return [
-        Case("positional_encoding", lambda places: wb.positional_encoding(places, 6), (places,)),
-        Case("frequency_encoding", lambda hertz: wb.frequency_encoding(hertz, 6), (hertz,)),
-        Case("image_loss", lambda seen, truth: wb.image_loss(seen, truth, 0.2), tuple(pictures)),
+        Case("positional_encoding", lambda places: wb.fields.positional_encoding(places, 6), (places,)),
+        Case("frequency_encoding", lambda hertz: wb.fields.frequency_encoding(hertz, 6), (hertz,)),
+        Case("image_loss", lambda seen, truth: wb.fields.image_loss(seen, truth, 0.2), tuple(pictures)),
         Case("ssim", wb.ssim, tuple(pictures)),
     ]
 
@@ -177,7 +177,7 @@ def statistics() -> list[Case]:
     return [
         Case("expected_ssim", lambda pas, power: wb.expected_ssim(spectra, pas, query, power), (pas, power), (0, 1)),
         Case("expected_power", lambda power: wb.expected_power(powers, power, query, jnp.zeros(3)), (power,)),
-        *(Case(name, getattr(wb, name), (jnp.linspace(-120.0, -60.0, 40).reshape(2, 20),)) for name in AIMS),
+        *(Case(name, getattr(wb.applications, name), (jnp.linspace(-120.0, -60.0, 40).reshape(2, 20),)) for name in AIMS),
     ]
 
 
@@ -188,7 +188,7 @@ def powers() -> list[Case]:
     measured = -40 - 20 * np.log10(np.linalg.norm(places[:, None] - receivers, axis=-1)) + rng.normal(size=(40, 3))
     readings = Readings(places, measured, np.ones((40, 3)), (), receivers)
     asked = jnp.asarray(rng.uniform(0, 8, (5, 3)), jnp.float32)
-    return [Case("received_power", functools.partial(wb.received_power, wb.learn_map(readings)), (asked,))]
+    return [Case("received_power", functools.partial(wb.power_map.received_power, wb.power_map.learn_map(readings)), (asked,))]
 
 
 @dataclass(frozen=True)
@@ -276,13 +276,13 @@ def _pas(of: Known) -> Callable[..., Any]:
 def _render(of: Known) -> Callable[..., Any]:
     plan = of.field.plan(of.params, of.dataset.receiver())
     query = lambda place: wb.make_query(place, of.query.frequency_hz)  # noqa: E731
-    return lambda params, place: of.field.render(params, plan, query(place))._replace(paths=None)  # `wave.channels` has them
+    return lambda params, place: of.field.render(params, plan, query(place))._replace(paths=None)  # a case of its own
 
 
 def _of_waves(of: Known) -> list[Case]:
     """Returns what only the coherent field says: snapshots and paths."""
     plan = of.field.plan(of.params, of.dataset.receiver())
-    says = {"wave.snapshots": wb.wave.snapshots, "wave.channels": wb.wave.channels}
+    says = {"coherent.snapshots": wb.coherent.snapshots, "coherent.channels": wb.coherent.channels}
     return [Case(name, lambda params, do=do: do(params, plan, of.query), (of.params,)) for name, do in says.items()]
 
 
@@ -291,16 +291,16 @@ def asking() -> list[Case]:
     of, receiver, query = known("wideband"), known("wideband").dataset.receiver(), known("wideband").query
     trained = TrainedField(RunConfig("1", "wideband", "smoke", SEED, None, of.settings), of.field, of.params, 0, 0.0)
     box = np.array([query.tx_position[0] - 0.6, query.tx_position[0] + 0.6])
-    locate = wb.locator(trained, [1e9], receivers=[receiver], box=box, step=0.6, starts=2)
+    locate = wb.applications.make_locator(trained, [1e9], receivers=[receiver], box=box, step=0.6, starts=2)
     observed = jnp.asarray(np.asarray(of.dataset.pas(of.dataset.train[:1])))
-    spectra, power = wb.predictor(trained, receiver), wb.power_predictor(trained, receiver)
+    spectra, power = wb.make_predictor(trained, receiver), wb.make_power_predictor(trained, receiver)
     waves = known("wave")
-    served = wb.power_at_users(waves.field, waves.params, np.asarray(receiver.position)[None], [1e9])
+    served = wb.applications.power_at_users(waves.field, waves.params, np.asarray(receiver.position)[None], [1e9])
 
     return [
-        Case("predictor:made", spectra, (query.tx_position, query.frequency_hz)),
-        Case("power_predictor:made", power, (query.tx_position, query.frequency_hz)),
-        Case("locator:loss", lambda places: locate.loss(places, observed, 0.1), (query.tx_position,)),
+        Case("make_predictor:made", spectra, (query.tx_position, query.frequency_hz)),
+        Case("make_power_predictor:made", power, (query.tx_position, query.frequency_hz)),
+        Case("make_locator:loss", lambda places: locate.loss(places, observed, 0.1), (query.tx_position,)),
         Case("power_at_users:made", lambda places: served(places, 0.1), (query.tx_position,), costly=True),
     ]
 
@@ -308,21 +308,21 @@ def asking() -> list[Case]:
 def placing() -> list[Case]:
     """Returns the cases of antennas and reflectors that look for their place: of powers that are known in closed form."""
     box, user = np.array([[0.0, 0.0, 1.0], [1.2, 1.2, 1.6]]), jnp.array([3.0, 1.0, 1.0])
-    plate = wb.reflector([0.0, 0.0, 2.0], np.array([[4.0, 1.0, 1.2], [3.0, -2.0, 1.0]]), (1.0, 0.5), [28e9])
+    plate = wb.applications.make_reflector([0.0, 0.0, 2.0], np.array([[4.0, 1.0, 1.2], [3.0, -2.0, 1.0]]), (1.0, 0.5), [28e9])
 
     def antenna(user: Any) -> Any:
-        return wb.place_antenna(
+        return wb.applications.place_antenna(
             lambda places, blur: -jnp.sum((places - user) ** 2, -1)[:, None] - blur, box, step=0.6, starts=1
         )
 
     def turned(user: Any) -> Any:
-        return wb.turn_array(lambda angles: -jnp.sum((angles - user[:2]) ** 2, -1)[:, None], starts=1)
+        return wb.applications.rotate_array(lambda angles: -jnp.sum((angles - user[:2]) ** 2, -1)[:, None], starts=1)
 
     return [
-        Case("boresight_quaternion", wb.boresight_quaternion, (jnp.array([0.4, -0.2]),)),
-        Case("reflector:power_db", plate.power_db, (jnp.array([[2.0, 0.5, 1.5, 2.5, 0.1]]),)),
+        Case("boresight_quaternion", wb.applications.boresight_quaternion, (jnp.array([0.4, -0.2]),)),
+        Case("make_reflector:power_db", plate.power_db, (jnp.array([[2.0, 0.5, 1.5, 2.5, 0.1]]),)),
         Case("place_antenna", antenna, (user,), ()),
-        Case("turn_array", turned, (user,), ()),
+        Case("rotate_array", turned, (user,), ()),
     ]
 
 

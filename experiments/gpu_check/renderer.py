@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from experiments.bench.scene import Scene, random_scene, temporary_gb
 from experiments.bench.timing import Effort, interleaved
 from experiments.gpu_check.record import Record, rounded
-from wbgs_jax import geometry_plan, render_splats
+from wbgs_jax.splat import geometry_plan, render_splats
 from wbgs_jax.splat.composite import assembled, blend_by_tiles, blend_by_tiles_backward
 from wbgs_jax.splat.render import GeometryPlan
 

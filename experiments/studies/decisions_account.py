@@ -20,7 +20,7 @@ from experiments.results import FOLDER, read_rows
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.splits import hold_out_validation
 from wbgs_jax.evaluation.report import environment
@@ -58,16 +58,16 @@ class Decision(NamedTuple):
 
 def decisions() -> tuple[Decision, ...]:
     """Returns all of them."""
-    search = SearchConfig()
+    own = CalibrationConfig()
     return (
-        Decision("antennas", search.antenna_spectra, "train", search.antenna_sure, "isotropic, or what the data name"),
-        Decision("materials, against the list", search.spectra, "train", search.sure, "an entry of the list"),
-        Decision("thicknesses", search.thickness_spectra, "train", thickness.SURE, "the thickness that is there"),
-        Decision("absent bodies", search.absent_spectra, "train", obstacles.SURE, "all bodies are there"),
-        Decision("idealisations", search.ideal_spectra, "train", propagation_options.SURE, "as ray tracers have it"),
-        Decision("array tuning", search.tuning_spectra // 2, "train", array_gains.SURE, "elements in tune"),
-        Decision("geometry", search.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
-        Decision("clutter", search.clutter_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
+        Decision("antennas", own.antenna_spectra, "train", own.antenna_n_sigma, "isotropic, or what the data name"),
+        Decision("materials, against the list", own.spectra, "train", own.n_sigma, "an entry of the list"),
+        Decision("thicknesses", own.thickness_spectra, "train", thickness.SURE, "the thickness that is there"),
+        Decision("absent bodies", own.spurious_spectra, "train", obstacles.SURE, "all bodies are there"),
+        Decision("idealisations", own.propagation_spectra, "train", propagation_options.SURE, "as ray tracers have it"),
+        Decision("array tuning", own.array_gain_spectra // 2, "train", array_gains.SURE, "elements in tune"),
+        Decision("geometry", own.geometry_snapshots, "train", alignment.SURE, "the mesh as it is"),
+        Decision("clutter", own.absorption_spectra, "train", obstacles.SURE_OF_CLUTTER, "none"),
         Decision("noise floor", mixture.COMPARED, "validation", mixture.SURE, "none"),
         Decision("shares of the two fields by query", VALIDATION_LINKS, "validation", 1.0, "one share for all"),
         Decision("residuals of neighbours", fit_kriging.SCORED, "validation", fit_kriging.SURE, "not used; never below 20"),

@@ -46,9 +46,9 @@ def settings_of(field: str, batch: int = BATCH) -> Settings:
 
 def without_search(settings: Settings) -> Settings:
     """Returns settings under which materials start alike."""
-    if settings.search is None:
+    if settings.calibration is None:
         return settings
-    return changed(settings, {"search": {"rounds": 0, "antenna_rounds": 0, "geometry": False}})
+    return changed(settings, {"calibration": {"rounds": 0, "antenna_rounds": 0, "geometry": False}})
 
 
 def data() -> Dataset:

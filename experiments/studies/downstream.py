@@ -28,11 +28,12 @@ import tyro
 from jaxtyping import Float, Int
 
 from experiments.results import FOLDER
-from wbgs_jax import load_trained, locator, score_beams
+from wbgs_jax import load_trained
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
+from wbgs_jax.applications import make_locator, score_beams
 from wbgs_jax.applications.locate import pooled
 from wbgs_jax.commands import train as training
 from wbgs_jax.data.dataset import Dataset
@@ -47,8 +48,9 @@ SETTINGS = (
     *("--field", "wave", "--preset", "cpu", "--no-neighbours"),
     *("--wave.specular-tried", "256", "--wave.specular-kept", "48"),
     *("--wave.diffracted-tried", "512", "--wave.diffracted-kept", "96"),
-    *("--search.no-geometry", "--search.antenna-rounds", "0", "--search.rounds", "1", "--search.spectra", "64"),
-    *("--search.glance", "16", "--search.ideal-spectra", "24", "--search.placement-spectra", "24"),
+    *("--calibration.no-geometry", "--calibration.antenna-rounds", "0", "--calibration.rounds", "1"),
+    *("--calibration.spectra", "64", "--calibration.glance", "16"),
+    *("--calibration.propagation-spectra", "24", "--calibration.position-std-spectra", "24"),
     *("--optim.steps", "100", "--optim.min-steps", "100"),
     *("--loop.evaluate-every", "100", "--loop.evaluate-spectra", "16"),
 )
@@ -153,7 +155,7 @@ def localisation(trained: TrainedField, dataset: Dataset, chosen: Int[np.ndarray
     links = links_of(dataset, chosen, command.ghz)
     truth = dataset.tx_positions[links[:, 0]]
     begin = time.perf_counter()
-    locate = locator(trained, np.array(command.ghz) * 1e9, step=command.step)
+    locate = make_locator(trained, np.array(command.ghz) * 1e9, step=command.step)
     locate.answers.block_until_ready()
     grid = time.perf_counter() - begin
     found = [locate(dataset.pas(row)) for row in links]

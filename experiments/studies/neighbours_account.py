@@ -39,10 +39,10 @@ def main() -> None:
         trained = load_trained(run)
         dataset = trained.dataset()
         asked, _ = evaluate(trained, dataset)
-        alone, _ = evaluate(dataclasses.replace(trained, neighbours=None), dataset)
+        alone, _ = evaluate(dataclasses.replace(trained, correction=None), dataset)
         scores = {"alone": alone, "asked": asked, "nearest_tx": asked["baselines"]["nearest_tx"]}
         report[dataset.name] = {name: {key: values[key] for key in KEPT} for name, values in scores.items()}
-        report[dataset.name]["neighbours"] = 0 if trained.neighbours is None else len(trained.neighbours.images)
+        report[dataset.name]["neighbours"] = 0 if trained.correction is None else len(trained.correction.images)
         print(dataset.name, report[dataset.name], file=sys.stderr)
     write_json(command.out / "neighbours.json", report | environment())
 

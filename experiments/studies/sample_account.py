@@ -18,23 +18,24 @@ import tyro
 from jaxtyping import Float
 
 from experiments.results import FOLDER
-from wbgs_jax import WaveConfig, make_mesh, metrics, pas_directions, wave
+from wbgs_jax import coherent, make_mesh, metrics
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.files import write_json
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.data import Dataset, load_dataset
 from wbgs_jax.data.scene import in_sight
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import Observation
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
+from wbgs_jax.radio import pas_directions
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.training.batches import training_data
 from wbgs_jax.training.calibration.antennas import AntennaReport, search_antennas
 from wbgs_jax.training.calibration.objective import make_scores
 from wbgs_jax.types import Links
 
-CONFIG = WaveConfig(
+CONFIG = coherent.WaveConfig(
     diffracted_tried=1, diffracted_kept=1, mirror_areas=(0.01, 0.2), permittivity=2.73, conductivity=0.0085, slope=0.94
 )
 AT_ONCE = 50
@@ -56,7 +57,7 @@ def main() -> None:
     """Entry point."""
     command = tyro.cli(Command, prog="python -m experiments.studies.sample_account")
     dataset = load_dataset(command.data)
-    field = wave.make_field(make_mesh(dataset), CONFIG)
+    field = coherent.make_field(make_mesh(dataset), CONFIG)
     prepared = field.prepare(dataset.links(np.arange(len(dataset))), dataset.receivers)
     _, first = np.unique(dataset.tx_index, return_index=True)
     kind = np.asarray(prepared.paths.specular.interaction_type)
@@ -86,7 +87,7 @@ def main() -> None:
         print(f"{name:28}", row, file=sys.stderr)
 
 
-def keep(prepared: wave.PreparedPaths, mask: np.ndarray) -> wave.PreparedPaths:
+def keep(prepared: coherent.PreparedPaths, mask: np.ndarray) -> coherent.PreparedPaths:
     """Returns the paths of a mask alone."""
     specular = prepared.paths.specular
     specular = dataclasses.replace(specular, alive=specular.alive & jnp.asarray(mask))
@@ -99,16 +100,16 @@ def observe(field: Calibratable, params: Any, plan: Any, links: Links) -> Observ
     return field.render(params, plan, links)._replace(paths=None)
 
 
-def antennas(dataset: Dataset, field: Calibratable, prepared: wave.PreparedPaths) -> tuple[AntennaReport, Any]:
+def antennas(dataset: Dataset, field: Calibratable, prepared: coherent.PreparedPaths) -> tuple[AntennaReport, Any]:
     """Returns the antennas that explain the training spectra best, and parameters that hold them."""
     data, params = training_data(dataset), field.init(jax.random.key(0))
     some = np.random.default_rng(0).permutation(dataset.train)[:SEARCHED]
     score = make_scores(field, prepared, data, jnp.asarray(some, jnp.int32))
-    params, report = search_antennas(params, score, dataset.tx_index[some], SearchConfig(), known_elements=False)
+    params, report = search_antennas(params, score, dataset.tx_index[some], CalibrationConfig(), known_elements=False)
     return report, params
 
 
-def ssim(dataset: Dataset, field: Calibratable, prepared: wave.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
+def ssim(dataset: Dataset, field: Calibratable, prepared: coherent.PreparedPaths, params: Any) -> Float[np.ndarray, " n"]:
     """Returns the score of every spectrum."""
     found = []
     plan = field.plan(params, dataset.receiver(), prepared)

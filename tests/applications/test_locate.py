@@ -12,7 +12,7 @@ from builders.synthetic import RX
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.applications.locate import Locator, locator
+from wbgs_jax.applications.locate import Locator, make_locator
 from wbgs_jax.applications.multistart import best_apart, gauss_newton, grid_over, in_blocks
 from wbgs_jax.fields.mixture import with_floor
 from wbgs_jax.types import Query, make_receiver
@@ -27,12 +27,12 @@ RECEIVERS = [make_receiver(place) for place in (RX, [-2.5, 2.0, 1.5], [2.8, -1.8
 
 @pytest.fixture(scope="module")
 def by_spectra() -> Locator:
-    return locator(trained(), HZ, box=BOX)
+    return make_locator(trained(), HZ, box=BOX)
 
 
 @pytest.fixture(scope="module")
 def by_power() -> Locator:
-    return locator(trained(), HZ[:1], "power", RECEIVERS, BOX)
+    return make_locator(trained(), HZ[:1], "power", RECEIVERS, BOX)
 
 
 def somewhere(rng, n=5):
@@ -75,7 +75,7 @@ def test_places_are_found_again_from_powers_at_four_receivers(by_power, rng):
 
 
 def test_an_unknown_transmitted_power_does_not_matter(rng):
-    asked = locator(trained(), HZ[:1], "power", RECEIVERS, BOX, known_power=False)
+    asked = make_locator(trained(), HZ[:1], "power", RECEIVERS, BOX, known_power=False)
     place = somewhere(rng, 1)[0]
     losses = [
         asked.loss(jnp.asarray(place[None]), said(asked, place, "power_db").reshape(-1) + gain, 0.0)[0] for gain in (0.0, 17.0)
@@ -93,7 +93,7 @@ class Noisy(MirrorsField):
 
 def test_an_observation_has_the_noise_that_the_data_had(rng):
     field = Noisy()
-    asked = locator(trained_field(field, field.init(jax.random.key(0))), HZ, box=BOX, step=2.0)
+    asked = make_locator(trained_field(field, field.init(jax.random.key(0))), HZ, box=BOX, step=2.0)
     place = jnp.asarray(somewhere(rng, 1)[0])
     clean = said(asked, place, "pas")[0]
     losses = [float(asked.loss(place[None], observed, 0.0)[0]) for observed in (with_floor(clean, 0.1), clean)]
@@ -102,7 +102,7 @@ def test_an_observation_has_the_noise_that_the_data_had(rng):
 
 @pytest.mark.heavy
 def test_front_and_back_of_a_planar_array_sound_alike(rng):
-    asked = locator(
+    asked = make_locator(
         trained(images=1), HZ, box=[RX - np.array([2, 1.5, 0.5]), RX + np.array([2, 1.5, 1.3])], step=1.0, starts=24
     )
     place = (RX + rng.uniform([0.8, -1, 0.2], [1.5, 1, 1.0])).astype(np.float32)
@@ -116,7 +116,7 @@ def test_front_and_back_of_a_planar_array_sound_alike(rng):
 
 @pytest.mark.parametrize("what, quantity", [("spectra", "pas"), ("snapshots", "snapshots"), ("power", "power_db")])
 def test_slopes_of_the_loss_are_differences(rng, what, quantity):
-    asked = locator(trained(), HZ, what, box=BOX, step=2.0)
+    asked = make_locator(trained(), HZ, what, box=BOX, step=2.0)
     place, aside = (jnp.asarray(x) for x in somewhere(rng, 2))
     observed = said(asked, place, quantity)[0]
     way = jnp.asarray(rng.normal(size=3), jnp.float32)
@@ -146,9 +146,9 @@ def test_an_observation_of_another_shape_and_a_field_that_knows_too_little_are_r
     with pytest.raises(ValueError, match="expected"):
         by_spectra(jnp.zeros((3, 90, 360)))
     with pytest.raises(UserError, match="is not enough"):
-        locator(trained(), HZ[:1], "power", RECEIVERS[:1], BOX, known_power=False)
+        make_locator(trained(), HZ[:1], "power", RECEIVERS[:1], BOX, known_power=False)
     with pytest.raises(UserError, match="predicts no snapshots"):
-        locator(trained_field(Silent(), None), HZ, "snapshots")
+        make_locator(trained_field(Silent(), None), HZ, "snapshots")
 
 
 class Silent(MirrorsField):

@@ -9,7 +9,7 @@ from builders.rooms import METAL, SPEED_OF_LIGHT, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import power_at_users
-from wbgs_jax.applications.reflector import place_reflector, plate_axes, reflector, straight_powers
+from wbgs_jax.applications.reflector import make_reflector, place_reflector, plate_axes, straight_powers
 
 HZ = 10e9
 WAVELENGTH = SPEED_OF_LIGHT / HZ
@@ -31,28 +31,28 @@ FACING = pose(2, 2, 1.5, -np.pi / 2, 0)
 
 
 def test_a_large_plate_is_a_mirror():
-    plate = reflector(TX, USER, (4.0, 4.0), HZ)
+    plate = make_reflector(TX, USER, (4.0, 4.0), HZ)
     assert float(plate.power_db(FACING)[0, 0]) == pytest.approx(friis(np.hypot(4, 4)), abs=0.02)
 
 
 def test_a_small_plate_obeys_the_radar_equation():
-    plate = reflector(TX, USER, (0.02, 0.015), HZ)
+    plate = make_reflector(TX, USER, (0.02, 0.015), HZ)
     leg, cosine = np.hypot(2, 2), np.sqrt(0.5)
     expected = 20 * np.log10(0.02 * 0.015 * cosine / (4 * np.pi * leg**2))
     assert float(plate.power_db(FACING)[0, 0]) == pytest.approx(expected, abs=0.1)
 
 
 def test_at_the_edge_of_a_plate_half_of_the_amplitude_is_left_and_behind_it_nothing():
-    plate = reflector(TX, USER, (2.0, 4.0), HZ)
+    plate = make_reflector(TX, USER, (2.0, 4.0), HZ)
     over = plate.power_db(jnp.concatenate([FACING, FACING.at[:, 0].add(1.0), FACING.at[:, 0].add(2.0)]))[:, 0]
     assert float(over[0] - over[1]) == pytest.approx(20 * np.log10(2), abs=0.05) and over[2] < over[1] - 60
-    between = reflector(TX, USER, (2.0, 4.0), HZ).power_db(pose(2, 0, 1.5, 0, 0))  # the ends on either side
+    between = make_reflector(TX, USER, (2.0, 4.0), HZ).power_db(pose(2, 0, 1.5, 0, 0))  # the ends on either side
     assert float(between[0, 0]) < -200
 
 
 def test_aimed_plates_send_the_wave_to_their_user(rng):
     users = rng.uniform([3, -1, 0.5], [5, 1, 2], (3, 3))
-    plate, centres = reflector(TX, users, (3.0, 3.0), HZ), jnp.asarray(rng.uniform(*BOX, (4, 3)), jnp.float32)
+    plate, centres = make_reflector(TX, users, (3.0, 3.0), HZ), jnp.asarray(rng.uniform(*BOX, (4, 3)), jnp.float32)
     poses = plate.aimed(centres)
     for k in range(4):
         for user in range(3):
@@ -63,7 +63,7 @@ def test_aimed_plates_send_the_wave_to_their_user(rng):
 
 
 def test_slopes_are_differences(rng):
-    plate = reflector(TX, np.array([USER, [3.5, 0.5, 1.0]]), (0.5, 0.4), HZ)
+    plate = make_reflector(TX, np.array([USER, [3.5, 0.5, 1.0]]), (0.5, 0.4), HZ)
     near = FACING[0] + jnp.asarray(rng.uniform(-0.03, 0.03, 5), jnp.float32)
     way = jnp.asarray(rng.normal(size=5), jnp.float32)
     for blur in (0.0, 0.2):
@@ -74,7 +74,7 @@ def test_slopes_are_differences(rng):
 
 def test_the_best_plate_halves_the_angle(rng):
     """For one user the law of reflection; and no other pose of thousands serves it better."""
-    plate = reflector(TX, USER, (0.5, 0.4), HZ)
+    plate = make_reflector(TX, USER, (0.5, 0.4), HZ)
     found = place_reflector(plate, [-150.0], BOX, step=0.8)
     best = found.place[0]
     normal = np.asarray(plate_axes(best[3:])[0])
@@ -93,7 +93,7 @@ def test_a_plate_is_what_a_field_with_the_same_plate_in_its_mesh_says():
     screen, plate = rectangle((2, -1, 0), (0, 2, 0), (0, 0, 3)), rectangle((1.2, 2, 0.7), (1.6, 0, 0), (0, 0, 1.6))
     fields = [field_of(parts, (0, 0, 1), conductivity=METAL, **SMALL)[:2] for parts in ([screen], [screen, plate])]
     powers = [float(jax.jit(power_at_users(*field, USER, HZ))(TX[None], 0.05)[0, 0]) for field in fields]
-    ours = reflector(TX, USER, (1.6, 1.6), HZ, *fields[0])
+    ours = make_reflector(TX, USER, (1.6, 1.6), HZ, *fields[0])
     alone = 10 * np.log10(10 ** (powers[1] / 10) - 10 ** (powers[0] / 10))
     assert float(jax.jit(ours.power_db)(FACING)[0, 0]) == pytest.approx(alone, abs=0.3)
     assert powers[1] > powers[0] + 10
@@ -103,7 +103,7 @@ def test_a_plate_is_what_a_field_with_the_same_plate_in_its_mesh_says():
 
 def test_what_cannot_reflect_or_tell_is_refused():
     with pytest.raises(UserError, match="two sides above 0"):
-        reflector(TX, USER, (0.0, 1.0), HZ)
+        make_reflector(TX, USER, (0.0, 1.0), HZ)
     field = Blind()
     with pytest.raises(UserError, match="predicts no paths"):
-        reflector(TX, USER, (1.0, 1.0), HZ, field, field.init(jax.random.key(0)))
+        make_reflector(TX, USER, (1.0, 1.0), HZ, field, field.init(jax.random.key(0)))

@@ -8,8 +8,13 @@ from builders.mirrors import Blind
 from builders.rooms import METAL, field_of, rectangle
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.applications.array_orientation import arrivals_anywhere, boresight_quaternion, power_when_turned, turn_array
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.applications.array_orientation import (
+    boresight_quaternion,
+    power_when_rotated,
+    predict_isotropic_paths,
+    rotate_array,
+)
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.types import Query, make_receiver
 
@@ -28,7 +33,7 @@ def waves(directions, powers):
     k = jnp.asarray(directions, jnp.float32)[:, None]
     amplitude = jnp.sqrt(jnp.asarray(powers, jnp.float32))[:, None].astype(jnp.complex64)
     polarised = jnp.stack([amplitude, jnp.zeros_like(amplitude)], -1)
-    return Arrivals(amplitude, k, jnp.ones(amplitude.shape), polarised=polarised)
+    return Paths(amplitude, k, jnp.ones(amplitude.shape), polarised=polarised)
 
 
 def test_elements_look_where_the_angles_say_and_stay_level(rng):
@@ -40,19 +45,19 @@ def test_elements_look_where_the_angles_say_and_stay_level(rng):
 
 def test_one_wave_is_heard_best_by_elements_that_look_at_it(rng):
     for angles in rng.uniform([-3, -0.9], [3, 0.9], (3, 2)):
-        found = turn_array(power_when_turned(waves(looking(angles)[None], [1e-6])))
+        found = rotate_array(power_when_rotated(waves(looking(angles)[None], [1e-6])))
         assert np.linalg.norm(looking(np.asarray(found.place[0], float)) - looking(angles)) < 0.03
         assert -float(found.loss[0]) == pytest.approx(-60 + 8, abs=0.02)
 
 
 def test_two_equal_waves_are_heard_best_from_between():
     angles = np.array([[-0.4, 0.0], [0.6, 0.0]])
-    found = turn_array(power_when_turned(waves(np.array([looking(a) for a in angles]), [1e-6, 1e-6])))
+    found = rotate_array(power_when_rotated(waves(np.array([looking(a) for a in angles]), [1e-6, 1e-6])))
     np.testing.assert_allclose(found.place[0], [0.1, 0.0], atol=0.03)
 
 
 def test_slopes_are_differences(rng):
-    powers = power_when_turned(waves(np.array([looking(a) for a in rng.uniform(-0.5, 0.5, (3, 2))]), [1e-6, 2e-6, 1e-7]))
+    powers = power_when_rotated(waves(np.array([looking(a) for a in rng.uniform(-0.5, 0.5, (3, 2))]), [1e-6, 2e-6, 1e-7]))
     angles, way = (jnp.asarray(rng.uniform(-0.3, 0.3, 2), jnp.float32) for _ in range(2))
     slope = jax.grad(lambda x: powers(x[None]).sum())(angles) @ way
     ahead, behind = (powers((angles + h * way)[None]).sum() for h in (0.01, -0.01))
@@ -65,7 +70,9 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
     """Before a wall of metal, with the powers of both waves added."""
     field, params, _ = field_of([rectangle((-5, 2, -5), (15, 0, 0), (0, 0, 15))], RX, conductivity=METAL, **SMALL)
     tx, angles = rng.uniform([1, -1, 0.5], [3, 1, 2], (2, 3)), np.array([0.3, 0.2])
-    turned = power_when_turned(arrivals_anywhere(field, params, RX, tx, HZ), pattern)(jnp.asarray(angles[None], jnp.float32))
+    turned = power_when_rotated(predict_isotropic_paths(field, params, RX, tx, HZ), pattern)(
+        jnp.asarray(angles[None], jnp.float32)
+    )
     orientation = boresight_quaternion(jnp.asarray(angles, jnp.float32))
     plan = field.plan(params, make_receiver(RX, orientation, np.zeros((1, 3)), pattern=pattern))
     query = Query(jnp.asarray(tx, jnp.float32), jnp.full(2, HZ, jnp.float32))
@@ -76,10 +83,10 @@ def test_a_turned_receiver_of_a_field_hears_the_same(rng, pattern):
 def test_a_frequency_in_gigahertz_is_refused():
     field, params, _ = field_of([rectangle((-5, 2, -5), (15, 0, 0), (0, 0, 15))], RX, conductivity=METAL, **SMALL)
     with pytest.raises(ValueError, match="in hertz"):
-        arrivals_anywhere(field, params, RX, [[1.0, 0, 0]], 28.0)
+        predict_isotropic_paths(field, params, RX, [[1.0, 0, 0]], 28.0)
 
 
 def test_a_field_without_paths_turns_nothing():
     field = Blind()
     with pytest.raises(UserError, match="predicts no paths"):
-        arrivals_anywhere(field, field.init(jax.random.key(0)), RX, [[1.0, 0, 0]], HZ)
+        predict_isotropic_paths(field, field.init(jax.random.key(0)), RX, [[1.0, 0, 0]], HZ)

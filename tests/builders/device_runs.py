@@ -41,7 +41,7 @@ def answers(result: TrainResult, dataset: Dataset) -> list[np.ndarray]:
     query, receiver = dataset.query(np.arange(ASKED)), dataset.receiver()
     links = predictor.observe_links(result.field, result.params, dataset, np.arange(ASKED)).pas
     queries = predictor.observe_queries(trained, receiver, query, "pas")
-    ask = predictor.predictor(trained, receiver)
+    ask = predictor.make_predictor(trained, receiver)
     return [links, queries, batching.predict_many(ask, query.tx_position, query.frequency_hz)]
 
 

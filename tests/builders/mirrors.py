@@ -12,7 +12,7 @@ from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.paths import REFLECTED
 from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
-from wbgs_jax.radio.channel import Arrivals, decibels
+from wbgs_jax.radio.channel import Paths, decibels
 
 BEAMS = beams_of(planar_array())
 
@@ -59,7 +59,7 @@ class MirrorsField(Field):
         amplitude = jnp.sqrt(power).astype(jnp.complex64)
         polarised = jnp.stack([amplitude, 0 * amplitude], -1)
         met = jnp.zeros((*distance.shape, 5), jnp.int32).at[:, 1:, 0].set(REFLECTED)
-        paths = Arrivals(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
+        paths = Paths(amplitude, away / distance[..., None], distance, polarised=polarised, interaction=met)
         return Observation(pas, waves[:, 0], decibels(power.sum(-1)), covariance, paths)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from wbgs_jax.config import DensityConfig, LoopConfig, OptimConfig, SearchConfig, Settings, changed
+from wbgs_jax.config import CalibrationConfig, DensityConfig, LoopConfig, OptimConfig, Settings, changed
 from wbgs_jax.data import scene_dataset
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene_file import SceneFile
@@ -105,8 +105,8 @@ def tiny_settings(field_name: str = "wideband", **changes) -> Settings:
         optim=OptimConfig(steps=8, batch=2, final_fraction=1.0, virtual=0.0),
         loop=LoopConfig(epoch_steps=2, evaluate_every=8, evaluate_spectra=2, checkpoint_every=4, keep_checkpoints=2),
         density=DensityConfig(every=0, reset_every=0) if "density" in hooks else None,
-        search=SearchConfig(rounds=0, antenna_rounds=0, absent_spectra=0, geometry=False, clutter_spectra=0)
-        if "search" in hooks
+        calibration=CalibrationConfig(rounds=0, antenna_rounds=0, spurious_spectra=0, geometry=False, absorption_spectra=0)
+        if "calibration" in hooks
         else None,
     )
     return changed(settings, changes)

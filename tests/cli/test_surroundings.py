@@ -13,7 +13,7 @@ from builders.synthetic import tiny_dataset
 from builders.untrained import make_run, make_trained
 
 from wbgs_jax._util import compilation
-from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.training.run_folder import load_trained, open_run
 
 ODD = os.fsdecode(b"r\xe9sum\xe9")
@@ -57,7 +57,7 @@ def test_a_user_without_a_home(monkeypatch):
 
 
 def test_a_predictor_goes_to_another_process(tmp_path):
-    ask = predictor(make_trained(tmp_path / "run"), tiny_dataset().receiver())
+    ask = make_predictor(make_trained(tmp_path / "run"), tiny_dataset().receiver())
     again = pickle.loads(pickle.dumps(ask))
     places, hertz = np.array([[1, 0.5, 1.5], [2, 1, 1]], np.float32), np.float32(28e9)
     np.testing.assert_array_equal(again(places, hertz), ask(places, hertz))

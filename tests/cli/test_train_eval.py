@@ -1,8 +1,10 @@
 """The two command lines, from a scene file and from a folder of spectra, and what they say when something is wrong."""
 
+import dataclasses
 import json
 import shutil
 
+import jax
 import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call, in_a_process
@@ -11,6 +13,7 @@ from builders.toys import RippleField, registered
 from PIL import Image
 
 import wbgs_jax
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands import evaluate as eval_command
 from wbgs_jax.commands import train as train_command
 from wbgs_jax.data.image_folder import export_layout
@@ -235,6 +238,43 @@ def test_what_cannot_be_trained(tmp_path, scene, layout, arguments, words):
     result = call(train_command.main, "--out", tmp_path / "run", *(places.get(word, word) for word in arguments))
     assert_error_for_people(result, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_training_from_python_is_the_command(tmp_path, layout, trained):
+    changes = {name: {key.replace("-", "_"): value for key, value in values.items()} for name, values in SHORT.items()}
+    found = wbgs_jax.train_field(layout, tmp_path / "run", "ripple", "smoke", changes, seed=0)
+    by_command = load_trained(trained["--data"])
+    assert found.config == dataclasses.replace(by_command.config, source=found.config.source)
+    for a, b in zip(jax.tree.leaves(found.params), jax.tree.leaves(by_command.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"field": "telepathy"}, "telepathy"),
+        ({"preset": "warp"}, "no preset 'warp'"),
+        ({"settings": {"optim": {"stepz": 3}}}, "a setting is unknown .*stepz"),
+        ({"settings": {"optics": {"steps": 3}}}, "a setting is unknown .*optics"),
+        ({"seeds": 3}, "an option is unknown .*seeds"),
+    ],
+)
+def test_what_cannot_be_trained_from_python(tmp_path, scene, given, words):
+    with pytest.raises(UserError, match=words):
+        wbgs_jax.train_field(scene, tmp_path / "run", **({"field": "ripple", "preset": "smoke"} | given))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_earlier_names_of_options_mean_the_present_ones():
+    common = ["--scene", "1", "--field", "wave", "--preset", "smoke"]
+    earlier = ["--search.sure", "3", "--search.geometry", "--search.geometry-doubt=0.01", "--search.clutter-spectra", "9"]
+    present = [
+        *("--calibration.n-sigma", "3", "--calibration.geometry"),
+        *("--calibration.geometry-position-std", "0.01", "--calibration.absorption-spectra", "9"),
+    ]
+    found = train_command.parse([*common, *earlier])
+    assert found == train_command.parse([*common, *present])
+    assert (found[1].calibration.n_sigma, found[1].calibration.geometry) == (3, True)
 
 
 def test_a_released_scene_is_not_hidden_by_a_folder_of_its_name(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from wbgs_jax.evaluation.score import watch
 from wbgs_jax.fields import losses
 from wbgs_jax.observation_kinds import KINDS, Kind, only_kind, power_of, spectra_of
 from wbgs_jax.radio.array import snapshot_to_pas
-from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
+from wbgs_jax.radio.channel import NO_PATH_DB, received_power_db
 from wbgs_jax.training.batches import check_data, training_data
 from wbgs_jax.training.loop import train
 
@@ -31,7 +31,7 @@ RSSI = Kind(
     np.float32,
     (2,),
     to_power=lambda values: values[..., 0],
-    measured=lambda values: values[..., 0] > NOT_HEARD_DB,
+    measured=lambda values: values[..., 0] > NO_PATH_DB,
     fault=lambda values: "" if (values[..., 1] > 0).all() else "standard deviations that are not positive",
 )
 

@@ -14,7 +14,8 @@ from builders.synthetic import tiny_dataset, tiny_settings
 
 from experiments.bench import __main__ as command_line
 from experiments.bench import quality, queries, renderer, timing, training
-from wbgs_jax import Gaussians, make_receiver, project, render_dense
+from wbgs_jax import make_receiver
+from wbgs_jax.splat import Gaussians, project, render_dense
 
 FIELDS = {"value", "unit", "direction", "spread", "tolerance"}
 EXPECTED = {

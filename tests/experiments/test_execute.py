@@ -166,9 +166,9 @@ def test_a_change_is_trained_by_the_same_runner(command, models, monkeypatch):
     assert runner.run(wanted, command) == []
     (still, plain), (moved, same), (_, without) = seen
     assert np.abs(moved - still).max() > 1e-3 and same == plain
-    assert plain.search.rounds > without.search.rounds == 0
+    assert plain.calibration.rounds > without.calibration.rounds == 0
     settings = [result_of(command, job).values["settings"] for job in wanted]
-    assert settings[1] == settings[0] | {"mesh.displacement": 0.03} and settings[2] == settings[0] | {"search.rounds": 0}
+    assert settings[1] == settings[0] | {"mesh.displacement": 0.03} and settings[2] == settings[0] | {"calibration.rounds": 0}
 
 
 def test_scores_find_their_transmitters_and_frequencies_in_any_order(rng):

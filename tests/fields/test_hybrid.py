@@ -268,7 +268,7 @@ def test_the_presets_have_both_fields_settings():
     wave, wideband = get_field("wave").presets, get_field("wideband").presets
     for name, settings in HybridField.presets.items():
         assert (settings.field.wave, settings.field.wideband) == (wave[name].field, wideband[name].field)
-        assert settings.search == wave[name].search and settings.density == wideband[name].density
+        assert settings.calibration == wave[name].calibration and settings.density == wideband[name].density
     phase_blind = dataclasses.replace(settings.field.wave, coherent=False)
     with pytest.raises(UserError, match="no coherent field to mix"):
         dataclasses.replace(settings.field, wave=phase_blind).check("hybrid")

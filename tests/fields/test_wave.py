@@ -20,11 +20,11 @@ from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import coherent as wave
 from wbgs_jax.fields import get_field
 from wbgs_jax.fields.coherent import WaveConfig, WaveField
-from wbgs_jax.inference.predictor import observe_links, predictor
+from wbgs_jax.inference.predictor import make_predictor, observe_links
 from wbgs_jax.inference.trained_field import at_receiver
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions, snapshot_to_pas
-from wbgs_jax.radio.channel import NOT_HEARD_DB, received_power_db
+from wbgs_jax.radio.channel import NO_PATH_DB, received_power_db
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import Batch, make_query, make_receiver
 
@@ -37,7 +37,7 @@ SHEETS = [*room(), rectangle((3, 0, 0), (0, 2.5, 0), (0, 0, 3))]
 """Without edges that diffract: what does not ask for them compiles in a third of the time."""
 STEPS = 100
 SETTINGS = {"wave.materials-lr": 0.08, "optim.steps": STEPS, "optim.min-steps": STEPS, "optim.final-fraction": 0.1}
-SETTINGS |= {"loop.evaluate-spectra": 0, "search.rounds": 0} | {f"wave.{n.replace('_', '-')}": v for n, v in SMALL.items()}
+SETTINGS |= {"loop.evaluate-spectra": 0, "calibration.rounds": 0} | {f"wave.{n.replace('_', '-')}": v for n, v in SMALL.items()}
 
 
 def scene_of_known_materials(n_tx=16):
@@ -124,7 +124,7 @@ def test_the_commands_answer(folder, trained, tmp_path):
     dataset = trained.dataset()
     seen, index = observe(trained.field, trained.params, dataset), 7 * len(FREQUENCIES) + np.array([1, 3])
     tx = dataset.tx_positions[index[0]]
-    spectra = np.asarray(predictor(trained)(tx, FREQUENCIES[[1, 3]]))
+    spectra = np.asarray(make_predictor(trained)(tx, FREQUENCIES[[1, 3]]))
     assert spectra.shape == (2, 90, 360)
     np.testing.assert_allclose(spectra.max((1, 2)), 1, rtol=1e-6)
     np.testing.assert_allclose(seen.pas[index], spectra, atol=1e-3)
@@ -159,7 +159,7 @@ def test_another_receiver_is_asked_as_if_it_were_the_only_one(folder, trained, t
     assert np.linalg.norm(at_home.orientation - receiver.orientation) > 0.05
     for own, said in zip(jax.tree.leaves(away), jax.tree.leaves(elsewhere), strict=True):
         np.testing.assert_allclose(own, said, atol=1e-7)
-    assert there.confidence is None and there.power_confidence is None and there.neighbours is None
+    assert there.intervals is None and there.power_intervals is None and there.correction is None
     plan = trained.field.plan(trained.params, elsewhere)
     expected = np.asarray(jax.jit(wave.snapshots)(trained.params, plan, make_query([tx], [3e9])))
     out, words = tmp_path / "snapshot.npz", [",".join(map(str, place)) for place in ([*rx, *turn], tx)]
@@ -329,7 +329,7 @@ def test_a_link_without_any_path_has_gradients(coherent):
     seen = jax.jit(WaveField.render)(field, params, field.plan(params, plan.receiver, nothing), links)
     assert not np.any(seen.pas)
     if coherent:
-        assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NOT_HEARD_DB
+        assert not np.any(seen.snapshots) and float(seen.power_db[0]) <= NO_PATH_DB
 
 
 @pytest.mark.heavy

@@ -13,7 +13,7 @@ from wbgs_jax.data.scene import surface_from_points
 from wbgs_jax.fields import wideband
 from wbgs_jax.fields.em_features import DARK, MAX_ATTENUATION, given_features
 from wbgs_jax.fields.wideband import INITIAL_ATTENUATION, WidebandField, make_field
-from wbgs_jax.splat import TileLimits, slots_for
+from wbgs_jax.splat.tiles import TileLimits, slots_for
 from wbgs_jax.types import Query, make_query, make_receiver
 
 N, B = 30, 3

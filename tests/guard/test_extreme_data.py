@@ -19,7 +19,14 @@ from wbgs_jax.data.scene_file import SceneFile, save_scene
 SMALL = ["--optim.steps", "4", "--optim.batch", "2"]
 SMALL += ["--loop.epoch-steps", "2", "--loop.evaluate-every", "4", "--loop.evaluate-spectra", "2"]
 FIELDS = {
-    "hybrid": ["--no-neighbours", "--search.geometry", "--search.tuning-spectra", "48", "--search.absent-spectra", "48"],
+    "hybrid": [
+        "--no-neighbours",
+        "--calibration.geometry",
+        "--calibration.array-gain-spectra",
+        "48",
+        "--calibration.spurious-spectra",
+        "48",
+    ],
     "wideband": [],
 }
 """The default and the paper's; the others are parts of these. Neighbours are asked of one, for they take as long again."""

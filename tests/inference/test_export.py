@@ -27,7 +27,7 @@ from wbgs_jax.fields.hybrid import HybridConfig
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.intervals import write_confidence
-from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.queries import Product
 from wbgs_jax.training.fit_intervals import learn_confidence
@@ -54,7 +54,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def predict(trained):
-    return predictor(trained, tiny_dataset().receiver())
+    return make_predictor(trained, tiny_dataset().receiver())
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_all_outputs_and_their_intervals(tmp_path):
     params = field.init(jax.random.key(1))
     confidence, of_powers = learn_confidence(field, params, dataset, None)
     whole = dataclasses.replace(
-        make_trained(tmp_path), field=field, params=params, confidence=confidence, power_confidence=of_powers
+        make_trained(tmp_path), field=field, params=params, intervals=confidence, power_intervals=of_powers
     )
     export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
     found = load_exported(tmp_path / "field.zip").observe(TX, HZ)
@@ -276,7 +276,7 @@ def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
     field = get_field(name).build(config, DatasetScene(dataset), 0)
     whole = dataclasses.replace(make_trained(tmp_path), field=field, params=field.init(jax.random.key(1)))
     export_field(whole, tmp_path / "field.zip", platforms=("cpu",), dataset=dataset)
-    exported, predict = load_exported(tmp_path / "field.zip"), predictor(whole, dataset.receiver())
+    exported, predict = load_exported(tmp_path / "field.zip"), make_predictor(whole, dataset.receiver())
     expected = predict(TX, HZ)
     np.testing.assert_allclose(exported(TX, HZ), expected, atol=2e-4)
     np.testing.assert_allclose(exported(TX[:1], HZ[:1]), expected[:1], atol=2e-4)

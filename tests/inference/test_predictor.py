@@ -13,7 +13,7 @@ from wbgs_jax.fields import get_field
 from wbgs_jax.fields.base import portable
 from wbgs_jax.inference import predictor as inference
 from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
-from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.types import Query, make_query, make_receiver
 
@@ -33,7 +33,7 @@ def plan(trained):
 
 @pytest.fixture(scope="module")
 def predict(trained):
-    return predictor(trained)
+    return make_predictor(trained)
 
 
 _render = jax.jit(lambda field, *args: field.render(*args).pas)
@@ -85,8 +85,8 @@ def test_gradients_are_those_of_the_field(trained, plan, predict, rng):
 def test_another_receiver(trained, predict):
     """Where the array stands and how it is turned is part of the function."""
     scene = tiny_scene()
-    same = predictor(trained, make_receiver(scene.rx_position[0], scene.rx_orientation[0], scene.element_positions[0]))
-    moved = predictor(trained, make_receiver(RX + np.array([0, 0.5, 0])))
+    same = make_predictor(trained, make_receiver(scene.rx_position[0], scene.rx_orientation[0], scene.element_positions[0]))
+    moved = make_predictor(trained, make_receiver(RX + np.array([0, 0.5, 0])))
     before = predict(TX, HZ)
     np.testing.assert_allclose(same(TX, HZ), before, atol=1e-6)
     assert np.abs(moved(TX, HZ) - before).max() > 1e-3

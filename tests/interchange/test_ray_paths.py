@@ -11,11 +11,11 @@ from jaxtyping import TypeCheckError
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene_file import TEST, load_scene, save_scene
-from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_arrivals, from_sionna, load_paths, save_paths
+from wbgs_jax.interchange.ray_paths import SPECULAR, RayPaths, from_paths, from_sionna, load_paths, save_paths
 from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
 from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array, steering_vector
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 
 
 def assert_same(one, other):
@@ -85,13 +85,13 @@ def line_of_sight(tx, rx, frequency_hz):
     one = {"amplitude": amplitude, "direction": -direction, "length": length, "departure": direction, "arrival": direction}
     met = np.zeros((len(tx), 1, 5), int)
     points = np.repeat(np.asarray(tx, float)[:, None, None], 5, -2)
-    return Arrivals(**{name: values[:, None] for name, values in one.items()}, interaction=met, points=points)
+    return Paths(**{name: values[:, None] for name, values in one.items()}, interaction=met, points=points)
 
 
 def test_snapshots_of_a_line_of_sight(rng, tmp_path):
     """What an array sees of plane waves from where the transmitters stand."""
     tx, rx, elements = rng.uniform(1, 4, (9, 3)), np.array([0.0, 0, 1]), planar_array(2, 2)
-    paths = [from_arrivals(line_of_sight(tx, rx, f), tx, rx, f) for f in (5e9, 2e9)]
+    paths = [from_paths(line_of_sight(tx, rx, f), tx, rx, f) for f in (5e9, 2e9)]
     np.testing.assert_allclose(
         np.abs(paths[0].a[0, :, 0]), SPEED_OF_LIGHT / 5e9 / (4 * np.pi * np.linalg.norm(tx - rx, axis=1))
     )
@@ -122,7 +122,7 @@ def test_places_of_interactions():
     points = np.array([[0, 0, 0], [1, 0, 0], [2, 2, 0], [3, 3, 3], [3, 3, 3]], float)[None, None]
     met = np.array([[[REFLECTED, TRANSMITTED, REFLECTED, 0, 0]]])
     arrived = line_of_sight(np.zeros((1, 3)), np.array([3.0, 3, 3]), 1e9)._replace(interaction=met, points=points)
-    paths = from_arrivals(arrived, np.zeros((1, 3)), np.array([3.0, 3, 3]), 1e9)
+    paths = from_paths(arrived, np.zeros((1, 3)), np.array([3.0, 3, 3]), 1e9)
     assert paths.interactions[0, 0, 0, 0] == SPECULAR
     np.testing.assert_array_equal(paths.vertices[0, 0, 0, 0], [1, 0, 0])
     assert np.isnan(paths.vertices[[1, 3, 4]]).all()

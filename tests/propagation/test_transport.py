@@ -259,7 +259,7 @@ def test_curved_waves_are_those_of_a_point_source_and_plane_ones_their_limit(rng
         direction = rng.normal(size=(5, 3))
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
         k = 2 * np.pi * frequency / SPEED_OF_LIGHT
-        arrived = channel.Arrivals(*map(jnp.asarray, (np.exp(-1j * k * far) / far * np.ones(5), direction, np.full(5, far))))
+        arrived = channel.Paths(*map(jnp.asarray, (np.exp(-1j * k * far) / far * np.ones(5), direction, np.full(5, far))))
         distance = np.linalg.norm(far * direction[:, None] - elements, axis=-1)
         exact = np.exp(-1j * k * distance) / distance
         curved = element_voltages(arrived, receiver, jnp.asarray(frequency), 1.0)

@@ -6,14 +6,14 @@ import numpy as np
 
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, cbf, pas_directions, planar_array, steering_vector
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 
 k_factor_db, delay_spread_s, correlation = map(jax.jit, (channel.k_factor_db, channel.delay_spread_s, channel.correlation))
 
 
 def arrivals(amplitudes, lengths):
     amplitude = jnp.asarray(amplitudes, jnp.complex64)
-    return Arrivals(amplitude, jnp.zeros((*amplitude.shape, 3)), jnp.asarray(lengths, jnp.float32))
+    return Paths(amplitude, jnp.zeros((*amplitude.shape, 3)), jnp.asarray(lengths, jnp.float32))
 
 
 def test_a_plane_wave_has_its_power_and_the_full_gain():
@@ -60,3 +60,67 @@ def test_angles_of_two_paths_spread_by_their_separation():
         np.testing.assert_allclose(spread[0], np.degrees(np.sqrt(-2 * np.log(np.cos(a)))), rtol=1e-3)
         assert spread[1] < 0.1
     assert abs(np.degrees(np.sqrt(-2 * np.log(np.cos(apart[0])))) - 5) < 0.05
+
+
+BAND = 400e6
+
+
+def link(rng, count=5):
+    """Two links of random paths within 100 ns; the second one lacks a path."""
+    amplitude = (rng.normal(size=(2, count)) + 1j * rng.normal(size=(2, count))) * 1e-5
+    amplitude[1, -1] = 0
+    return arrivals(amplitude, rng.uniform(3, 30, (2, count)))
+
+
+def delays(paths):
+    tau = np.asarray(paths.length, np.float64) / SPEED_OF_LIGHT
+    return tau - np.min(np.where(np.asarray(paths.amplitude) != 0, tau, np.inf), -1, keepdims=True)
+
+
+def test_the_impulse_response_has_the_amplitudes_and_delays_of_the_paths(rng):
+    paths = link(rng)
+    a, tau = paths.cir(normalize_delays=False)
+    assert a is paths.amplitude
+    np.testing.assert_allclose(tau[0], np.asarray(paths.length[0]) / SPEED_OF_LIGHT, rtol=1e-6)
+    assert tau[1, -1] == -1 and (tau[1, :-1] > 0).all()
+    _, later = paths.cir()
+    np.testing.assert_allclose(later[0], delays(paths)[0], atol=1e-14)
+    assert later[0].min() == later[1, :-1].min() == 0 and later[1, -1] == -1
+    a, tau = arrivals([0, 0], [3, 4]).cir()
+    assert not a.any() and (tau == -1).all()
+
+
+def test_the_frequency_response_is_the_sum_over_paths(rng):
+    paths, offsets = link(rng), np.linspace(-BAND / 2, BAND / 2, 33)
+    expected = np.einsum("bk,bkf->bf", paths.amplitude, np.exp(-2j * np.pi * delays(paths)[..., None] * offsets))
+    found = jax.jit(Paths.cfr)(paths, jnp.asarray(offsets, jnp.float32))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    later = paths.cfr(jnp.asarray(offsets), normalize_delays=False)
+    turns = offsets[None] * np.min(np.asarray(paths.length)[:, :4], -1, keepdims=True) / SPEED_OF_LIGHT
+    np.testing.assert_allclose(later[0], (expected * np.exp(-2j * np.pi * turns))[0], atol=1e-8)
+
+
+def test_taps_are_samples_of_the_band_limited_response(rng):
+    """Their Fourier transform is the frequency response within the band; a path between two samples has a slow sinc."""
+    paths, index = link(rng), np.arange(-4000, 4001)
+    taps = np.asarray(paths.taps(BAND, -4000, 4000))
+    offsets = np.linspace(-0.4, 0.4, 9) * BAND
+    spectrum = taps @ np.exp(-2j * np.pi * index[:, None] * offsets / BAND)
+    np.testing.assert_allclose(spectrum, paths.cfr(jnp.asarray(offsets)), atol=2e-8)
+    assert paths.taps(BAND).shape == (2, 6 + 1 + int(np.ceil(BAND * delays(paths)[:, :4].max())) + 6)
+
+
+def test_a_path_on_a_sample_is_one_tap():
+    paths = arrivals([[2.0, 1.0j]], [[3.0, 3.0 + 3 * SPEED_OF_LIGHT / BAND]])
+    np.testing.assert_allclose(paths.taps(BAND, -1, 4), [[0, 2, 0, 0, 1j, 0]], atol=1e-5)
+    np.testing.assert_allclose(paths.taps(BAND, -1, 4, normalize=True)[0, 1], 2 / np.sqrt(5), rtol=1e-5)
+
+
+def test_normalised_channels_have_the_energy_of_one_sample(rng):
+    paths, offsets = link(rng), jnp.linspace(-BAND / 2, BAND / 2, 64)
+    faint = paths._replace(amplitude=paths.amplitude * 1e-20)  # whose squares underflow
+    for some in (paths, faint):
+        np.testing.assert_allclose(jnp.mean(jnp.abs(some.cfr(offsets, normalize=True)) ** 2, -1), 1, rtol=1e-5)
+        np.testing.assert_allclose(jnp.sum(jnp.abs(some.taps(BAND, normalize=True)) ** 2, -1), 1, rtol=1e-5)
+    silent = arrivals([[0.0, 0.0]], [[3.0, 4.0]])
+    assert not silent.cfr(offsets, normalize=True).any() and not silent.taps(BAND, normalize=True).any()

@@ -80,7 +80,7 @@ def no_work(monkeypatch, place):
     monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.LoadedField.answer", reached)
     monkeypatch.setattr("wbgs_jax.inference.cached_field.make_cached", lambda *_: None)
     monkeypatch.setattr("wbgs_jax.inference.radio_map.evaluate_plane", reached)
-    monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.arrivals_of", reached)
+    monkeypatch.setattr("wbgs_jax.inference.evaluate_quantities.predict_paths", reached)
     monkeypatch.setattr("wbgs_jax.viewer.app.Viewer", reached)
     monkeypatch.setattr(measure, "learn_map", reached)
     monkeypatch.setattr(measure, "use_compilation_cache", lambda: None)

@@ -22,16 +22,13 @@ from wbgs_jax.splat import (
     Splats,
     TileLimits,
     composite,
-    fit_limits,
     geometry_plan,
-    grown_slots,
     measure_limits,
     project,
     render_dense,
     render_splats,
-    slots_for,
 )
-from wbgs_jax.splat.tiles import CHUNK, CPU_TILING, GPU_TILING, build_tile_jobs
+from wbgs_jax.splat.tiles import CHUNK, CPU_TILING, GPU_TILING, build_tile_jobs, fit_limits, grown_slots, slots_for
 from wbgs_jax.types import Gaussians, Receiver, make_receiver
 
 EXACT = 1e-12

@@ -20,7 +20,14 @@ SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
     optim={"steps": 4, "min_steps": 4},
-    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absent_spectra": 768, "absent_glance": 24, "tuning_spectra": 0},
+    calibration={
+        "spectra": 80,
+        "rounds": 1,
+        "antenna_rounds": 0,
+        "spurious_spectra": 768,
+        "spurious_glance": 24,
+        "array_gain_spectra": 0,
+    },
 )
 
 
@@ -74,7 +81,7 @@ def test_what_is_there_stays(truth, tmp_path, rng):
     """Though all of it stands two centimetres off, and walls are then often worse than none at the lowest frequency."""
     wrong = [part.copy().apply_translation(rng.normal(0, 0.02, 3)) for part in PARTS]
     run, told = told_of(wrong, truth, tmp_path)
-    _, same, report = search_absent(of_concrete(run), told, SETTINGS.search)
+    _, same, report = search_absent(of_concrete(run), told, SETTINGS.calibration)
     assert same is told and not report.centres and report.after == report.before
 
 
@@ -84,7 +91,7 @@ def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
     run, told = told_of([*PARTS, anything(rng)], truth, tmp_path)
     params = of_concrete(run)
     high = dataclasses.replace(told, spectra=told.spectra[told.frequency_hz() > 2e9])
-    assert not len(absent_movers(params, high, SETTINGS.search))
+    assert not len(absent_movers(params, high, SETTINGS.calibration))
     ghosts = [jnp.concatenate([leaf, jnp.zeros((2, 3))]) for leaf in (run.field.motion.shift, run.field.motion.turn)]
     motion = dataclasses.replace(run.field.motion, shift=ghosts[0], turn=ghosts[1])
     mover = jnp.where(run.field.facets.mover > 0, run.field.facets.mover + 2, 0)  # two have lost all of their facets
@@ -93,7 +100,7 @@ def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
     field = dataclasses.replace(run.field, facets=facets, motion=motion)
     large = dataclasses.replace(told, field=field, prepared=dataclasses.replace(run.prepared, surfaces=surfaces))
     np.testing.assert_array_equal(
-        absent_movers(params, large, SETTINGS.search), absent_movers(params, told, SETTINGS.search) + 2
+        absent_movers(params, large, SETTINGS.calibration), absent_movers(params, told, SETTINGS.calibration) + 2
     )
 
 

@@ -19,7 +19,7 @@ N_TX = 30
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 64, "specular_kept": 32, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"spectra": 60, "antenna_spectra": 60, "antenna_rounds": 2, "rounds": 0},
+    calibration={"spectra": 60, "antenna_spectra": 60, "antenna_rounds": 2, "rounds": 0},
 )
 
 
@@ -35,7 +35,7 @@ def searched(run, known_elements=False, **antennas):
     data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:60]
     score = make_scores(run.field, run.prepared, data, jnp.asarray(spectra))
     tx = run.dataset.tx_index[spectra]
-    return search_antennas(run.state.params, score, tx, SETTINGS.search, known_elements)
+    return search_antennas(run.state.params, score, tx, SETTINGS.calibration, known_elements)
 
 
 @pytest.mark.heavy

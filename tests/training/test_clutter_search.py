@@ -26,7 +26,7 @@ SETTINGS = tiny_settings(
         "clutter_cell": 0.3,
     },
     optim={"steps": 4, "min_steps": 4},
-    search={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "clutter_spectra": 160, "clutter_steps": 400},
+    calibration={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absorption_spectra": 160, "absorption_steps": 400},
 )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands_and_read_again(tmp
 def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
     run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
     params, told = told_of(PARTS, heard_in(run, of_concrete(run), PLACES, FREQUENCIES), tmp_path / "same")
-    same, still, report = search_clutter(params, told, SETTINGS.search, rng)
+    same, still, report = search_clutter(params, told, SETTINGS.calibration, rng)
     assert not report.taken
     assert same is params
     assert still is told
@@ -91,7 +91,7 @@ def test_grids_without_cells_are_refused(values):
 def test_few_transmitters_prove_nothing(tmp_path, rng):
     nothing = np.ones((12, 1, len(FREQUENCIES), 16), np.complex64)
     params, told = told_of(PARTS, nothing, tmp_path, n_tx=12)
-    assert search_clutter(params, told, SETTINGS.search, rng) == (params, told, None)
+    assert search_clutter(params, told, SETTINGS.calibration, rng) == (params, told, None)
 
 
 @pytest.mark.heavy

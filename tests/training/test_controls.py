@@ -14,15 +14,15 @@ from builders.synthetic import tiny_dataset
 from builders.toys import RippleConfig, RippleField, metrics_of, registered, toy_settings
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.config import DensityConfig, SearchConfig
+from wbgs_jax.config import CalibrationConfig, DensityConfig
 from wbgs_jax.fields import Group
 from wbgs_jax.training import loop
 from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.training.loop import Run, train
 from wbgs_jax.training.step import loss_and_gradients, run_epoch
 
-DENSITY, SEARCH = DensityConfig(every=4), SearchConfig(rounds=1)
-SETTINGS = dataclasses.replace(toy_settings(), density=DENSITY, search=SEARCH)
+DENSITY, SEARCH = DensityConfig(every=4), CalibrationConfig(rounds=1)
+SETTINGS = dataclasses.replace(toy_settings(), density=DENSITY, calibration=SEARCH)
 SEED = 0
 
 
@@ -31,7 +31,7 @@ class LayeredField(RippleField):
     """Its levels are a sum of layers, whose number hooks change; its groups are called as its parameters are."""
 
     name: ClassVar[str] = "layered"
-    hooks: ClassVar = ("density", "search")
+    hooks: ClassVar = ("density", "calibration")
 
     def init(self, key):
         return {"layers": 0.1 * jax.random.normal(key, (2, 4)), "tilt": jnp.zeros(3)}
@@ -121,7 +121,7 @@ def toys():
 def use(monkeypatch, density, search=Watching):
     """Other hooks under the names that settings know."""
     monkeypatch.setitem(loop.HOOKS, "density", density)
-    monkeypatch.setitem(loop.HOOKS, "search", search)
+    monkeypatch.setitem(loop.HOOKS, "calibration", search)
 
 
 def entries(folder):

@@ -31,7 +31,7 @@ SETTINGS = tiny_settings(
         "slope": 0.0,
     },
     optim={"steps": 20, "min_steps": 20},
-    search={"spectra": 48, "rounds": 3, "antenna_rounds": 0, "tuning_spectra": 0},
+    calibration={"spectra": 48, "rounds": 3, "antenna_rounds": 0, "array_gain_spectra": 0},
 )
 
 
@@ -45,12 +45,12 @@ def run_on(untrained, tmp_path):
     """Gives a run, before its first step, on snapshots that these materials (eps_r, c, d) made, as ray tracers have them or
     in some ways as nature has them."""
 
-    def make(materials, search=SETTINGS.search, natural=(), **start):
+    def make(materials, search=SETTINGS.calibration, natural=(), **start):
         run = object.__new__(Run)
         run.__dict__.update(untrained.__dict__)
         run.folder = tmp_path
-        run.settings = dataclasses.replace(changed(SETTINGS, {"field": start}), search=search)
-        run.hooks = (search_module.Search(search),)
+        run.settings = dataclasses.replace(changed(SETTINGS, {"field": start}), calibration=search)
+        run.hooks = (search_module.Calibration(search),)
         field = dataclasses.replace(run.field, config=run.settings.field)
         params = field.init(run.key)
         columns = [jnp.asarray(column, jnp.float32) for column in np.array(materials).T]
@@ -114,7 +114,7 @@ def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_
     materials = with_entry(run.state.params.materials, 0, "concrete")
     params = dataclasses.replace(run.state.params, materials=materials)
     told = Told(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
-    found, _ = search_materials(params, told, 48, dataclasses.replace(SETTINGS.search, rounds=1))
+    found, _ = search_materials(params, told, 48, dataclasses.replace(SETTINGS.calibration, rounds=1))
     np.testing.assert_allclose(found.materials.log_susceptibility[0], np.log(ITU_MATERIALS[expected][0] - 1), rtol=1e-5)
 
 
@@ -155,7 +155,7 @@ def test_it_finds_out_what_ray_tracers_leave_out(natural, run_on, tmp_path, rng)
 
 @pytest.mark.parametrize("steps, rounds", [(5, 3), (0, 0)])
 def test_it_is_left_out_when_resumed_or_switched_off(steps, rounds, run_on, tmp_path):
-    search = dataclasses.replace(SETTINGS.search, rounds=rounds)
+    search = dataclasses.replace(SETTINGS.calibration, rounds=rounds)
     run = run_on([ITU_MATERIALS["wood"]] * len(PARTS), search)
     run.state = dataclasses.replace(run.state, step=jnp.asarray(steps))
     before = run.state
@@ -202,7 +202,7 @@ def test_known_thickness_stays_where_it_is_in_training(run_on):
 @pytest.mark.parametrize("rounds", [0, 3])
 def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng):
     """Nobody has said what was transmitted; what reflects well and what does not is told by powers."""
-    search = dataclasses.replace(SETTINGS.search, rounds=rounds, antenna_rounds=1)
+    search = dataclasses.replace(SETTINGS.calibration, rounds=rounds, antenna_rounds=1)
     run, offset = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search), float(rng.uniform(-90, 40))
     powers = received_power_db(run.data.snapshots) + offset
     run.data = dataclasses.replace(run.data, steering=None, observations={"power_db": powers})
@@ -217,7 +217,7 @@ def test_of_powers_alone_the_unknown_gain_is_found(rounds, run_on, tmp_path, rng
 @pytest.mark.parametrize("ordinary", [False, True])
 def test_snapshots_in_a_unit_of_their_own_get_a_gain(ordinary, run_on, tmp_path, rng):
     """Measured voltages are not relative to what was transmitted; gradients alone cover less than 40 dB."""
-    search = dataclasses.replace(SETTINGS.search, rounds=0, antenna_rounds=1, placement_spectra=16)
+    search = dataclasses.replace(SETTINGS.calibration, rounds=0, antenna_rounds=1, position_std_spectra=16)
     offset = 0.0 if ordinary else float(rng.choice([-1, 1]) * rng.uniform(60, 160))
     run = run_on([ITU_MATERIALS["concrete"]] * len(PARTS), search)
     silent = np.asarray(run.dataset.train)[:2]

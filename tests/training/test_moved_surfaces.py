@@ -26,7 +26,14 @@ PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"spectra": 80, "rounds": 2, "antenna_rounds": 0, "geometry": True, "geometry_snapshots": 96, "geometry_tx": 40},
+    calibration={
+        "spectra": 80,
+        "rounds": 2,
+        "antenna_rounds": 0,
+        "geometry": True,
+        "geometry_snapshots": 96,
+        "geometry_tx": 40,
+    },
 )
 
 
@@ -44,7 +51,7 @@ def learned(truth, parts, folder, receiver=RX, found=None):
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, snapshots, (receiver,))
     params = dataclasses.replace(params, transmitter=found) if found else params
     place = Place(run.field, params, run.prepared)  # materials known: what is learned here is where they are
-    return learn_geometry(place, run.data, run.dataset.train, SETTINGS.search, np.random.default_rng(0)), run
+    return learn_geometry(place, run.data, run.dataset.train, SETTINGS.calibration, np.random.default_rng(0)), run
 
 
 def test_frequencies_are_looked_at_where_they_stand_apart_and_the_highest_always():
@@ -71,11 +78,11 @@ def test_walls_come_back(truth, tmp_path):
     assert np.median(left[walls]) < 5e-4 < np.median(along[walls])
     assert len(report.bodies) == len(np.asarray(place.field.motion.shift))
     for body in report.bodies:
-        assert 0 < body["best_known_mm"] <= body["least_known_mm"] <= 1e3 * SETTINGS.search.geometry_width + 1e-3
+        assert 0 < body["best_known_mm"] <= body["least_known_mm"] <= 1e3 * SETTINGS.calibration.geometry_width + 1e-3
     known = np.array([report.bodies[m]["best_known_mm"] for m in mover[walls]])
     z = 1e3 * left[walls] / known  # the posterior is no narrower than what is left
     print(np.round(known, 3), np.round(z, 1))
-    assert np.median(z) < 3 and np.median(known) < 0.25e3 * SETTINGS.search.geometry_width
+    assert np.median(z) < 3 and np.median(known) < 0.25e3 * SETTINGS.calibration.geometry_width
 
 
 @pytest.mark.heavy
@@ -114,7 +121,7 @@ def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path
     monkeypatch.setattr(alignment, "adjust", lambda field, params, prepared, motion, covariance, *_: (motion, covariance))
     prepared = run.prepared  # which is done when it is first asked for
     monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or prepared)
-    heard = alignment._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.search, np.random.default_rng(0), silent)
+    heard = alignment._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.calibration, np.random.default_rng(0), silent)
     now = Place(run.field, run.state.params, run.prepared, likely=likely)
     assert alignment._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
 
@@ -166,7 +173,7 @@ def test_a_training_goes_on_with_the_moved_field(truth, tmp_path, monkeypatch):
     moved = run.field.moved(dataclasses.replace(still, shift=still.shift + 1e-3))
     report = GeometryReport(-1.0, -2.0, True, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: (Place(moved, place.params, place.prepared), report))
-    run.hooks = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0)),)
+    run.hooks = (pipeline.Calibration(dataclasses.replace(SETTINGS.calibration, geometry_position_std=0.0)),)
     run.run_hooks()
     assert run.field is moved
     assert json.loads((tmp_path / "metrics.jsonl").read_text())["geometry"] == dataclasses.asdict(report)
@@ -185,7 +192,7 @@ def test_an_antenna_that_was_dropped_is_reported_no_more(truth, tmp_path, monkey
         return dataclasses.replace(place, params=dataclasses.replace(place.params, transmitter=new.transmitter)), report
 
     monkeypatch.setattr(pipeline, "learn_geometry", moved)
-    run.hooks = (pipeline.Search(dataclasses.replace(SETTINGS.search, geometry_doubt=0.0, antenna_rounds=1)),)
+    run.hooks = (pipeline.Calibration(dataclasses.replace(SETTINGS.calibration, geometry_position_std=0.0, antenna_rounds=1)),)
     run.run_hooks()
     assert list(json.loads((tmp_path / "metrics.jsonl").read_text())["antennas"]["taken"]) == ["element"]
 
@@ -214,7 +221,7 @@ def test_a_mesh_is_doubted_where_spectra_are_explained_better_without_believing_
     run, asked = run_in(shifted(PARTS, metres, rng), SETTINGS, tmp_path, PLACES, FREQUENCIES, truth[0]), []
     report = GeometryReport(-1.0, -1.0, False, True, 1.0, 1.0, 0.0, 0.0, 0.0)
     monkeypatch.setattr(pipeline, "learn_geometry", lambda place, *_: asked.append(place) or (place, report))
-    run.hooks = (pipeline.Search(SETTINGS.search),)
+    run.hooks = (pipeline.Calibration(SETTINGS.calibration),)
     run.run_hooks()
     found = json.loads((tmp_path / "metrics.jsonl").read_text())["doubt"]
     assert (len(asked) == 1) == (metres > 0) == (found["spread_mm"] > 0.5), found

@@ -23,7 +23,7 @@ SETTINGS = tiny_settings(
         "diffracted_kept": 1,
         "mirror_areas": (0.0,),
     },
-    search={"spectra": 60, "rounds": 2, "antenna_rounds": 0, "thickness_spectra": 60},
+    calibration={"spectra": 60, "rounds": 2, "antenna_rounds": 0, "thickness_spectra": 60},
 )
 
 
@@ -70,13 +70,13 @@ def off_in_a_room(room, rng):
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, names, metres))
-    found, report, likely = search_slabs(start, heard, SETTINGS.search, 60)
-    alone, _ = search_materials(start, heard, 60, SETTINGS.search)
+    found, report, likely = search_slabs(start, heard, SETTINGS.calibration, 60)
+    alone, _ = search_materials(start, heard, 60, SETTINGS.calibration)
     left, without = heard.scores()([found, alone]).mean(1)
     assert left < without - 0.5
     assert set(report.thickness_mm) == set(likely) == set(range(len(PARTS)))
     other = {material: [Slab("metal", 0.3)] for material in likely}
-    wrong, _, _ = search_slabs(start, heard, SETTINGS.search, 60, likely=other)
+    wrong, _, _ = search_slabs(start, heard, SETTINGS.calibration, 60, likely=other)
     assert heard.scores()([wrong]).mean() > left + 0.1, "what is ruled out is looked at no more"
     optical = [m * np.sqrt(ITU_MATERIALS[name][0]) for m, name in zip(metres, names, strict=True)]
     materials = found.materials
@@ -90,7 +90,7 @@ def test_what_fits_stays(room, rng):
     names = rng.choice(["concrete", "brick", "plasterboard", "wood"], len(PARTS))
     start = room.field.init(jax.random.key(0))
     heard = told(room, of(start, names, [USUAL_M[name] for name in names]))
-    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     usual = np.log([USUAL_M[name] for name in names])
     assert not report.thickness_mm or np.abs(np.asarray(found.materials.log_thickness) - usual).max() < 0.02
     assert heard.scores()([found]).mean() < -4
@@ -102,7 +102,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     known = dataclasses.replace(room.field, known_thickness=jnp.full(len(PARTS), 0.1))
     heard = told(room, of(start, ["wood"] * len(PARTS), metres), known)
-    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     assert not report.thickness_mm
     np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
 
@@ -114,7 +114,7 @@ def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     nothing = SearchReport(0.0, 0.0, {})
     monkeypatch.setattr("wbgs_jax.training.calibration.thickness.search_materials", lambda params, *_, **__: (params, nothing))
     monkeypatch.setattr("wbgs_jax.training.calibration.thickness._sized", lambda *_: pytest.fail("searched"))
-    found, report, _ = search_slabs(start, heard, SETTINGS.search, 60)
+    found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     assert found is start and report is nothing
 
 

@@ -19,7 +19,7 @@ PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
     field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
-    search={"rounds": 0, "antenna_rounds": 0, "geometry": False},
+    calibration={"rounds": 0, "antenna_rounds": 0, "geometry": False},
 )
 
 

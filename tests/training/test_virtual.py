@@ -12,7 +12,7 @@ from builders.toys import RippleField, registered, toy_settings
 from wbgs_jax.config import limit_steps
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import get_field
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 from wbgs_jax.training import batches as module
 from wbgs_jax.training.batches import (
     BESIDE,
@@ -82,7 +82,7 @@ def test_training_data_hold_both(kind):
     assert len(set(np.asarray(data.links.tx_index)[virtual]) & set(np.asarray(plain.links.tx_index))) == 0
     batch = data.batch(jnp.asarray(virtual[:3]), jax.random.key(0))
     assert batch.pas.shape == (3, 90, 360) and batch.pas.max() > 0.2
-    assert batch.received_db is None or (batch.received_db <= NOT_HEARD_DB).all()
+    assert batch.received_db is None or (batch.received_db <= NO_PATH_DB).all()
 
 
 def test_half_of_a_batch_is_virtual_and_of_the_same_receiver(rng):

@@ -9,8 +9,8 @@ import pytest
 import wbgs_jax as wb
 from wbgs_jax.fields.coherent_model import WavePlan
 
-CONFIG = wb.WidebandConfig(width=8, depth=2)
-LIMITS = wb.TileLimits(entries=4096, jobs=1024)
+CONFIG = wb.wideband.WidebandConfig(width=8, depth=2)
+LIMITS = wb.splat.TileLimits(entries=4096, jobs=1024)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_the_other_fields_have_the_same_door(planned):
     query = wb.Query(jnp.zeros((2, 3)), jnp.full(2, 2.4))
     plan = object.__new__(WavePlan)
     object.__setattr__(plan, "prepared", None)  # all that is looked at
-    for field in (wb.wave, wb.nerf2):
+    for field in (wb.coherent, wb.fields.nerf2):
         with pytest.raises(ValueError, match="in hertz"):
             field.render(None, plan, query)
 
@@ -101,9 +101,9 @@ def test_a_wrong_surface_is_refused():
 def test_wrong_attenuation_is_refused(planned):
     _, plan = planned
     with pytest.raises(ValueError, match=r"attenuation has shape \(59, 1\); expected \(64, b\)"):
-        wb.render_splats(plan.geometry, jnp.zeros((59, 1)), jnp.zeros((59, 1)))
+        wb.splat.render_splats(plan.geometry, jnp.zeros((59, 1)), jnp.zeros((59, 1)))
     with pytest.raises(ValueError, match="signal has shape"):
-        wb.render_splats(plan.geometry, jnp.zeros((64, 2)), jnp.zeros((64, 1)))
+        wb.splat.render_splats(plan.geometry, jnp.zeros((64, 2)), jnp.zeros((64, 1)))
 
 
 def test_make_query_broadcasts_one_frequency():

@@ -11,7 +11,7 @@ from builders.untrained import make_coherent_run, make_run
 from experiments.studies.viewer_pictures import chromium, drag, window
 from wbgs_jax.commands import view
 from wbgs_jax.inference.evaluate_quantities import LoadedField
-from wbgs_jax.inference.predictor import predictor
+from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, pas_directions
 from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.viewer import drawing, panel, session, walk
@@ -40,7 +40,7 @@ def splatting(tmp_path_factory):
 @pytest.mark.heavy
 def test_an_answer_is_the_fields(coherent):
     answer = coherent.ask(PLACE, HZ)
-    np.testing.assert_allclose(answer.pas, predictor(coherent.trained)(PLACE, HZ), atol=1e-5)
+    np.testing.assert_allclose(answer.pas, make_predictor(coherent.trained)(PLACE, HZ), atol=1e-5)
     assert answer.doubts == () and "outside" in coherent.ask(np.array([90.0, 0, 1]), HZ).doubts[0]
 
 

@@ -33,17 +33,44 @@ NARROWEST_M = 0.02
 
 def soft_minimum(power_db: Float[Array, "*k users"], soft_db: float = SOFT_DB) -> Float[Array, "*k"]:
     """Returns a smooth minimum over the users, between the lowest power and the mean of the decibels; it approaches the mean as
-    `soft_db` grows."""
+    `soft_db` grows.
+
+    Args:
+        power_db: powers of the users.
+        soft_db: width of the transition, decibels.
+
+    Returns:
+        Decibels (*k,).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> round(float(soft_minimum(jnp.array([-60.0, -90.0]), 1.0)), 1)
+        -89.3
+    """
     return -soft_db * (jax.nn.logsumexp(-power_db / soft_db, -1) - jnp.log(power_db.shape[-1]))
 
 
 def mean_power(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
-    """Returns the mean over the users of their powers in dB."""
+    """Returns the mean over the users of their powers in dB.
+
+    Args:
+        power_db: powers of the users.
+
+    Returns:
+        Decibels (*k,).
+    """
     return jnp.mean(power_db, -1)
 
 
 def tenth_percentile(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
-    """Returns the power that nine of ten users exceed; its gradient is that of the two adjacent users."""
+    """Returns the power that nine of ten users exceed; its gradient is that of the two adjacent users.
+
+    Args:
+        power_db: powers of the users.
+
+    Returns:
+        Decibels (*k,).
+    """
     return jnp.quantile(power_db, 0.1, axis=-1)
 
 
@@ -58,6 +85,9 @@ def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any
         field, params: a trained field, of which the receiver-independent part is used (`Field.receiver_independent`).
         users: (users, 3), world frame, metres.
         frequencies_hz: (f,) or one, hertz.
+
+    Returns:
+        The function: positions (k, 3) in metres and a smoothing length in metres -> powers (k, users), dB.
 
     Raises:
         UserError: the field predicts no power, or only at the receivers it was trained for.
@@ -105,6 +135,9 @@ def place_antenna(
             smooth function (k, users) -> (k,).
         step: grid spacing, metres.
         starts: number of starting points of the gradient steps.
+
+    Returns:
+        `place` (starts, 3), world frame, metres, and `loss` (starts,), dB.
     """
     low_high = jnp.asarray(box, jnp.float32)
     places = grid_over(np.asarray(box, np.float32), step)

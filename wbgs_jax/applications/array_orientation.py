@@ -19,10 +19,10 @@ from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.radio.antenna import Antenna, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
-from wbgs_jax.radio.channel import Arrivals, decibels
+from wbgs_jax.radio.channel import Paths, decibels
 from wbgs_jax.types import make_query, make_receiver
 
-Turned = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
+PowerByBoresight = Callable[[Float[Array, "k 2"]], Float[Array, "k tx"]]
 """Azimuth and elevation of the boresight (radians, world frame) -> power (dB) from every transmitter."""
 STEP = 0.3
 """Spacing of the directions that are tried first, radians."""
@@ -35,12 +35,19 @@ HIGHEST = 1.55
 
 def boresight_quaternion(angles: Float[Array, "2"]) -> Float[Array, "4"]:
     """Returns the quaternion (wxyz) of a receiver whose +x, the boresight of directive elements, has this azimuth and elevation
-    (radians, world frame) and whose y axis stays horizontal."""
+    (radians, world frame) and whose y axis stays horizontal.
+
+    Args:
+        angles: azimuth and elevation, radians.
+
+    Returns:
+        Unit quaternion (4,), for `make_receiver(orientation=...)`.
+    """
     (ca, ce), (sa, se) = jnp.cos(angles / 2), jnp.sin(angles / 2)
     return jnp.stack([ca * ce, sa * se, -ca * se, sa * ce])
 
 
-def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Arrivals:
+def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmitters: Any, frequency_hz: float) -> Paths:
     """Returns the waves that reach an isotropic element from n transmitters over all paths; its local frame is the world frame.
 
     Args:
@@ -49,6 +56,9 @@ def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters:
         receiver: (3,), world frame, metres.
         transmitters: (n, 3), world frame, metres.
         frequency_hz: hertz.
+
+    Returns:
+        `wbgs_jax.Paths` with arrays (n, k, ...).
 
     Raises:
         UserError: the field predicts no paths, or only at the receivers it was trained for.
@@ -61,16 +71,19 @@ def arrivals_anywhere(field: Field, params: Params, receiver: Any, transmitters:
     return paths_of(field, params, plan, make_query(places, frequency_hz))
 
 
-def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
+def power_when_rotated(arrived: Paths, pattern: str = "tr38901") -> PowerByBoresight:
     """Returns a function for the mean received power over all elements (dB) in terms of the boresight; differentiable.
 
     The powers of all paths are added, as in a mean over positions around the receiver: interference should not determine the
     orientation.
 
     Args:
-        arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`arrivals_anywhere`).
+        arrived: at isotropic elements in the world frame, with a leading axis of transmitters (`predict_isotropic_paths`).
         pattern: of the elements: "tr38901", "dipole", "hw_dipole", or "iso", for which the orientation affects only the
             polarisation.
+
+    Returns:
+        The function: boresights (k, 2), azimuth and elevation in radians -> powers (k, tx), dB.
     """
     assert arrived.polarised is not None, "arrivals of traced paths have polarised amplitudes"
     direction, amplitude = arrived.direction, arrived.polarised
@@ -85,8 +98,8 @@ def power_when_turned(arrived: Arrivals, pattern: str = "tr38901") -> Turned:
     return jax.vmap(one)
 
 
-def turn_array(
-    powers: Turned, aim: Callable[[Float[Array, "k tx"]], Float[Array, " k"]] = soft_minimum, starts: int = 4
+def rotate_array(
+    powers: PowerByBoresight, aim: Callable[[Float[Array, "k tx"]], Float[Array, " k"]] = soft_minimum, starts: int = 4
 ) -> Descended:
     """Returns the best boresights: `place` (starts, 2), azimuth and elevation in radians, the best one first, and `loss`, minus
     the objective (dB).
@@ -94,9 +107,12 @@ def turn_array(
     The best directions of a grid over the sphere that are not close together are refined by gradient steps.
 
     Args:
-        powers: of the transmitters by boresight, from `power_when_turned` or any similar function.
+        powers: of the transmitters by boresight, from `power_when_rotated` or any similar function.
         aim: objective to maximise, as in `place_antenna`.
         starts: number of starting directions of the gradient steps.
+
+    Returns:
+        `place` (starts, 2), radians, and `loss` (starts,), dB.
     """
     sphere = np.array([[-np.pi, -HIGHEST], [np.pi, HIGHEST]])
     tried = jnp.asarray(grid_over(sphere, STEP))

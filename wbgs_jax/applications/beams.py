@@ -31,7 +31,15 @@ class BeamScores(NamedTuple):
 
 def rank_beams(spectra: Float[AnyArray, "n 90 360"], count: int = 3) -> Int[np.ndarray, "n count"]:
     """Returns the strongest beams of the codebook (0 to 63: four rings from the zenith down, sixteen azimuths from -180 degrees
-    on) in every spectrum, the best one first."""
+    on) in every spectrum, the best one first.
+
+    Args:
+        spectra: measured or predicted.
+        count: beams per spectrum.
+
+    Returns:
+        Indices of beams (n, count).
+    """
     received = np.asarray(spectra).reshape(len(spectra), -1)[:, codebook()]
     return np.argsort(-received, axis=1, kind="stable")[:, :count]
 
@@ -45,16 +53,27 @@ def choose_beams(predict: Predictor, tx_positions: Any, frequencies_hz: Any, cou
     """Returns the beams to try for n transmitters, the most promising one first.
 
     Args:
-        predict: predicts a field's spectra, from `predictor`.
+        predict: predicts a field's spectra, from `make_predictor`.
         tx_positions: (n, 3), world frame, metres.
         frequencies_hz: (n,) or one, hertz.
         count: beams per transmitter.
+
+    Returns:
+        Indices of beams (n, count), as in `rank_beams`.
     """
     return rank_beams(predict_many(predict, tx_positions, frequencies_hz), count)
 
 
 def score_beams(predicted: Float[AnyArray, "n 90 360"], truth: Float[AnyArray, "n 90 360"]) -> BeamScores:
-    """Returns the quality, in true spectra, of the beams that predicted spectra rank highest."""
+    """Returns the quality, in true spectra, of the beams that predicted spectra rank highest.
+
+    Args:
+        predicted: spectra of a field.
+        truth: measured spectra of the same links.
+
+    Returns:
+        Shares of links and losses in dB (`BeamScores`).
+    """
     first, three = (beam_loss_db(np.asarray(predicted), np.asarray(truth), tried) for tried in (1, 3))
     top1, top3 = (float(np.mean(loss <= RIGHT_DB)) for loss in (first, three))
     return BeamScores(top1, top3, float(first.mean()), float(three.mean()))

@@ -23,7 +23,7 @@ from wbgs_jax.fields.base import Observation, Params, as_observed, outputs_of
 from wbgs_jax.inference.predictor import check_power
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 from wbgs_jax.types import Receiver, make_query
 
 What = Literal["spectra", "snapshots", "power"]
@@ -64,9 +64,9 @@ class Located(NamedTuple):
 
 @pytree
 class Locator:
-    """Localiser based on a trained field. Create it with `locator`, and call it with an observation: (frequencies, 90, 360)
-    spectra, (frequencies, elements) snapshots or (frequencies,) powers in dB; for several receivers (receivers, frequencies,
-    ...)."""
+    """Localiser based on a trained field. Create it with `make_locator`, and call it with an observation: (frequencies, 90,
+    360) spectra, (frequencies, elements) snapshots or (frequencies,) powers in dB; for several receivers (receivers,
+    frequencies, ...)."""
 
     field: Field
     params: Params
@@ -106,9 +106,9 @@ class Locator:
             observed: (receivers * frequencies, ...), spectra, snapshots or powers.
             blur: metres over which predictions are smoothed, if the field has interference fringes.
         """
-        return _loss(_residuals(self, self.ask(places, blur), _target(self.what, observed)))
+        return _loss(_residuals(self, self.predict(places, blur), _target(self.what, observed)))
 
-    def ask(self, places: Float[Array, "k 3"], blur: Any) -> Float[Array, "k links m"]:
+    def predict(self, places: Float[Array, "k 3"], blur: Any) -> Float[Array, "k links m"]:
         """Returns the predictions at K positions, in the form that is compared: (k, receivers * frequencies, m)."""
         params = self.field.smoothed(self.params, blur)
 
@@ -124,7 +124,7 @@ class Locator:
         return jnp.moveaxis(jnp.concatenate(each), 0, 1)
 
 
-def locator(
+def make_locator(
     trained: TrainedField,
     frequencies_hz: Any,
     what: What = "spectra",
@@ -137,7 +137,7 @@ def locator(
     """Returns a function from observations to positions. Its construction takes a while, an evaluation seconds.
 
     Args:
-        trained: the field; residual kriging (`neighbours`) is not used.
+        trained: the field; residual kriging (`TrainedField.correction`) is not used.
         frequencies_hz: (f,), hertz, at which the transmitter is observed; more of them make the result less ambiguous.
         what: kind of observation: "spectra" (normalised PAS), "snapshots" (complex voltages of the elements), "power" (dB).
         receivers: observing receivers; by default the first one of the training data.
@@ -145,6 +145,9 @@ def locator(
         step: grid spacing, metres.
         starts: number of grid points that are refined.
         known_power: whether the transmitted power is known. If not, powers are compared up to a common offset in decibels.
+
+    Returns:
+        The locator; its result for an observation is a `Located`.
 
     Raises:
         UserError: the field does not predict this kind of observation.
@@ -169,7 +172,7 @@ def locator(
 @jax.jit
 def _predict_grid(locator: Locator) -> Array:
     """Returns the predictions at the grid points."""
-    return in_blocks(lambda places: locator.ask(places, BLUR * locator.step), locator.places)
+    return in_blocks(lambda places: locator.predict(places, BLUR * locator.step), locator.places)
 
 
 @jax.jit
@@ -179,7 +182,7 @@ def _locate(locator: Locator, observed: Array) -> Located:
     chosen = best_apart(locator.places, losses, locator.starts, 1.5 * locator.step)
 
     def residuals(places: Float[Array, "k 3"], blur: Any) -> Float[Array, "k m"]:
-        return _residuals(locator, locator.ask(places, blur), target)
+        return _residuals(locator, locator.predict(places, blur), target)
 
     first = BLUR * locator.step
     blurs = shrinking(first, min(NARROWEST_M, first), LEVELS)
@@ -197,11 +200,11 @@ def _compared(what: What, predicted: Observation) -> Float[Array, "k m"]:
     """Returns the form of K links' predictions that is compared with an observation: a vector per link, of norm 1 except for
     powers."""
     if what == "power":
-        assert predicted.power_db is not None, "`locator` has checked the outputs"
+        assert predicted.power_db is not None, "`make_locator` has checked the outputs"
         return predicted.power_db[:, None]
     if what == "spectra":
         return _unit(pooled(predicted.pas))
-    assert predicted.snapshots is not None, "`locator` has checked the outputs"
+    assert predicted.snapshots is not None, "`make_locator` has checked the outputs"
     return _unit(_products(predicted.snapshots) if predicted.covariance is None else predicted.covariance)
 
 
@@ -230,7 +233,7 @@ def _residuals(locator: Locator, answers: Float[Array, "k links m"], target: Flo
     """Returns residuals whose squares add up to the loss, a mean over links."""
     error = answers - target
     if locator.what == "power":
-        received = target > NOT_HEARD_DB
+        received = target > NO_PATH_DB
         count = jnp.maximum(jnp.sum(received), 1)
         error = jnp.where(received, error, 0)
         if not locator.known_power:

@@ -36,7 +36,7 @@ NEAREST_M = 1e-3
 
 @dataclass(frozen=True)
 class Reflector:
-    """A flat rectangular metal plate between one transmitter and users. Create it with `reflector`.
+    """A flat rectangular metal plate between one transmitter and users. Create it with `make_reflector`.
 
     A pose is (5,): the plate's centre x, y, z (world frame, metres), and azimuth and elevation of its normal (radians). Two of
     its sides are horizontal.
@@ -117,7 +117,7 @@ class Reflector:
         return decibels(amplitude**2) + _friis(whole, self.frequencies_hz) + in_the_way
 
 
-def reflector(
+def make_reflector(
     transmitter: Any,
     users: Any,
     size: tuple[float, float],
@@ -136,6 +136,9 @@ def reflector(
         frequencies_hz: (f,) or one, hertz.
         field, params: a trained field that predicts paths, used for the walls between the plate and the ends; by default there
             are no walls. Every end is planned and compiled separately: a dozen take a minute.
+
+    Returns:
+        The plate; `power_db` is the function of its pose.
 
     Raises:
         UserError: a side is not longer than 0, or the field predicts no paths, or only at the receivers it was trained for.
@@ -156,6 +159,9 @@ def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any
         field, params: a trained field that predicts paths, of which the receiver-independent part is used.
         ends: (ends, 3), world frame, metres.
         frequencies_hz: (f,) or one, hertz.
+
+    Returns:
+        The function: positions (k, 3) in metres and a smoothing length in metres -> powers (k, ends), dB.
 
     Raises:
         UserError: the field predicts no paths, or only at the receivers it was trained for.
@@ -196,12 +202,15 @@ def place_reflector(
     gradient steps in all five numbers, with the plate's edges smoothed less and less.
 
     Args:
-        plate: from `reflector`.
+        plate: from `make_reflector`.
         without_db: (users,), power of every user without the plate, dB (`power_at_users` at the transmitter); powers are added.
         box: (2, 3), lowest and highest corner of the possible centres, metres.
         aim: objective to maximise, as in `place_antenna`.
         step: grid spacing, metres.
         starts: number of starting poses of the gradient steps.
+
+    Returns:
+        `place` (starts, 5), metres and radians (`Reflector`), and `loss` (starts,), dB.
     """
     before = 10 ** (jnp.asarray(without_db, jnp.float32) / 10)
     centres = grid_over(np.asarray(box, np.float32), step)

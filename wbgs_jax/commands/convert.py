@@ -133,12 +133,12 @@ def _write_gaussians(
 def _write_paths(
     command: Command, trained: Any, receiver: Any, positions: Float[np.ndarray, "tx 3"], frequency_hz: float
 ) -> str:
-    from wbgs_jax.inference.evaluate_quantities import arrivals_of
+    from wbgs_jax.inference.evaluate_quantities import predict_paths
     from wbgs_jax.interchange.deepmimo import as_deepmimo, write_deepmimo
-    from wbgs_jax.interchange.ray_paths import from_arrivals, save_paths
+    from wbgs_jax.interchange.ray_paths import from_paths, save_paths
 
-    found = arrivals_of(trained, receiver, positions, frequency_hz)
-    paths = from_arrivals(found, positions, np.asarray(receiver.position), frequency_hz)
+    found = predict_paths(trained, receiver, positions, frequency_hz)
+    paths = from_paths(found, positions, np.asarray(receiver.position), frequency_hz)
     if command.out.suffix == ".npz":
         save_paths(command.out, paths)
         return f"paths: {command.out} ({paths.valid.sum()} of {len(positions)} transmitters)"

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import shlex
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +20,7 @@ from wbgs_jax._util.cli import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.devices import by_first, connect, is_first
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.config import Settings, check, from_sections, sections
+from wbgs_jax.config import Settings, check, from_sections, present_option, sections
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import released_scenes, source_names
@@ -28,7 +29,7 @@ from wbgs_jax.fields import default_field, field_names, get_field
 from wbgs_jax.fields.base import check_config
 from wbgs_jax.inference.intervals import write_confidence
 from wbgs_jax.inference.kriging import write_neighbours
-from wbgs_jax.inference.trained_field import RunConfig
+from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training.batches import check_data, limited
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.cross_validation import Training, is_few, learn_few
@@ -87,16 +88,27 @@ def default_preset() -> str:
     return "gpu" if jax.default_backend() == "gpu" else "cpu"
 
 
-def parse(arguments: list[str]) -> tuple[Command, Settings]:
-    """Returns the command and its settings. Field and preset are read first, because they determine the settings and their
-    defaults. `--help` lists the options of the command, `--help-settings` also those of the field."""
-    field = option_value(arguments, "--field", default_field())
-    preset = option_value(arguments, "--preset", default_preset())
+def preset_of(field: str, preset: str) -> Settings:
+    """Returns the settings of a field's preset.
+
+    Raises:
+        UserError: the field or the preset is unknown.
+    """
     kind = get_field(field)
     if preset not in kind.presets:
         others = [f"--field {name}" for name in field_names() if preset in get_field(name).presets]
         raise UserError(f"{field} has no preset {preset!r}; choose one of: {', '.join([*kind.presets, *others])}")
-    parts = sections(kind.presets[preset], field)
+    return kind.presets[preset]
+
+
+def parse(arguments: list[str]) -> tuple[Command, Settings]:
+    """Returns the command and its settings. Field and preset are read first, because they determine the settings and their
+    defaults. `--help` lists the options of the command, `--help-settings` also those of the field."""
+    arguments = [present_option(argument) for argument in arguments]
+    field = option_value(arguments, "--field", default_field())
+    preset = option_value(arguments, "--preset", default_preset())
+    default = preset_of(field, preset)
+    parts = sections(default, field)
     everything = "--help-settings" in arguments
     if everything:
         arguments = [argument for argument in arguments if argument != "--help-settings"] + ["--help"]
@@ -109,7 +121,7 @@ def parse(arguments: list[str]) -> tuple[Command, Settings]:
         description=f"{Command.__doc__} Settings of the field: {PROGRAM} --field {field} --help-settings.",
     )
     values = {f.name: getattr(parsed, f.name) for f in dataclasses.fields(Command)}
-    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, kind.presets[preset], field)
+    return Command(**values), from_sections({name: getattr(parsed, name) for name in parts}, default, field)
 
 
 def _with_settings(parts: dict[str, Any]) -> type[Command]:
@@ -171,7 +183,55 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     if "--distributed" in arguments:  # before `parse`, which makes JAX look for devices
         connect()
-    command, settings = parse(arguments)
+    _train(*parse(arguments))
+
+
+def train_field(
+    source: str | Path,
+    out: str | Path,
+    field: str | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    **options: Any,
+) -> TrainedField:
+    """Trains a field and writes its run folder, as `wbgs-jax train` does.
+
+    Args:
+        source: a released scene ("1", "2", ...), a scene file (.npz), or a folder of the published layout.
+        out: run folder, a new one unless `resume=True`.
+        field: model to train; by default the hybrid one.
+        preset: size of the field and of its training; by default "gpu" if JAX finds one, else "cpu".
+        settings: changes of the preset by section and name, as in the options --SECTION.NAME.
+        options: further options of the command by name: `seed`, `resume`, `train_ghz`, `train_tx`, `validation`, ...
+
+    Returns:
+        The trained field, which `load_trained(out)` reads again.
+
+    Raises:
+        UserError: the data, an option or a setting is invalid, or the folder holds something else.
+        Interrupted: Ctrl-C; the run continues with `resume=True`.
+
+    Example:
+        >>> run = train_field("1", "runs/short", preset="smoke", settings={"optim": {"steps": 100}})  # doctest: +SKIP
+    """
+    where: Any = {"data": str(source)} if Path(str(source).split(",")[0]).is_dir() else {"scene": str(source)}
+    try:
+        command = Command(**where, out=Path(out), field=field or default_field(), preset=preset or default_preset(), **options)
+    except TypeError as error:
+        known = ", ".join(f.name for f in dataclasses.fields(Command))
+        raise UserError(f"an option is unknown ({error}); those of train_field are {known}") from error
+    default = preset_of(command.field, command.preset)
+    parts = sections(default, command.field)
+    try:
+        changed = {name: dataclasses.replace(parts[name], **values) for name, values in (settings or {}).items()}
+    except (KeyError, TypeError) as error:
+        raise UserError(f"a setting is unknown ({error}); {PROGRAM} --help-settings lists all of them") from error
+    _train(command, from_sections(parts | changed, default, command.field))
+    return load_trained(out)
+
+
+def _train(command: Command, settings: Settings) -> None:
+    """Trains and writes the run folder."""
     config = run_config(command, settings)
     dataset = config.dataset()
     config = dataclasses.replace(config, convention=dataset.convention)

@@ -53,6 +53,12 @@ SEGMENTS, OUTLINE = _Format(("x1", "y1", "x2", "y2"), 1.0), _Format(("x", "y"), 
 def load_walls(path: Path) -> Walls:
     """Reads the walls of a CSV file.
 
+    Args:
+        path: of the file, in metres.
+
+    Returns:
+        The walls (docs/measured.md).
+
     Raises:
         UserError: the file is in neither of the two forms.
     """

@@ -82,7 +82,7 @@ def _numbered_on(datasets: Sequence[Dataset], receivers: Int[np.ndarray, " sets"
     return np.concatenate([one.receiver_index + start for one, start in zip(datasets, receivers, strict=False)])
 
 
-SNAPSHOTS = "read it with its own library and hand the arrays to `wb.scene_of_snapshots` (docs/formats.md)"
+SNAPSHOTS = "read it with its own library and hand the arrays to `wb.interchange.scene_of_snapshots` (docs/formats.md)"
 PATHS = "export its paths as DeepMIMO's converters do, or as the arrays of sionna.rt.Paths (docs/interchange.md)"
 ROOM = "`wbgs-jax convert` makes a room of it for measured data, data_gen computes spectra for it (docs/own_scene.md)"
 MODELS = (".usd", ".usda", ".usdc", ".usdz", ".stl", ".dae", ".fbx", ".blend", ".3ds", ".off", ".3mf", ".abc", ".vtk", ".vtp")
@@ -92,7 +92,7 @@ KINDS = {
     ".parquet": ("a Parquet file", PATHS),
     ".mat": (
         "a MATLAB file",
-        "pass DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.scene_of_snapshots` (docs/formats.md)",
+        "pass DeepMIMO's to `wbgs-jax convert --paths`, other arrays to `wb.interchange.scene_of_snapshots` (docs/formats.md)",
     ),
     ".npy": (
         "a single NumPy array",
@@ -157,7 +157,15 @@ def load_dataset(
     """Loads a dataset from a scene number ("1": the released scene), a scene file (.npz) or a folder of the published layout;
     or from several of one scene, separated by commas, as one dataset with several receivers.
 
-    The other arguments are for folders that do not record them (`wbgs_jax.data.image_folder.load_layout`); scene files do.
+    Args:
+        source: number or name of a released scene, a file, a folder, or several of them separated by commas.
+        frequency_hz: hertz, of a folder that does not record it.
+        seed: of the split of a folder that has none.
+        test_fraction: fraction of the transmitters for testing in that split.
+        convention: order of the rows of a folder's images; by default the recorded one, or what the images suggest.
+
+    Returns:
+        The data set: positions in metres (world frame), frequencies in hertz, observations and splits.
 
     Raises:
         UserError: there is no such scene, or its files are missing or damaged.

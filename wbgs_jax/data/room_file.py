@@ -45,6 +45,12 @@ def save_room(path: Path | str, room: Room) -> None:
 def load_room(path: Path | str) -> Room:
     """Reads a room from a room file, or from a scene file that has a mesh.
 
+    Args:
+        path: of the file (.npz).
+
+    Returns:
+        Vertices (metres, world frame), triangles, and objects and materials if the file names them.
+
     Raises:
         UserError: the file is missing, damaged or of another kind, or has no triangles.
     """

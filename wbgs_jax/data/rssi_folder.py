@@ -176,6 +176,9 @@ def load_readings(folder: Path, height: float) -> Readings:
         folder: in one of the layouts above.
         height: of the transmitter above the floor (metres), for files without a column z.
 
+    Returns:
+        Positions (n, 3) in metres and received powers (n, receivers) in dBm; NaN where there is no reading.
+
     Raises:
         UserError: a file is missing or damaged.
     """
@@ -231,6 +234,9 @@ def cell_means(readings: Readings, size: float) -> Readings:
     Args:
         readings: to average.
         size: of a cell, metres.
+
+    Returns:
+        One reading per cell.
     """
     names, room = np.unique(np.array(readings.rooms), return_inverse=True)
     cubes = np.column_stack([np.floor(readings.places / size).astype(int), room.reshape(-1)])

@@ -69,6 +69,15 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
     resolution is the same everywhere in the image, and no Gaussian is placed where the image cannot show it. "area" distributes
     them uniformly over the surface. Without faces, points of the cloud are used; without any points, random ones in the box of
     transmitters and receivers.
+
+    Args:
+        dataset: data with a mesh, points, or neither.
+        count: number of points.
+        seed: of the random numbers.
+        sampling: "solid_angle" or "area".
+
+    Returns:
+        Points (n, 3) and their spacing (n,), metres, float32.
     """
     rng = np.random.default_rng(seed)
     if count == 0:
@@ -86,6 +95,12 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
 def make_mesh(dataset: Dataset) -> Mesh:
     """Returns the surfaces themselves, for fields that use their geometry; if parts or materials are unknown, all triangles
     have the same one.
+
+    Args:
+        dataset: data with a mesh.
+
+    Returns:
+        Triangles (metres, world frame) with the object and the material of each.
 
     Raises:
         UserError: there are only points, or no surfaces at all.
@@ -105,7 +120,14 @@ def make_mesh(dataset: Dataset) -> Mesh:
 
 
 def surface_from_points(points: Float[np.ndarray, "n 3"]) -> Surface:
-    """Returns a surface (float32) with the spacing of its points; at least 4 points are needed."""
+    """Returns a surface (float32) with the spacing of its points; at least 4 points are needed.
+
+    Args:
+        points: (n, 3), world frame, metres.
+
+    Returns:
+        The points with the mean distance of each to its 3 nearest others, metres.
+    """
     neighbours, _ = cKDTree(points).query(points, 4)
     return Surface(jnp.asarray(points, jnp.float32), jnp.asarray(neighbours[:, 1:].mean(1), jnp.float32))
 

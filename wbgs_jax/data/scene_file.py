@@ -216,7 +216,15 @@ class SceneFile:
 
 
 def save_scene(path: Path | str, scene: SceneFile) -> None:
-    """Checks and writes a scene file; equal scenes give equal bytes."""
+    """Checks and writes a scene file; equal scenes give equal bytes.
+
+    Args:
+        path: of the file; an existing one is replaced at once, never left half-written.
+        scene: its content.
+
+    Raises:
+        UserError: the scene is invalid, or the file cannot be written.
+    """
     arrays = {key: getattr(scene, key) for key in (*ARRAYS, *TEXTS)} | scene.observations
     arrays = check_arrays({key: np.asarray(value) for key, value in arrays.items()}, str(path))
     meta = json.dumps(scene.meta | {"format": FORMAT, "name": scene.name}, sort_keys=True)
@@ -231,6 +239,12 @@ def save_scene(path: Path | str, scene: SceneFile) -> None:
 
 def load_scene(path: Path | str) -> SceneFile:
     """Reads and checks a scene file of this format or an older one.
+
+    Args:
+        path: of the file (.npz).
+
+    Returns:
+        The content of the file, in SI units (docs/formats.md).
 
     Raises:
         UserError: the file is missing, truncated, in another format, or does not contain a valid scene.

@@ -36,7 +36,7 @@ from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_li
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import plane_normal
 from wbgs_jax.radio import channel
-from wbgs_jax.radio.channel import NOT_HEARD_DB, free_space_db
+from wbgs_jax.radio.channel import NO_PATH_DB, free_space_db
 
 FILE = "repeatability.json"
 
@@ -138,22 +138,22 @@ def power_figures(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: I
     Raises:
         UserError: as `score_power`.
     """
-    report = score_heard(predicted, dataset, index)
+    report = score_received(predicted, dataset, index)
     if report is None:
         return None
     others = {"free_space": free_space(dataset, index)}
     if can_lend(dataset, index):
         others["nearest_tx"] = nearest_power(dataset, index)
-    return report | {"baselines": {name: score_heard(values, dataset, index) for name, values in others.items()}}
+    return report | {"baselines": {name: score_received(values, dataset, index) for name, values in others.items()}}
 
 
-def score_heard(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
+def score_received(predicted: Float[np.ndarray, " n"], dataset: Dataset, index: Int[np.ndarray, " n"]) -> dict[str, Any] | None:
     """Returns the report of predicted powers of links, omitting those without received power; None if the data contain no
     powers, or only snapshots in which nothing was received."""
     truth = dataset.received_db(index)
     if truth is None:
         return None
-    received = truth > NOT_HEARD_DB
+    received = truth > NO_PATH_DB
     if dataset.has_spectra and not received.any():
         return None
     return score_power(predicted[received], truth[received], dataset.frequencies_hz[index[received]])
@@ -167,7 +167,7 @@ def calibrate_power(
     truth = dataset.received_db(index)
     if truth is None:
         return None
-    received = truth > NOT_HEARD_DB
+    received = truth > NO_PATH_DB
     receivers = jnp.asarray(dataset.rx_positions(index[received]), jnp.float32)
     expected = _expected_power(
         confidence, jnp.asarray(predicted[received], jnp.float32), dataset.query(index[received]), receivers
@@ -191,7 +191,7 @@ def nearest_power(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.nd
     receiver received none, simply of the nearest one."""
     everything = dataset.received_db(np.arange(len(dataset)))
     assert everything is not None
-    received = dataset.train[everything[dataset.train] > NOT_HEARD_DB]
+    received = dataset.train[everything[dataset.train] > NO_PATH_DB]
     all_received = np.isin(dataset.receiver_index[index], dataset.receiver_index[received]).all()
     return everything[nearest_links(dataset, index, received if all_received else dataset.train)]
 
@@ -209,21 +209,32 @@ def evaluate(
 ) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
+    Args:
+        trained: a trained field.
+        dataset: the data of its run, or others of the same kind.
+        part: "test" or "validation".
+
+    Returns:
+        The report, {figure: value}, and the spectra (n, 90, 360) in the order of the held-out links.
+
     Raises:
         UserError: nothing is held out, or the field does not predict the kind of observation in the data.
+
+    Example:
+        >>> report, spectra = evaluate(trained, trained.dataset())  # doctest: +SKIP
     """
     index = held_out(dataset, part)
     tested = part == "test"
-    if not tested and trained.neighbours is not None:  # residual kriging uses the validation part
-        left = without_asked(trained.neighbours, dataset.query(index))
-        trained = dataclasses.replace(trained, neighbours=left)
+    if not tested and trained.correction is not None:  # residual kriging uses the validation part
+        left = without_asked(trained.correction, dataset.query(index))
+        trained = dataclasses.replace(trained, correction=left)
     reference = with_validation_trained(dataset) if tested else dataset
     predictions = observe(trained, dataset, index)
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     power_db = power_of(predictions, dataset)
     power = None if power_db is None else power_figures(power_db, reference, index)
-    if power_db is not None and power and trained.power_confidence and tested:  # fitted to the validation part
-        power |= {"confidence_db": calibrate_power(trained.power_confidence, power_db, dataset, index)}
+    if power_db is not None and power and trained.power_intervals and tested:  # fitted to the validation part
+        power |= {"confidence_db": calibrate_power(trained.power_intervals, power_db, dataset, index)}
     own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
@@ -238,7 +249,7 @@ def evaluate(
     repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
     report |= own | ({"power": power} if power else {})
-    intervals = trained.confidence
+    intervals = trained.intervals
     if (
         tested
         and intervals is not None
@@ -332,7 +343,7 @@ def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray,
     """Returns the figure of held-out links shown in the training curves."""
     predictions = observe_links(field, params, dataset, index)
     power_db = power_of(predictions, dataset)
-    if not dataset.has_spectra and power_db is not None and (report := score_heard(power_db, dataset, index)):
+    if not dataset.has_spectra and power_db is not None and (report := score_received(power_db, dataset, index)):
         return {"held_out_power_error_db": report["power_error_db"]}
     noisy = as_observed(field, params, np.asarray(predictions.pas))
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
@@ -341,7 +352,7 @@ def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray,
 def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
     """Returns milliseconds per PAS, for single queries and in blocks: medians over repeats after compilation."""
     plan = trained.field.plan(trained.params, dataset.receiver())
-    neighbours = for_receiver(trained.neighbours, dataset.receiver())
+    neighbours = for_receiver(trained.correction, dataset.receiver())
     result = {}
     for name, size in (("ms_per_pas", BLOCK), ("ms_per_pas_single", 1)):
         query = dataset.query(np.resize(dataset.test if len(dataset.test) else dataset.train, size))

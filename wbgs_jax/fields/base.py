@@ -25,7 +25,7 @@ from wbgs_jax._util.pytree import from_leaves, replaced
 from wbgs_jax.config import PRESETS, Settings
 from wbgs_jax.fields.losses import LOSSES, image_loss
 from wbgs_jax.observation_kinds import only_kind
-from wbgs_jax.radio.channel import NOT_HEARD_DB, Arrivals
+from wbgs_jax.radio.channel import NO_PATH_DB, Paths
 from wbgs_jax.types import Batch, Gaussians, Links, Query, Receiver, Scene, check_query
 
 T = TypeVar("T")
@@ -46,7 +46,7 @@ class Observation(NamedTuple):
     """Received power relative to the transmitted power (dB), if the field predicts it."""
     covariance: Complex[Array, "b elements elements"] | None = None
     """Mean product y y^H of the snapshots, scaled to a trace of 1, if the field predicts the uncertainty of its phases."""
-    paths: Arrivals | None = None
+    paths: Paths | None = None
     """All paths with amplitude, length and direction, leading axis B, if the field predicts paths. They take half as much
     memory as the spectra; a compiled function that does not need them should replace them by None."""
 
@@ -381,7 +381,7 @@ def field_from_arrays(cls: type[Field], arrays: Mapping[str, Any], config: Any) 
     return cls(**parts, config=config)  # type: ignore[call-arg]
 
 
-def paths_of(field: Field, params: Params, plan: Any, links: Query) -> Arrivals:
+def paths_of(field: Field, params: Params, plan: Any, links: Query) -> Paths:
     """Returns all paths of B links, leading axis B, from a field whose `outputs` include "paths".
 
     Raises:
@@ -393,7 +393,7 @@ def paths_of(field: Field, params: Params, plan: Any, links: Query) -> Arrivals:
 
 
 @jax.jit
-def _paths_of(field: Field, params: Params, plan: Any, links: Query) -> Arrivals:
+def _paths_of(field: Field, params: Params, plan: Any, links: Query) -> Paths:
     paths = field.render(params, plan, links).paths
     if paths is None:
         raise UserError(f"the {field.name} field of this run predicts no paths; train the default one on data with a mesh")
@@ -468,7 +468,7 @@ def power_error_db(seen: Observation, batch: Batch) -> Float[Array, ""] | None:
     received = batch.received_db
     if seen.power_db is None or received is None:
         return None
-    measured = received > NOT_HEARD_DB
+    measured = received > NO_PATH_DB
     error, count = jnp.sum(jnp.abs(seen.power_db - received) * measured), jnp.sum(measured)
     return over_all_links(error) / jnp.maximum(over_all_links(count), 1)
 
@@ -487,6 +487,9 @@ def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity
         query: transmitter positions (metres) and frequencies (hertz).
         capacity: static sizes, which a field with a capacity needs under `jit` or `grad`, found on the host:
             `field.capacity(params, stack_receivers([receiver]))`. One that is too small gives NaN, never a wrong spectrum.
+
+    Returns:
+        Spectra (b, 90, 360), amplitudes with a maximum of 1.
     """
     return field.render(params, field.plan(params, receiver, None, capacity), query).pas
 
@@ -495,21 +498,42 @@ _FIELDS: dict[str, type[Field]] = {}
 
 
 def register(cls: type[Field]) -> type[Field]:
-    """Registers a field by its name for command lines and run folders; usable as a decorator."""
+    """Registers a field by its name for command lines and run folders; usable as a decorator.
+
+    Args:
+        cls: the class, with `name` and `presets`.
+
+    Returns:
+        The class itself.
+    """
     _FIELDS[cls.name] = cls
     return cls
 
 
 def field_names() -> list[str]:
-    """Returns the names of all registered fields."""
+    """Returns the names of all registered fields.
+
+    Returns:
+        Names, for `get_field` and `--field`.
+    """
     return list(_FIELDS)
 
 
 def get_field(name: str) -> type[Field]:
     """Returns the class of a field by its name.
 
+    Args:
+        name: "hybrid", "wideband", "wave", "wrfgs", "nerf2", or that of a registered class.
+
+    Returns:
+        The class; its `presets` hold settings, and `build` makes a field of a scene.
+
     Raises:
         UserError: no field of this name is registered.
+
+    Example:
+        >>> get_field("nerf2").outputs
+        ('pas',)
     """
     if name not in _FIELDS:
         raise UserError(f"unknown field {name!r}; choose one of: {', '.join(_FIELDS)}")
@@ -517,7 +541,11 @@ def get_field(name: str) -> type[Field]:
 
 
 def default_field() -> str:
-    """Returns the name of the field that is trained by default."""
+    """Returns the name of the field that is trained by default.
+
+    Returns:
+        A name, for `get_field`.
+    """
     return "hybrid"
 
 

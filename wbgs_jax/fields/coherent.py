@@ -104,7 +104,7 @@ class WaveField(Calibratable):
     name: ClassVar[str] = "wave"
     presets: ClassVar = PRESETS
     outputs: ClassVar = ("pas", "snapshots", "power", "paths")
-    hooks: ClassVar = ("search",)
+    hooks: ClassVar = ("calibration",)
     seconds: ClassVar = {"cpu": 170.0, "smoke": 35.0}
 
     @classmethod

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS as COMMON
-from wbgs_jax.config import SearchConfig, Settings
+from wbgs_jax.config import CalibrationConfig, Settings
 
 MAX_FACETS = 100_000
 """Largest number of facets that has been tested; each may reflect waves and obstruct all other paths."""
@@ -45,7 +45,7 @@ class WaveConfig:
     placement: float = 1e-6
     """Initial standard deviation of the positions of surfaces and transmitters, before calibration, metres."""
     clutter_cells: int = 32_768
-    """Maximum number of cells of the absorption grid, for objects that are not in the mesh (`search.clutter_spectra`)."""
+    """Maximum number of cells of the absorption grid, for objects that the mesh lacks (`calibration.absorption_spectra`)."""
     clutter_cell: float = 0.25
     """Smallest edge length of a cell of the absorption grid, metres."""
     coherent: bool = True
@@ -79,17 +79,19 @@ class WaveConfig:
         if self.max_facets > MAX_FACETS:
             raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {MAX_FACETS}")
         if self.clutter_cells < 1 or self.clutter_cell <= 0:
-            raise UserError(f"--{name}.clutter-cells and -cell must be positive; --search.clutter-spectra 0 disables the grid")
+            raise UserError(
+                f"--{name}.clutter-cells and -cell must be positive; --calibration.absorption-spectra 0 disables the grid"
+            )
 
 
 STEPS = {"smoke": 100, "cpu": 2000, "gpu": 4000}
 """Training steps by preset: few, since only a few numbers per material are learned, and no networks."""
-SEARCH = {
-    "smoke": SearchConfig(
-        rounds=1, spectra=32, antenna_rounds=0, absent_spectra=0, tuning_spectra=0, geometry=False, clutter_spectra=0
+CALIBRATION = {
+    "smoke": CalibrationConfig(
+        rounds=1, spectra=32, antenna_rounds=0, spurious_spectra=0, array_gain_spectra=0, geometry=False, absorption_spectra=0
     ),
-    "cpu": SearchConfig(),
-    "gpu": SearchConfig(),
+    "cpu": CalibrationConfig(),
+    "gpu": CalibrationConfig(),
 }
 
 
@@ -105,7 +107,7 @@ def _preset(name: str) -> Settings:
     common, steps = COMMON[name], STEPS[name]
     optim = dataclasses.replace(common.optim, steps=steps, min_steps=steps // 2, batch=8)
     loop = dataclasses.replace(common.loop, evaluate_every=min(common.loop.evaluate_every, steps // 2))
-    return Settings(CONFIGS[name], optim, loop, search=SEARCH[name])
+    return Settings(CONFIGS[name], optim, loop, calibration=CALIBRATION[name])
 
 
 PRESETS = {name: _preset(name) for name in COMMON}

@@ -34,8 +34,8 @@ from wbgs_jax.fields.mixture import (
     without_floor,
 )
 from wbgs_jax.fields.wideband import WidebandConfig, WidebandField, WidebandParams, WidebandPlan, gaussian_state
-from wbgs_jax.radio.channel import NOT_HEARD_DB
-from wbgs_jax.splat import TileLimits
+from wbgs_jax.radio.channel import NO_PATH_DB
+from wbgs_jax.splat.tiles import TileLimits
 from wbgs_jax.types import Batch, Query, Receiver, Scene
 
 
@@ -87,7 +87,7 @@ class HybridPlan:
 
 def _preset(name: str) -> Settings:
     wave, wideband = WaveField.presets[name], WidebandField.presets[name]
-    return dataclasses.replace(wideband, field=HybridConfig(wave.field, wideband.field), search=wave.search)
+    return dataclasses.replace(wideband, field=HybridConfig(wave.field, wideband.field), calibration=wave.calibration)
 
 
 @register
@@ -104,7 +104,7 @@ class HybridField(Field):
     presets: ClassVar = {name: _preset(name) for name in WaveField.presets}
     outputs: ClassVar = WaveField.outputs
     components: ClassVar = {"wideband": WidebandField, "wave": WaveField}
-    hooks: ClassVar = ("wideband.density", "wave.search", "expert_weights")
+    hooks: ClassVar = ("wideband.density", "wave.calibration", "expert_weights")
     seconds: ClassVar = {"cpu": 700.0, "smoke": 60.0}
 
     @classmethod
@@ -165,7 +165,7 @@ class HybridField(Field):
         )
         inputs = features(query, plan.wave.receiver.position, coherent, own)
         assert own.power_db is not None, "the splatting field predicts received power"
-        met = coherent.power_db > NOT_HEARD_DB  # without any path the coherent field predicts nothing
+        met = coherent.power_db > NO_PATH_DB  # without any path the coherent field predicts nothing
         powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
         floor = jax.lax.stop_gradient(params.trust.floor)  # estimated, not trained
         clean, clean_informed = (without_floor(seen.pas, floor) for seen in (own, informed))

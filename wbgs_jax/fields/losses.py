@@ -49,6 +49,13 @@ def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"], stride: int = 1) 
 
     With a `stride` of k only every k-th window along both axes is used. Adjacent windows overlap by 10 of 11 pixels and have
     nearly the same values, so that a stride of 2 takes a third of the time in training without loss of accuracy.
+
+    Args:
+        a, b: images with values from 0 to 1.
+        stride: distance between the windows used, pixels.
+
+    Returns:
+        The mean SSIM of every pair, at most 1.
     """
     mean_a, mean_b = _blur(a, stride), _blur(b, stride)
     squared_means, product = mean_a**2 + mean_b**2, mean_a * mean_b
@@ -115,7 +122,16 @@ def image_loss(
     predicted: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], ssim_weight: float = 0.2, ssim_stride: int = 1
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Returns the mean loss over the images (paper, equation 5), and their mean SSIM (`ssim`), whose windows have the stride
-    `ssim_stride`."""
+    `ssim_stride`.
+
+    Args:
+        predicted, truth: spectra, from 0 to 1.
+        ssim_weight: weight of one minus the SSIM; the rest is that of the mean absolute difference.
+        ssim_stride: as in `ssim`.
+
+    Returns:
+        The loss and the mean SSIM.
+    """
     l1 = jnp.mean(jnp.abs(predicted - truth))
     similarity = jnp.mean(ssim(predicted, truth, ssim_stride))
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity), similarity

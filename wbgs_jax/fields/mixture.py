@@ -40,7 +40,7 @@ from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.base import Observation, Params
 from wbgs_jax.fields.losses import ssim
 from wbgs_jax.radio.array import EXACT
-from wbgs_jax.radio.channel import NOT_HEARD_DB, beyond_free_space_db
+from wbgs_jax.radio.channel import NO_PATH_DB, beyond_free_space_db
 from wbgs_jax.types import Query
 
 SHARES = np.linspace(0, 1, 21)
@@ -211,7 +211,7 @@ def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[n
     """Returns the negative absolute error (dB) of the mixtures of two received powers with all weights of `SHARES`; 0 for links
     on which nothing was received."""
     mixtures = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
-    return np.where((heard_db > NOT_HEARD_DB)[:, None], -np.abs(mixtures - heard_db[:, None]), 0)
+    return np.where((heard_db > NO_PATH_DB)[:, None], -np.abs(mixtures - heard_db[:, None]), 0)
 
 
 def learn_share(known: Scored) -> Share:

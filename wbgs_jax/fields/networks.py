@@ -202,7 +202,20 @@ FrequencyScale = Literal["log", "ghz"]
 
 def positional_encoding(x: Float[Array, "*n d"], octaves: int) -> Float[Array, "*n d_out"]:
     """Returns (x, sin(2^k x), cos(2^k x), k = 0..octaves-1), which includes the input: d_out = d (1 + 2 octaves)  (NeRF,
-    equation 4)."""
+    equation 4).
+
+    Args:
+        x: coordinates of order 1.
+        octaves: number of doublings of the frequency.
+
+    Returns:
+        The encoding (*n, d (1 + 2 octaves)).
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> positional_encoding(jnp.zeros(3), 6).shape
+        (39,)
+    """
     scaled = x[..., None, :] * (2.0 ** jnp.arange(octaves, dtype=x.dtype))[:, None]
     waves = jnp.concatenate([jnp.sin(scaled), jnp.cos(scaled)], -2)
     return jnp.concatenate([x, waves.reshape((*x.shape[:-1], -1))], -1)
@@ -218,7 +231,16 @@ def scale_frequency(frequency_hz: Float[Array, "*n"], scale: FrequencyScale = "l
 
 
 def frequency_encoding(frequency_hz: Float[Array, "*n"], octaves: int, scale: FrequencyScale = "log") -> Float[Array, "*n d"]:
-    """Returns the positional encoding of the scaled frequency: d = 1 + 2 octaves."""
+    """Returns the positional encoding of the scaled frequency: d = 1 + 2 octaves.
+
+    Args:
+        frequency_hz: of the carriers.
+        octaves: number of doublings of the frequency of the encoding.
+        scale: "log" or "ghz" (`scale_frequency`).
+
+    Returns:
+        The encoding (*n, 1 + 2 octaves).
+    """
     return positional_encoding(scale_frequency(frequency_hz, scale)[..., None], octaves)
 
 

@@ -16,7 +16,19 @@ def predict_blocks(
     """Yields the spectra or powers (float32) of n queries in order, in blocks, so that the results need not fit in memory.
 
     Positions are (n, 3) in metres; frequencies are (n,) or a single one in hertz. All blocks are evaluated with the same shape,
-    so that one compilation suffices. A block has `block` queries per device; `predictor` divides it among the devices.
+    so that one compilation suffices. A block has `block` queries per device; `make_predictor` divides it among the devices.
+
+    Args:
+        predict: from `make_predictor`, `make_power_predictor` or `load_exported`.
+        tx_positions: (n, 3), world frame, metres.
+        frequencies_hz: (n,) or one, hertz.
+        block: queries per device that are evaluated at once.
+
+    Yields:
+        Arrays (k, 90, 360) or (k,), at most `block` queries per device in each.
+
+    Raises:
+        ValueError: the shapes of positions and frequencies do not match.
     """
     positions = np.atleast_2d(np.asarray(tx_positions, np.float32))
     frequencies = np.broadcast_to(np.asarray(frequencies_hz, np.float32), len(positions))
@@ -32,7 +44,14 @@ def predict_blocks(
 def predict_many(
     predict: Predictor, tx_positions: Any, frequencies_hz: Any, block: int = BLOCK
 ) -> Float[np.ndarray, " n *answer"]:
-    """Returns the blocks of `predict_blocks` as one array."""
+    """Returns the blocks of `predict_blocks` as one array.
+
+    Args:
+        predict, tx_positions, frequencies_hz, block: as in `predict_blocks`.
+
+    Returns:
+        Spectra (n, 90, 360), or powers (n,) in dB, float32.
+    """
     n, done = len(np.atleast_2d(tx_positions)), 0
     answers = None
     for part in predict_blocks(predict, tx_positions, frequencies_hz, block):
@@ -48,6 +67,19 @@ def map_queries(
     """Returns the positions (metres) and frequencies (hertz) of a map at one height, with x fastest, then y, then frequency.
 
     The results of the n = frequencies * ys * xs queries can be reshaped to (frequencies, ys, xs, ...).
+
+    Args:
+        xs, ys: coordinates of the columns and of the rows, world frame, metres.
+        height: of the transmitters, metres.
+        frequencies_hz: one or several, hertz.
+
+    Returns:
+        Positions (n, 3) and frequencies (n,).
+
+    Example:
+        >>> positions, frequencies = map_queries([0.0, 1.0], [5.0], 1.5, 2.4e9)
+        >>> positions.tolist(), frequencies.tolist()
+        ([[0.0, 5.0, 1.5], [1.0, 5.0, 1.5]], [2400000000.0, 2400000000.0])
     """
     frequency, y, x = np.meshgrid(np.atleast_1d(frequencies_hz), np.atleast_1d(ys), np.atleast_1d(xs), indexing="ij")
     return np.stack([x, y, np.full(x.shape, height)], -1).reshape(-1, 3).astype(float), frequency.reshape(-1).astype(float)
@@ -56,5 +88,13 @@ def map_queries(
 def predict_map(
     predict: Predictor, xs: Any, ys: Any, height: float, frequencies_hz: Any, block: int = BLOCK
 ) -> Float[np.ndarray, " n *answer"]:
-    """Returns the spectra (float32, 130 kB each) or powers for a map of transmitters, in the order of `map_queries`."""
+    """Returns the spectra (float32, 130 kB each) or powers for a map of transmitters, in the order of `map_queries`.
+
+    Args:
+        predict, block: as in `predict_blocks`.
+        xs, ys, height, frequencies_hz: as in `map_queries`.
+
+    Returns:
+        Spectra (frequencies * ys * xs, 90, 360), or powers, float32.
+    """
     return predict_many(predict, *map_queries(xs, ys, height, frequencies_hz), block)

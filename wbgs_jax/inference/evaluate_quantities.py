@@ -30,13 +30,13 @@ from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.transport import mimo_matrix, snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import best_beams, cbf, pas_directions, planar_array, steering_vector
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MIN_FREQUENCY_HZ, Query, Receiver, make_query
 
 Answer = dict[str, np.ndarray]
 """Arrays by name, with leading axes (tx, freq), or the columns of a table."""
 DEFAULTS = Options()
-OfArrivals = Callable[[Arrivals, Receiver, Any], Array]
+OfPaths = Callable[[Paths, Receiver, Any], Array]
 """(paths of one link, receiver, frequency_hz) -> a quantity of the link."""
 
 
@@ -71,7 +71,7 @@ class LoadedField:
         """Provenance of the predictions: scene, field, step, version, receiver, and levels of the prediction intervals."""
         receiver = {name: np.asarray(getattr(self.receiver, name)).tolist() for name in ("position", "orientation")}
         origin = {name: value for name, value in self.trained.origin().items() if name in ("field", "step")}
-        learned = {"interval_level": self.trained.confidence, "power_interval_level": self.trained.power_confidence}
+        learned = {"interval_level": self.trained.intervals, "power_interval_level": self.trained.power_intervals}
         levels = {name: round(float(own.level), 4) for name, own in learned.items() if own is not None}
         return {"scene": self.dataset.name, "version": wbgs_jax.__version__, "receiver": receiver} | origin | levels
 
@@ -171,7 +171,7 @@ def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarr
     query = _queries(tx_positions, frequencies_hz)
     seen = observe_queries(at.trained, at.receiver, query)
     answer = {"pas": _shaped(seen.pas, tx_positions, frequencies_hz)}
-    confidence = for_receiver(at.trained.confidence, at.receiver)
+    confidence = for_receiver(at.trained.intervals, at.receiver)
     if confidence is not None:
         power = None if seen.power_db is None else np.asarray(seen.power_db)
         expected = expect_many(
@@ -188,7 +188,7 @@ def _snapshots(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.nda
 
 def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns received powers, dB relative to the transmitted power, and their prediction intervals if the run has them."""
-    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_confidence
+    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_intervals
     power = observe_queries(at.trained, at.receiver, query, "power_db")
     answer = {"power_db": power}
     if learned is not None:
@@ -204,7 +204,7 @@ def _best_beams(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.nd
 
 
 def _from_arrivals(
-    name: str, function: OfArrivals, at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
+    name: str, function: OfPaths, at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
 ) -> Answer:
     """Returns a quantity that is computed from the paths of each link."""
     found = map_blocks(
@@ -216,27 +216,27 @@ def _from_arrivals(
 
 
 @partial(jax.jit, static_argnames=("function",))
-def _measure(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfArrivals) -> Any:
+def _measure(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfPaths) -> Any:
     arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
 
 
-def _beamforming_gain(arrivals: Arrivals, receiver: Receiver, frequency_hz: Any) -> Array:
+def _beamforming_gain(arrivals: Paths, receiver: Receiver, frequency_hz: Any) -> Array:
     y = snapshots_from_paths(arrivals, receiver, frequency_hz)
     directions = jnp.asarray(pas_directions(), jnp.float32)
     strongest = jnp.max(cbf(y, steering_vector(receiver.element_wavelengths(frequency_hz), directions)))
     return channel.beamforming_gain_db(y, strongest)
 
 
-def _k_factor(arrivals: Arrivals, *_: Any) -> Array:
+def _k_factor(arrivals: Paths, *_: Any) -> Array:
     return channel.k_factor_db(arrivals)
 
 
-def _angular_spread(arrivals: Arrivals, *_: Any) -> Array:
+def _angular_spread(arrivals: Paths, *_: Any) -> Array:
     return channel.angular_spread_deg(arrivals)
 
 
-def _delay_spread(arrivals: Arrivals, *_: Any) -> Array:
+def _delay_spread(arrivals: Paths, *_: Any) -> Array:
     return channel.delay_spread_s(arrivals)
 
 
@@ -310,16 +310,29 @@ EVALUATE: dict[str, Callable[[LoadedField, np.ndarray, np.ndarray], Answer]] = {
 """Functions of `quantities.QUANTITIES` by name: (field, tx_positions (tx, 3), frequencies_hz (freq,)) -> `Answer`."""
 
 
-def arrivals_of(
+def predict_paths(
     trained: TrainedField, receiver: Receiver, tx_positions: Float[np.ndarray, "tx 3"], frequency_hz: float
-) -> Arrivals:
+) -> Paths:
     """Returns the paths from transmitters at one frequency, as NumPy arrays with a leading axis of transmitters.
+
+    Args:
+        trained: a field that predicts paths.
+        receiver: receiver; for one that is not in the training data, call `at_receiver` first.
+        tx_positions: (tx, 3), world frame, metres.
+        frequency_hz: of the carrier.
+
+    Returns:
+        `wbgs_jax.Paths` with arrays (tx, k, ...), whose methods `cir`, `cfr` and `taps` are the channel.
 
     Raises:
         UserError: the field does not predict paths.
+
+    Example:
+        >>> paths = predict_paths(trained, trained.dataset().receiver(), positions, 28e9)  # doctest: +SKIP
+        >>> response = paths.cfr(jnp.linspace(-200e6, 200e6, 64))  # (tx, 64)  # doctest: +SKIP
     """
     check_quantity("paths", trained.field)
     plan = trained.field.plan(trained.params, receiver)
     query = make_query(np.asarray(tx_positions), np.full(len(tx_positions), frequency_hz))
-    found: Arrivals = map_blocks(lambda block: paths_of(trained.field, trained.params, plan, block), query, BLOCK)
+    found: Paths = map_blocks(lambda block: paths_of(trained.field, trained.params, plan, block), query, BLOCK)
     return found

@@ -62,9 +62,9 @@ class FrozenField(NamedTuple):
 
 def freeze(trained: TrainedField, receiver: Receiver) -> FrozenField:
     """Returns a trained field (`trained_field.at_receiver`) with its plan for a receiver."""
-    neighbours, confidence = (for_receiver(one, receiver) for one in (trained.neighbours, trained.confidence))
+    neighbours, confidence = (for_receiver(one, receiver) for one in (trained.correction, trained.intervals))
     plan = trained.field.plan(trained.params, receiver)
-    return FrozenField(trained.field, trained.params, plan, neighbours, confidence, trained.power_confidence, receiver)
+    return FrozenField(trained.field, trained.params, plan, neighbours, confidence, trained.power_intervals, receiver)
 
 
 def answer_all(frozen: FrozenField, query: Query, names: Sequence[str]) -> dict[str, Array]:
@@ -94,14 +94,14 @@ def frozen_outputs(trained: TrainedField, dataset: Dataset) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ExportedField:
-    """A field read by `load_exported`. It is called like a `predictor`, with batches: `jax.vmap` is not supported. It can be
-    differentiated once with reverse-mode `jax.grad`."""
+    """A field read by `load_exported`. It is called like the result of `make_predictor`, with batches: `jax.vmap` is not
+    supported. It can be differentiated once with reverse-mode `jax.grad`."""
 
     metadata: dict[str, Any]
     """The content of `metadata.json`."""
     predict: Predictor
     observe: Callable[[Any, Any], dict[str, Array]]
-    """Function (tx_position, frequency_hz) -> all outputs by name; the arguments are those of a `predictor`."""
+    """Function (tx_position, frequency_hz) -> all outputs by name; arguments as in `make_predictor`'s result."""
 
     def __call__(self, tx_position: Any, frequency_hz: Any) -> Float[Array, "*b 90 360"]:
         return self.predict(tx_position, frequency_hz)
@@ -112,7 +112,11 @@ def export_field(
 ) -> None:
     """Writes a trained field to one file (a zip archive) that runs on all of `platforms`, a selection of `PLATFORMS`.
 
-    `dataset` is the training data; it is loaded if it is not passed.
+    Args:
+        trained: a trained field.
+        path: of the file.
+        platforms: those on which the file is to run.
+        dataset: the training data; loaded if not passed.
 
     Raises:
         UserError: a platform is unknown, the file cannot be written, or the run's data are missing.
@@ -182,6 +186,12 @@ def _no_source_locations() -> Iterator[None]:
 
 def load_exported(path: Path | str) -> ExportedField:
     """Returns a field that `export_field` wrote. The model's code is not needed.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The field, called like the result of `make_predictor`, with its `metadata`.
 
     Raises:
         UserError: the file is missing, damaged, not an exported field, or of an unsupported version.

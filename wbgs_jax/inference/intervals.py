@@ -7,8 +7,8 @@ expected absolute error and a 90 % bound on it, both in decibels.
 The features are selected on the validation part, and the ends of the interval are quantiles of the residuals there (split
 conformal prediction, Lei et al. 2018). The coverage is therefore valid for transmitters drawn from the same distribution as
 those of the validation part, not for others (`domain.Domain` excludes queries outside of the scene and of the band). An SSIM
-below 0 counts as 0, so that all expected scores and ends of intervals lie between 0 and 1. The few mixture weights of a hybrid field were learned on the same transmitters,
-for which its predictions are slightly too good.
+below 0 counts as 0, so that all expected scores and ends of intervals lie between 0 and 1. The few mixture weights of a hybrid
+field were learned on the same transmitters, for which its predictions are slightly too good.
 """
 
 from pathlib import Path
@@ -155,6 +155,9 @@ def expected_ssim(
         pas: the predicted spectra.
         query: the queries.
         power_db: the received powers predicted by the field; if omitted, the mean of the feature that depends on them is used.
+
+    Returns:
+        Expected SSIM and the two ends of its prediction interval (b,).
     """
     known = features(pas, query, confidence.rx_position, confidence.tx_position, power_db)
     if power_db is None:
@@ -175,6 +178,9 @@ def expected_power(
         power_db: the predicted powers.
         query: the queries.
         rx_position: position of the receiver, or one per query, world frame, metres.
+
+    Returns:
+        Expected absolute error and the bound of the prediction interval (b,), dB.
     """
     error = _log_error(confidence, power_features(power_db, query, rx_position, confidence.tx_position))
     bounds = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))

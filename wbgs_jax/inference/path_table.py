@@ -11,7 +11,7 @@ from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import paths_of
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
+from wbgs_jax.radio.channel import Paths, decibels, doppler_hz
 from wbgs_jax.types import Query, make_query
 
 WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
@@ -56,7 +56,7 @@ def path_table(
 @jax.jit
 def _link(
     field: Field, params: Any, plan: Any, query: Query, tx_velocity: Array, rx_velocity: Array
-) -> tuple[Arrivals, Float[Array, " k"]]:
+) -> tuple[Paths, Float[Array, " k"]]:
     """Returns the paths of one query and their Doppler shifts."""
     found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))
     return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)

@@ -32,7 +32,7 @@ Predictor = Callable[[Any, Any], Array]
 """(tx_position (*b, 3) metres, frequency_hz (*b,)) -> PAS (*b, 90, 360) or power (*b,); leading axes broadcast like NumPy's."""
 
 
-def predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
+def make_predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> PAS, which supports `jit`, `vmap` and one
     reverse-mode `grad`.
 
@@ -40,15 +40,35 @@ def predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predic
     receiver of the training data, which are read to obtain it; for a receiver that is not in the training data, call
     `at_receiver` first. The function is compiled for every new number of queries; `batching.predict_many` keeps that number
     fixed.
+
+    Args:
+        trained: a trained field.
+        receiver: by default the first one of the training data.
+
+    Returns:
+        The function; for positions (b, 3) or (3,) in metres and frequencies in hertz it returns spectra (b, 90, 360) or (90,
+        360).
+
+    Example:
+        >>> predict = make_predictor(load_trained("runs/try"))  # doctest: +SKIP
+        >>> predict([1.0, 0.5, 1.5], [2.4e9, 28e9]).shape  # doctest: +SKIP
+        (2, 90, 360)
     """
     receiver = trained.dataset().receiver() if receiver is None else receiver
-    plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.neighbours, receiver)
+    plan, neighbours = trained.field.plan(trained.params, receiver), for_receiver(trained.correction, receiver)
     return OnAnyShape(_Shared("pas", (trained.field, trained.params, plan), (neighbours,)))
 
 
-def power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
+def make_power_predictor(trained: TrainedField, receiver: Receiver | None = None) -> Predictor:
     """Returns a trained field as a pure function (tx_position, frequency_hz) -> received power relative to the transmitted
-    power (dB); otherwise as `predictor`.
+    power (dB); otherwise as `make_predictor`.
+
+    Args:
+        trained: a trained field.
+        receiver: by default the first one of the training data.
+
+    Returns:
+        The function; powers (b,), or () for one position.
 
     Raises:
         UserError: the field does not predict power, or was trained on spectra, which have no scale.
@@ -190,7 +210,7 @@ def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, qua
     The preparation for a transmitter is shared by all of its frequencies. Powers have no scale if the training data had none
     (`check_power`). The queries are divided among the devices.
     """
-    field, params, neighbours = trained.field, trained.params, for_receiver(trained.neighbours, receiver)
+    field, params, neighbours = trained.field, trained.params, for_receiver(trained.correction, receiver)
     count = len(query.frequency_hz)
     devices = _devices(count)
     tx_index = jnp.asarray(group_transmitters(np.asarray(query.tx_position)), jnp.int32)
@@ -241,7 +261,7 @@ def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"
     seen = observe_links(trained.field, trained.params, dataset, index)
     if dataset.n_receivers > 1:
         return seen
-    neighbours = for_receiver(trained.neighbours, dataset.receiver())
+    neighbours = for_receiver(trained.correction, dataset.receiver())
     return seen._replace(pas=jnp.asarray(corrected(neighbours, np.asarray(seen.pas), dataset, index)))
 
 

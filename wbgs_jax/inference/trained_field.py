@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from wbgs_jax._util.public_names import warn_renamed
 from wbgs_jax.config import Settings
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, check_data
@@ -82,11 +83,11 @@ class TrainedField:
     step: int
     seconds: float
     """Training time."""
-    neighbours: Beside = None
-    """Measured spectra that correct its predictions."""
-    confidence: Confidence | None = None
+    correction: Beside = None
+    """Measured spectra that correct its predictions: residual kriging, or a mixture with simple methods."""
+    intervals: Confidence | None = None
     """Regression for the prediction intervals of spectra."""
-    power_confidence: PowerConfidence | None = None
+    power_intervals: PowerConfidence | None = None
     """Regression for the prediction intervals of received powers."""
     data: str = ""
     """Checksum of the training data; empty if it was not recorded."""
@@ -94,6 +95,24 @@ class TrainedField:
     def dataset(self) -> Dataset:
         """Returns the training data; different data of the same name are a `UserError`."""
         return check_data(self.config.dataset(), self.data, f"this run ({self.config.source})")
+
+    @property
+    def neighbours(self) -> Beside:
+        """`correction` by its earlier name."""
+        warn_renamed("wbgs_jax.TrainedField.neighbours", "correction")
+        return self.correction
+
+    @property
+    def confidence(self) -> Confidence | None:
+        """`intervals` by its earlier name."""
+        warn_renamed("wbgs_jax.TrainedField.confidence", "intervals")
+        return self.intervals
+
+    @property
+    def power_confidence(self) -> PowerConfidence | None:
+        """`power_intervals` by its earlier name."""
+        warn_renamed("wbgs_jax.TrainedField.power_confidence", "power_intervals")
+        return self.power_intervals
 
     def origin(self) -> dict[str, Any]:
         """Returns its provenance: field, preset, seed and step."""
@@ -105,7 +124,15 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
 
     For a receiver of its data, the field is returned unchanged. For any other receiver, its receiver-independent part (the
     coherent field) is returned, without residual kriging or mixture and without prediction intervals, for which there are no
-    measurements at that receiver. `dataset` is the training data, if they are already loaded.
+    measurements at that receiver.
+
+    Args:
+        trained: a trained field.
+        receiver: the receiver to be predicted for.
+        dataset: the training data; loaded if not passed.
+
+    Returns:
+        The field for this receiver.
 
     Raises:
         UserError: no part of the field is receiver-independent.
@@ -114,7 +141,7 @@ def at_receiver(trained: TrainedField, receiver: Receiver, dataset: Dataset | No
     if any(_same(dataset.receiver(number), receiver) for number in range(dataset.n_receivers)):
         return trained
     field, params = trained.field.receiver_independent(trained.params)
-    return dataclasses.replace(trained, field=field, params=params, neighbours=None, confidence=None, power_confidence=None)
+    return dataclasses.replace(trained, field=field, params=params, correction=None, intervals=None, power_intervals=None)
 
 
 def at_receivers(trained: TrainedField, dataset: Dataset) -> TrainedField:

@@ -173,6 +173,9 @@ def read_deepmimo(
         tx_set, tx, rx_set: choice among several pairs of a transmitter and a set of users; by default the first transmitter,
             and the largest set of users that are not transmitters.
 
+    Returns:
+        The arrays in the scenario's units: degrees, seconds, dB.
+
     Raises:
         UserError: the scenario does not exist, or an array is missing.
     """
@@ -193,6 +196,9 @@ def load_deepmimo(
         path: folder or file.
         frequency_hz: needed if no params.json records it.
         tx_set, tx, rx_set: as in `read_deepmimo`.
+
+    Returns:
+        The paths, in radians and seconds.
 
     Raises:
         UserError: the scenario does not exist, an array is missing, or the frequency is unknown or contradicts the recorded
@@ -298,7 +304,14 @@ def write_deepmimo(
     folder: Path | str, arrays: dict[str, np.ndarray], frequency_hz: float, tx_set: int = 1, tx: int = 0, rx_set: int = 0
 ) -> None:
     """Writes arrays as the .npz files of a scenario into a folder, which DeepMIMO loads; further transmitters of the same users
-    may be added."""
+    may be added.
+
+    Args:
+        folder: of the scenario; made if it does not exist.
+        arrays: from `as_deepmimo`.
+        frequency_hz: of the carrier.
+        tx_set, tx, rx_set: numbers in the names of the files.
+    """
     write_pair(Path(folder), Pair(tx_set, tx, rx_set), arrays, frequency_hz)
 
 
@@ -309,6 +322,9 @@ def from_deepmimo(arrays: dict[str, np.ndarray], frequency_hz: float, propagatio
         arrays: of `read_deepmimo`.
         frequency_hz: of the carrier, recorded in the scenario's parameters.
         propagation: whether phases include the propagation, if lines of sight do not reveal it.
+
+    Returns:
+        The paths, in radians and seconds.
     """
     power = np.asarray(arrays["power"], np.float64)
     valid = np.isfinite(power)
@@ -349,7 +365,15 @@ def _includes_propagation(
 
 
 def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
-    """Returns the paths of one transmitter to all receivers as a scenario's arrays, for each receiver the strongest first."""
+    """Returns the paths of one transmitter to all receivers as a scenario's arrays, for each receiver the strongest first.
+
+    Args:
+        paths: from one or more transmitters.
+        transmitter: index of the one that is exported.
+
+    Returns:
+        Arrays by the names that DeepMIMO gives them: degrees, seconds, dB.
+    """
     a = np.where(paths.valid, paths.a, 0)[:, transmitter]
     order = np.argsort(-np.abs(a), -1, kind="stable")
     valid = np.take_along_axis(paths.valid[:, transmitter], order, -1)

@@ -46,6 +46,9 @@ def write_gaussians(
         colours: red, green, blue from 0 to 1; grey by default.
         opacity: from 0 to 1; by default that of the Gaussians, `sigmoid(opacity_logits)`.
 
+    Returns:
+        Number of Gaussians in the file.
+
     Raises:
         UserError: the file cannot be written.
     """
@@ -68,6 +71,12 @@ def write_gaussians(
 
 def read_gaussians(path: Path | str) -> tuple[Gaussians, Float[np.ndarray, "n 3"]]:
     """Returns the Gaussians of a splatting PLY file, and their colours from 0 to 1.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        Gaussians (world frame, metres) and red, green, blue (n, 3).
 
     Raises:
         UserError: the file is missing, damaged, or has no Gaussians.

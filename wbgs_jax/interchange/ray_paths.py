@@ -103,6 +103,9 @@ def from_sionna(paths: Any, frequency_hz: float | None = None, antennas: tuple[i
         antennas: indices of the receivers' and of the transmitters' antenna, if devices have several. With a synthetic array
             the coefficients contain the phase of the antenna's offset from the device's position.
 
+    Returns:
+        The paths, in radians and seconds.
+
     Raises:
         UserError: an array is missing or has other axes, or devices have several antennas and none is chosen.
     """
@@ -157,17 +160,20 @@ def check_arrays(arrays: Mapping[str, np.ndarray], what: str) -> None:
             raise UserError(f"{name} of {what} has shape {values.shape}, which does not fit a with {of_a}")
 
 
-def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
+def from_paths(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz: float) -> RayPaths:
     """Returns the paths predicted by a field (`fields.base.paths_of`) from T transmitters at one frequency to a single element
     at the centre of the receiver's array.
 
     Transmissions have no position (NaN): a field records which walls a path crosses, and where it is reflected or diffracted.
 
     Args:
-        arrivals: `wbgs_jax.radio.channel.Arrivals` with a leading axis T.
+        arrivals: `wbgs_jax.radio.channel.Paths` with a leading axis T.
         tx_positions: (T, 3), metres, world frame.
         rx_position: (3,), metres, world frame.
         frequency_hz: frequency of the arrivals.
+
+    Returns:
+        The paths with one receiver, in radians and seconds.
     """
     amplitude, length = np.asarray(arrivals.amplitude, np.complex128), np.asarray(arrivals.length, np.float64)
     tau = length / SPEED_OF_LIGHT
@@ -192,7 +198,12 @@ def from_arrivals(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_
 
 
 def save_paths(path: Path | str, paths: RayPaths) -> None:
-    """Writes paths as an .npz file with the arrays of `RayPaths.as_sionna`."""
+    """Writes paths as an .npz file with the arrays of `RayPaths.as_sionna`.
+
+    Args:
+        path: of the file.
+        paths: to be written.
+    """
     arrays: dict[str, Any] = paths.as_sionna()
     with atomic_write(path) as stream:
         np.savez_compressed(stream, **arrays)
@@ -201,6 +212,13 @@ def save_paths(path: Path | str, paths: RayPaths) -> None:
 def load_paths(path: Path | str, frequency_hz: float | None = None) -> RayPaths:
     """Returns the paths of an .npz file with the arrays of `sionna.rt.Paths` by name, between single antennas; `a` may be
     complex, or `a_real` and `a_imag`.
+
+    Args:
+        path: of the file.
+        frequency_hz: of the carrier; needed if the file does not record it.
+
+    Returns:
+        The paths, in radians and seconds.
 
     Raises:
         UserError: the file is missing, damaged, or does not contain paths.

@@ -39,6 +39,9 @@ def scene_of_paths(
         seed: of the split.
         room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
 
+    Returns:
+        The scene, for `save_scene`.
+
     Raises:
         UserError: positions are unknown or differ, or there are too few transmitters.
     """
@@ -94,6 +97,9 @@ def scene_of_snapshots(
         faces: triangles.
         seed: of the split.
         room: the scene's surfaces with objects and materials (`load_room`), instead of `vertices` and `faces`.
+
+    Returns:
+        The scene, for `save_scene`.
 
     Raises:
         UserError: there are too few transmitters, or the shapes do not match.

@@ -78,6 +78,9 @@ def scene_of_sionna(
         room: the scene's surfaces (`load_room`).
         source: name of the paths in error messages; by default the name of the scene.
 
+    Returns:
+        The scene, for `save_scene`.
+
     Raises:
         UserError: something is missing or contradictory, or several antennas require a choice.
     """

@@ -1,1 +1,5 @@
 """Maps of received power, learned from measured powers (readings)."""
+
+from wbgs_jax._util.public_names import attach
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -92,6 +92,9 @@ def learn_map(readings: Readings, walls: Walls = NO_WALLS, scales: Scales | None
         walls: of the floor plan.
         scales: standard deviations of the residuals; by default they are learned.
 
+    Returns:
+        The map, a pytree for `received_power`.
+
     Raises:
         UserError: too few powers, or too many positions.
     """
@@ -125,6 +128,9 @@ def received_power(learned: PowerMap, tx_position: Float[Array, "b 3"]) -> tuple
     Args:
         learned: the map.
         tx_position: metres.
+
+    Returns:
+        Mean (b, r), dBm, and standard deviation (b, r), dB.
     """
     features = _law_features(tx_position, learned.receivers, learned.walls)
     room, wall = learned.scales[:2]

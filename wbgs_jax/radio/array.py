@@ -39,6 +39,18 @@ def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float
 
     The order is that of Sionna RT's `PlanarArray` with identity orientation: columns of elements from -y to +y, each from
     +z down to -z.
+
+    Args:
+        rows: number of elements along z.
+        columns: number of elements along y.
+        spacing: distance of adjacent elements, wavelengths.
+
+    Returns:
+        Positions (rows * columns, 3).
+
+    Example:
+        >>> planar_array(1, 2).tolist()
+        [[0.0, -0.25, 0.0], [0.0, 0.25, 0.0]]
     """
     y = (np.arange(columns) - (columns - 1) / 2) * spacing
     z = ((rows - 1) / 2 - np.arange(rows)) * spacing
@@ -56,7 +68,12 @@ def _pas_directions() -> Float[np.ndarray, "90 360 3"]:
 
 
 def pas_directions() -> Float[np.ndarray, "90 360 3"]:
-    """Returns the unit vectors (float64, read-only) of the PAS pixels in the receiver's local frame."""
+    """Returns the unit vectors (float64, read-only) of the PAS pixels in the receiver's local frame.
+
+    Returns:
+        Unit vectors (90, 360, 3) in the receiver's frame, NumPy: rows from the zenith down, columns from azimuth -180 degrees
+        on.
+    """
     return _pas_directions()
 
 
@@ -64,7 +81,20 @@ def pas_directions() -> Float[np.ndarray, "90 360 3"]:
 def steering_vector(
     element_positions: Float[Array, "elements 3"], directions: Float[Array, "*n 3"]
 ) -> Complex[Array, "*n elements"]:
-    """Returns the element phases exp(+j 2 pi p.k) of plane waves from unit vectors `directions`; positions in wavelengths."""
+    """Returns the element phases exp(+j 2 pi p.k) of plane waves from unit vectors `directions`; positions in wavelengths.
+
+    Args:
+        element_positions: in the receiver's frame, wavelengths.
+        directions: unit vectors towards the sources, receiver's frame.
+
+    Returns:
+        Phase factors (*n, elements), complex64.
+
+    Example:
+        >>> import numpy as np
+        >>> np.round(steering_vector(np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), np.array([1.0, 0.0, 0.0])).real).tolist()
+        [1.0, -1.0]
+    """
     return phasor(jnp.matmul(directions, element_positions.T, precision=EXACT))
 
 
@@ -91,7 +121,15 @@ def array_response(
 
 
 def cbf(snapshot: Complex[Array, "*n elements"], steering: Complex[Array, "*m elements"]) -> Float[Array, "*nm"]:
-    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and steering vector; shape (*n, *m)."""
+    """Returns the amplitude of conventional beamforming |a^H y| for every snapshot and steering vector; shape (*n, *m).
+
+    Args:
+        snapshot: complex voltages of the elements.
+        steering: from `steering_vector`.
+
+    Returns:
+        Amplitudes (*n, *m); N elements in phase give N times the voltage of one.
+    """
     return jnp.abs(jnp.tensordot(snapshot, steering.conj(), axes=[[-1], [-1]], precision=EXACT))
 
 
@@ -102,6 +140,13 @@ def snapshot_to_pas(
     """Returns the power angular spectra, each scaled to a maximum of 1, of complex array snapshots; zeros for a zero snapshot.
 
     Element positions are in wavelengths: one set for all snapshots, or one for each (an array of fixed size in metres).
+
+    Args:
+        snapshot: complex voltages of the elements, in any unit.
+        element_positions: in the receiver's frame, wavelengths.
+
+    Returns:
+        Spectra (*n, 90, 360), amplitudes.
     """
     snapshot = jnp.asarray(snapshot)
     positions = jnp.asarray(element_positions, snapshot.real.dtype)

@@ -1,6 +1,6 @@
 """Channel quantities: received power, beamforming gain, K-factor, delay and angular spread, and correlation of snapshots.
 
-All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Arrivals` the amplitudes and
+All functions are pure. A `snapshot` holds the complex voltages of the receiver's elements, `Paths` the amplitudes and
 geometry of all paths. Leading axes are batch axes.
 """
 
@@ -8,13 +8,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude, steering_vector, wide_covariance_to_pas
 
 
-class Arrivals(NamedTuple):
-    """Amplitudes and geometry of K paths at a receiver."""
+class Paths(NamedTuple):
+    """Amplitudes and geometry of K paths at a receiver.
+
+    `cir`, `cfr` and `taps` are the impulse response, the frequency response and the taps of the channel from the transmitter to
+    an element at the array's centre, with the definitions of Sionna RT's `Paths` and for one instant.
+    """
 
     amplitude: Complex[Array, "*b k"]
     """Complex amplitude at the array's centre, including the carrier phase; 0 for padding."""
@@ -37,12 +42,100 @@ class Arrivals(NamedTuple):
     points: Float[Array, "*b k 5 3"] | None = None
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
 
+    def cir(self, normalize_delays: bool = True) -> tuple[Complex[Array, "*b k"], Float[Array, "*b k"]]:
+        """Returns the impulse response: sum over k of a_k delta(t - tau_k), in complex baseband around the carrier.
+
+        Args:
+            normalize_delays: whether the delays of every link are counted from its first path.
+
+        Returns:
+            Amplitudes a (*b, k), with the phase of the carrier at every path's full length, and 0 for padding; delays tau
+            (*b, k), seconds, and -1 for padding.
+        """
+        amplitude = jnp.asarray(self.amplitude)
+        valid, tau = amplitude != 0, jnp.asarray(self.length) / SPEED_OF_LIGHT
+        if normalize_delays:
+            first = jnp.min(jnp.where(valid, tau, jnp.inf), -1, keepdims=True)
+            tau = tau - jnp.where(jnp.isfinite(first), first, 0)
+        return amplitude, jnp.where(valid, tau, -1)
+
+    def cfr(
+        self, frequencies_hz: Float[Array, " f"], normalize_delays: bool = True, normalize: bool = False
+    ) -> Complex[Array, "*b f"]:
+        """Returns the frequency response in complex baseband: sum over k of a_k exp(-2 pi j f tau_k).
+
+        The amplitudes are those at the carrier: over a band in which materials change, query the field at every frequency.
+
+        Args:
+            frequencies_hz: relative to the carrier, such as those of OFDM subcarriers.
+            normalize_delays: whether the delays of every link are counted from its first path.
+            normalize: whether the mean of |H|^2 over the frequencies is 1 for every link (links without paths stay 0).
+
+        Returns:
+            H (*b, f), relative to the transmitted amplitude unless it is normalised.
+
+        Example:
+            >>> import jax.numpy as jnp, wbgs_jax as wb
+            >>> one = wb.Paths(jnp.array([1.0 + 0j, 0.5]), jnp.zeros((2, 3)), jnp.array([3.0, 3.0 + 299.792458]))
+            >>> [round(float(abs(h)), 3) for h in one.cfr(jnp.array([0.0, 0.5e6]))]  # one path is a microsecond later
+            [1.5, 0.5]
+        """
+        a, tau = self.cir(normalize_delays)
+        cycles = jnp.asarray(frequencies_hz, tau.dtype)[:, None] * tau[..., None, :]
+        response = jnp.sum(a[..., None, :] * jnp.exp(-2j * jnp.pi * (cycles - jnp.round(cycles))), -1)
+        return _with_energy(response, response.shape[-1]) if normalize else response
+
+    def taps(
+        self,
+        bandwidth_hz: float,
+        l_min: int = -6,
+        l_max: int | None = None,
+        normalize_delays: bool = True,
+        normalize: bool = False,
+    ) -> Complex[Array, "*b taps"]:
+        """Returns the taps of the channel sampled at the bandwidth, by sinc interpolation: h_l = sum over k of
+        a_k sinc(l - W tau_k).
+
+        Args:
+            bandwidth_hz: bandwidth W; taps are 1 / W apart.
+            l_min: index of the first tap; negative, because a sinc begins before its path arrives.
+            l_max: index of the last tap; by default 6 taps after the last path, which is not possible under `jax.jit`.
+            normalize_delays: whether the delays of every link are counted from its first path.
+            normalize: whether the sum of |h_l|^2 is 1 for every link (links without paths stay 0).
+
+        Returns:
+            h (*b, l_max - l_min + 1), relative to the transmitted amplitude unless it is normalised.
+
+        Example:
+            >>> import jax.numpy as jnp, wbgs_jax as wb
+            >>> one = wb.Paths(jnp.array([1.0 + 0j, 0.5]), jnp.zeros((2, 3)), jnp.array([3.0, 3.0 + 299.792458]))
+            >>> [round(float(abs(h)), 3) for h in one.taps(2e6, l_min=0, l_max=3)]  # one path is two samples later
+            [1.0, 0.0, 0.5, 0.0]
+        """
+        a, tau = self.cir(normalize_delays)
+        last = int(np.ceil(bandwidth_hz * float(jnp.max(tau, initial=0)))) + 6 if l_max is None else l_max
+        index = jnp.arange(l_min, last + 1, dtype=tau.dtype)
+        taps = jnp.sum(a[..., None, :] * jnp.sinc(index[:, None] - bandwidth_hz * tau[..., None, :]), -1)
+        return _with_energy(taps, 1) if normalize else taps
+
+
+Arrivals = Paths
+"""The same class, by the name that `propagation` and the coherent field still use, where `Paths` are traced points."""
+
+
+def _with_energy(values: Complex[Array, "*b n"], energy: int) -> Complex[Array, "*b n"]:
+    """Returns values scaled so that their squared magnitudes sum to `energy` along the last axis; zeros stay zeros."""
+    strongest = jnp.max(jnp.abs(values), -1, keepdims=True)
+    relative = values / jnp.where(strongest > 0, strongest, 1)  # squares of faint amplitudes would underflow
+    total = jnp.sum(squared_magnitude(relative), -1, keepdims=True)
+    return relative * jnp.sqrt(energy / jnp.where(total > 0, total, 1))
+
 
 FAINTEST = 1e-30
 """Amplitude that counts as zero; its square would underflow in single precision."""
 SMALLEST = 1e-30
 """Power that counts as zero, so that decibels stay finite."""
-NOT_HEARD_DB = -250.0
+NO_PATH_DB = -250.0
 """Received powers at or below this value (dB) mean that no path was found; they do not measure a weak one."""
 
 
@@ -52,7 +145,14 @@ def decibels(power: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def received_power_db(snapshot: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss."""
+    """Returns the mean received power per element relative to the transmitted power (dB), the negative path loss.
+
+    Args:
+        snapshot: complex voltages of the elements, relative to the transmitted amplitude.
+
+    Returns:
+        Decibels (*b,).
+    """
     return decibels(jnp.mean(squared_magnitude(snapshot), -1))
 
 
@@ -63,6 +163,13 @@ def free_space_db(distance: Float[Array, "*b"], frequency_hz: Float[Array, "*b"]
     Args:
         distance: metres.
         frequency_hz: of the carrier.
+
+    Returns:
+        Decibels (*b,), negative beyond a tenth of a wavelength.
+
+    Example:
+        >>> round(float(free_space_db(jnp.array(10.0), jnp.array(2.4e9))), 1)
+        -60.1
     """
     return 20 * jnp.log10(SPEED_OF_LIGHT / (4 * jnp.pi * frequency_hz * distance))
 
@@ -95,15 +202,29 @@ def beamforming_gain_db(snapshot: Complex[Array, "*b elements"], peak: Float[Arr
     return decibels(peak**2 / snapshot.shape[-1] / jnp.maximum(mean, SMALLEST))
 
 
-def k_factor_db(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the Rician K-factor: the power of the strongest path over that of all others (dB)."""
+def k_factor_db(arrivals: Paths) -> Float[Array, "*b"]:
+    """Returns the Rician K-factor: the power of the strongest path over that of all others (dB).
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Decibels (*b,).
+    """
     power = squared_magnitude(arrivals.amplitude)
     strongest = jnp.max(power, -1)
     return decibels(strongest / jnp.maximum(jnp.sum(power, -1) - strongest, SMALLEST))
 
 
-def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
-    """Returns the power-weighted r.m.s. delay spread (seconds)."""
+def delay_spread_s(arrivals: Paths) -> Float[Array, "*b"]:
+    """Returns the power-weighted r.m.s. delay spread (seconds).
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Seconds (*b,); 0 with a single path.
+    """
     power = squared_magnitude(arrivals.amplitude)
     weight = power / jnp.maximum(jnp.sum(power, -1, keepdims=True), SMALLEST)
     delay = arrivals.length / SPEED_OF_LIGHT
@@ -111,9 +232,16 @@ def delay_spread_s(arrivals: Arrivals) -> Float[Array, "*b"]:
     return jnp.sqrt(jnp.sum(weight * (delay - mean) ** 2, -1))
 
 
-def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
+def angular_spread_deg(arrivals: Paths) -> Float[Array, "*b 2"]:
     """Returns the power-weighted circular spreads of azimuth and zenith of arrival (in this order) in the receiver's frame,
-    degrees (3GPP TR 38.901, annex A); 0 without any path."""
+    degrees (3GPP TR 38.901, annex A); 0 without any path.
+
+    Args:
+        arrivals: paths.
+
+    Returns:
+        Azimuth and zenith spread (*b, 2), degrees.
+    """
     power = squared_magnitude(arrivals.amplitude)
     total = jnp.sum(power, -1, keepdims=True)
     weight = power / jnp.maximum(total, SMALLEST)
@@ -126,7 +254,7 @@ def angular_spread_deg(arrivals: Arrivals) -> Float[Array, "*b 2"]:
 
 
 def doppler_hz(
-    arrivals: Arrivals, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
+    arrivals: Paths, frequency_hz: Float[Array, ""], tx_velocity: Float[Array, "3"], rx_velocity: Float[Array, "3"]
 ) -> Float[Array, "*b k"]:
     """Returns the Doppler shifts of all paths (hertz).
 
@@ -134,6 +262,9 @@ def doppler_hz(
         arrivals: of traced paths, with directions of departure and arrival.
         frequency_hz: of the carrier.
         tx_velocity, rx_velocity: metres per second, world frame.
+
+    Returns:
+        Hertz (*b, k), positive if the path gets shorter.
     """
     assert arrivals.departure is not None and arrivals.arrival is not None, (
         "only arrivals of traced paths have these directions"
@@ -151,13 +282,20 @@ def unit_snapshots(
 
 
 def correlation(a: Complex[Array, "*b elements"], b: Complex[Array, "*b elements"]) -> Float[Array, "*b"]:
-    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot."""
+    """Returns |a^H b| / (|a| |b|): 1 for snapshots that are equal up to a common phase and scale; 0 for a zero snapshot.
+
+    Args:
+        a, b: complex voltages of the same elements.
+
+    Returns:
+        Values (*b,) from 0 to 1.
+    """
     # Computed from unit vectors: the squared product of weak snapshots would underflow in single precision.
     (unit_a, _), (unit_b, _) = unit_snapshots(a), unit_snapshots(b)
     return jnp.sqrt(squared_magnitude(jnp.sum(unit_a.conj() * unit_b, -1)))
 
 
-def added_powers(arrivals: Arrivals, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
+def added_powers(arrivals: Paths, elements: Float[Array, "elements 3"]) -> Float[Array, "90 360"]:
     """Returns the spectrum, scaled to a maximum of 1, that an array measures of one transmitter if the powers of its paths are
     added instead of their amplitudes. Element positions are in wavelengths."""
     strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrivals.amplitude)))

@@ -85,6 +85,9 @@ def project(
         projection: mapping from angles to pixels.
         means2d_offset: pixels, normally zeros; added to the centres. Its gradient is the positional gradient that density
             control needs.
+
+    Returns:
+        The splats: centres and extents in pixels, depths in metres.
     """
     local = to_local(gaussians.means - receiver.position, receiver.orientation)
     # Empty slots are moved to a harmless position so that neither their values nor their gradients can be NaN.

@@ -16,7 +16,16 @@ from wbgs_jax.splat.projection import Splats, footprint, mahalanobis2, wrap_azim
 
 
 def render_dense(splats: Splats, attenuation: Float[Array, "n b"], signal: Float[Array, "n b"]) -> Float[Array, "b 90 360"]:
-    """Returns N splats blended for B queries; attenuation (delta, in [0, 1)) and signal (Sig) are per Gaussian and query."""
+    """Returns N splats blended for B queries; attenuation (delta, in [0, 1)) and signal (Sig) are per Gaussian and query.
+
+    Args:
+        splats: from `project`.
+        attenuation: delta of every Gaussian and query, in [0, 1).
+        signal: Sig of every Gaussian and query.
+
+    Returns:
+        Images (b, 90, 360), in the unit of the signal.
+    """
     order = jnp.argsort(jax.lax.stop_gradient(splats.depths))
     x = jnp.arange(PAS_WIDTH, dtype=attenuation.dtype)[None, :]
     y = jnp.arange(PAS_HEIGHT, dtype=attenuation.dtype)[:, None]

@@ -44,6 +44,9 @@ def geometry_plan(
             is pure and jittable, and the caller must check `plan.jobs.overflow`.
         projection: mapping from angles to pixels.
         means2d_offset: pixels, added to the centres (`project`).
+
+    Returns:
+        The plan, for `render_splats` with any attenuation and signal.
     """
     splats = project(gaussians, receiver, projection, means2d_offset)
     if limits is None:
@@ -58,6 +61,9 @@ def measure_limits(splats: Splats, slack: float = 1.25, tiling: Tiling | None = 
         splats: projected Gaussians.
         slack: factor on the required counts.
         tiling: tile size; by default the fastest one on the default device.
+
+    Returns:
+        The limits, for `geometry_plan`.
 
     Raises:
         ValueError: called under jit.
@@ -84,6 +90,9 @@ def render_splats(
         plan: of one receiver. If its tile lists overflowed, the image is NaN, never wrong.
         attenuation: delta of every Gaussian and query, in [0, 1).
         signal: Sig of every Gaussian and query.
+
+    Returns:
+        Images (b, 90, 360), in the unit of the signal.
     """
     check_array("attenuation", attenuation, (plan.splats.depths.shape[0], "b"))
     check_array("signal", signal, attenuation.shape)

@@ -22,7 +22,7 @@ from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import rotation_matrix
-from wbgs_jax.splat import grown_slots
+from wbgs_jax.splat.tiles import grown_slots
 from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.types import Gaussians
 

@@ -21,7 +21,7 @@ from wbgs_jax.fields.mixture import (
     reported,
     similarity,
 )
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.types import Batch
 
@@ -70,7 +70,7 @@ class ExpertWeights(Hook):
         if pas is not None:
             floor = floor_of(said, pas, tx_index)
             spectra = learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
-        known = heard_db is not None and np.any(heard_db > NOT_HEARD_DB)
+        known = heard_db is not None and np.any(heard_db > NO_PATH_DB)
         power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
         report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
         weighted = mixing.field.with_shares(mixing.of(params), spectra, power, floor)

@@ -28,7 +28,7 @@ from wbgs_jax.inference.intervals import (
 from wbgs_jax.inference.kriging import Neighbours, correct
 from wbgs_jax.inference.predictor import as_observed, observe_links
 from wbgs_jax.metrics import ssim
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 
 FEWEST, MOST = 8, 1000
 """Minimum number of validation spectra for prediction intervals, and maximum number that is used."""
@@ -111,7 +111,7 @@ def _of_powers(seen: Observation, dataset: Dataset, index: Int[np.ndarray, " n"]
     truth = dataset.received_db(index)
     if truth is None or seen.power_db is None:
         return None
-    received = np.flatnonzero(truth > NOT_HEARD_DB)
+    received = np.flatnonzero(truth > NO_PATH_DB)
     if len(received) < FEWEST or len(np.unique(dataset.tx_index[index[received]])) < 2:
         return None
     index, predicted = index[received], np.asarray(seen.power_db)[received]

@@ -35,7 +35,7 @@ from wbgs_jax.fields import Field, get_field
 from wbgs_jax.fields.base import Params, field_from_arrays
 from wbgs_jax.training import checkpoint, curves
 from wbgs_jax.training.batches import check_data, data_with_virtual, limited, with_virtual_drawn
-from wbgs_jax.training.calibration.pipeline import Search
+from wbgs_jax.training.calibration.pipeline import Calibration
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.expert_weights import ExpertWeights
 from wbgs_jax.training.hooks import Context, Edit, Hook, OfPart, Say, map_moments, silent
@@ -71,7 +71,7 @@ class Precompilation:
 
 HOOKS: dict[str, Callable[[Any], Hook]] = {
     "density": DensityControl,
-    "search": Search,
+    "calibration": Calibration,
     "expert_weights": lambda _: ExpertWeights(),
 }
 """Constructors of hooks from their section of the settings, by their names in fields and settings."""

@@ -129,6 +129,12 @@ def open_run(folder: Path) -> TrainedField:
 def load_trained(folder: Path | str) -> TrainedField:
     """Returns the field of a run's newest checkpoint; the data are not read.
 
+    Args:
+        folder: a run folder of `wbgs-jax train` or `train_field`.
+
+    Returns:
+        The field with its parameters, corrections and prediction intervals.
+
     Raises:
         UserError: the folder is not a run folder, or it has no valid checkpoint.
     """

@@ -8,7 +8,7 @@ from matplotlib import colormaps
 
 from wbgs_jax.propagation.paths import NONE, TRANSMITTED
 from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.radio.channel import NOT_HEARD_DB
+from wbgs_jax.radio.channel import NO_PATH_DB
 
 ZOOM = 2
 """Screen pixels per pixel of a spectrum, along both axes."""
@@ -93,7 +93,7 @@ def stems(delay_ns: Float[np.ndarray, " k"], power_db: Float[np.ndarray, " k"]) 
 def map_picture(values: Float[np.ndarray, "ny nx"]) -> tuple[UInt8[np.ndarray, "ny nx 4"], float, float]:
     """Returns a map as an image, with the largest y at the top, transparent where nothing is received; and the values of the
     first and the last colour."""
-    received = values > NOT_HEARD_DB
+    received = values > NO_PATH_DB
     low, high = np.quantile(values[received], [MAP_MARGIN, 1 - MAP_MARGIN]) if received.any() else (-100.0, 0.0)
     picture = np.concatenate([colored(values, float(low), float(high)), 230 * received[..., None].astype(np.uint8)], -1)
     return np.ascontiguousarray(picture[::-1]), float(low), float(high)

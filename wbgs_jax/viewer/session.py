@@ -23,7 +23,7 @@ from wbgs_jax.inference.radio_map import Plane, evaluate_plane, pieces
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.radio.channel import Arrivals, decibels, delay_spread_s, k_factor_db
+from wbgs_jax.radio.channel import Paths, decibels, delay_spread_s, k_factor_db
 from wbgs_jax.types import Query, make_query
 
 
@@ -92,7 +92,7 @@ class Asker:
         self.loaded, self.trained, self.dataset, self.receiver = loaded, loaded.trained, loaded.dataset, loaded.receiver
         self.plan = loaded.plan
         self._neighbours, self._confidence = (
-            for_receiver(learned, self.receiver) for learned in (self.trained.neighbours, self.trained.confidence)
+            for_receiver(learned, self.receiver) for learned in (self.trained.correction, self.trained.intervals)
         )
         self._spectra = self._links_with_spectra()
         self._samples: dict[int, Sample] = {}
@@ -214,7 +214,7 @@ class Asker:
         part = next((name for name, links in parts.items() if link in links), "other")
         return Sample(truth[0], position, frequency, 0.0, part, float(ssim(predicted, truth)[0]))
 
-    def _listed(self, arrived: Arrivals, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
+    def _listed(self, arrived: Paths, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
         power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
         order = np.argsort(-power, kind="stable")
         order = order[np.abs(arrived.amplitude[order]) > 0]

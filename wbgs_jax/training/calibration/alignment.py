@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from wbgs_jax._util.pytree import same
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.propagation.displacement import Motion
@@ -109,7 +109,7 @@ class _Heard:
 
     data: TrainingData
     spectra: Int[np.ndarray, " n"]
-    config: SearchConfig
+    config: CalibrationConfig
     rng: np.random.Generator
     say: Say
 
@@ -137,7 +137,7 @@ class _Heard:
 
     def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
         """Returns a candidate with the position uncertainty that fits spectra best."""
-        params, _ = search_placement(now.params, self.told(now).scores(self.config.placement_spectra, compared))
+        params, _ = search_placement(now.params, self.told(now).scores(self.config.position_std_spectra, compared))
         return dataclasses.replace(now, params=params)
 
     def surprised(self, now: Place) -> float:
@@ -158,7 +158,7 @@ def learn_geometry(
     place: Place,
     data: TrainingData,
     train: Int[np.ndarray, " n"],
-    config: SearchConfig,
+    config: CalibrationConfig,
     rng: np.random.Generator,
     say: Say = silent,
 ) -> tuple[Place, GeometryReport]:

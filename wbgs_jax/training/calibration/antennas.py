@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.pytree import replaced
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.antenna import PATTERN_EXPONENTS, Antenna
 from wbgs_jax.training.calibration.objective import Scores, by_transmitter, surely_better
@@ -67,7 +67,7 @@ def search_antennas(
     params: WaveParams,
     score: Scores,
     tx_index: Int[np.ndarray, " n"],
-    config: SearchConfig,
+    config: CalibrationConfig,
     known_elements: bool,
 ) -> tuple[WaveParams, AntennaReport]:
     """Returns parameters with the antennas that score best, chosen alternately for transmitters and elements. An antenna is
@@ -90,7 +90,7 @@ def search_antennas(
         best = 1 + int(np.argmin(scores[1:].mean(1)))
         before, after = before if turn else scores[0], scores[0]
         settled += 1
-        if surely_better(scores[0] - scores[best], tx_index, config.antenna_sure) or gains_much(scores, tx_index):
+        if surely_better(scores[0] - scores[best], tx_index, config.antenna_n_sigma) or gains_much(scores, tx_index):
             taken[end], params, after, settled = list(candidates)[best - 1], tried[best], scores[best], 1
         if settled == len(ends):  # the other end has not changed since this one was scored
             break

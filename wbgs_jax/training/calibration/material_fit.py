@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from wbgs_jax._util.pytree import same
 from wbgs_jax._util.statistics import standard_error
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import Materials, WaveParams
 from wbgs_jax.training.calibration.objective import Compared, Told
 
@@ -73,7 +73,7 @@ class SearchReport:
 
 
 def search_materials(
-    params: WaveParams, told: Told, count: int, config: SearchConfig, compared: Compared = "snapshots", usual: bool = False
+    params: WaveParams, told: Told, count: int, config: CalibrationConfig, compared: Compared = "snapshots", usual: bool = False
 ) -> tuple[WaveParams, SearchReport]:
     """Returns parameters with the materials that fit spectra best. `told` are training spectra, with the field and its paths.
 
@@ -103,7 +103,7 @@ def search_materials(
         settled += 1
         listed = any(same(params.materials, entry.materials) for entry in entries)
         gain, error = standard_error(scores[best] - scores[0], tx_index)  # gain of the current properties
-        kept = scores[0].mean() < scores[best].mean() if listed else gain > config.sure * error
+        kept = scores[0].mean() < scores[best].mean() if listed else gain > config.n_sigma * error
         if np.ptp(scores.mean(1)) >= UNSEEN and not kept:
             taken[material] = list(ITU_MATERIALS)[likely[best - 1]]
             settled = settled if same(params.materials, candidates[best].materials) else 1

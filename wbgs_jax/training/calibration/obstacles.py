@@ -25,7 +25,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax._util.pytree import replaced
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import Materials, PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import centres
@@ -67,14 +67,14 @@ class AbsentReport:
 
 
 def search_absent(
-    params: WaveParams, told: Told, config: SearchConfig, say: Say = silent
+    params: WaveParams, told: Told, config: CalibrationConfig, say: Say = silent
 ) -> tuple[WaveParams, Told, AbsentReport]:
     """Returns parameters, and the field with its paths, without spurious bodies. `told` are training spectra with the field;
     they need snapshots, since spectra alone would take ten times as long.
 
     Args:
         params: parameters with materials that have been chosen with the first of the spectra.
-        config: settings of the calibration; `absent_spectra` are used, up to the highest frequency at which positions are
+        config: settings of the calibration; `spurious_spectra` are used, up to the highest frequency at which positions are
             sufficiently accurate.
         say: called with a description of every pass.
     """
@@ -99,14 +99,14 @@ def search_absent(
     return params, told, AbsentReport(float(before.mean()), float(now.mean()), where)
 
 
-def _explained(params: WaveParams, told: Told, config: SearchConfig) -> Float[np.ndarray, " n"]:
+def _explained(params: WaveParams, told: Told, config: CalibrationConfig) -> Float[np.ndarray, " n"]:
     """Returns the negative log-likelihoods of snapshots with the position uncertainty that fits best: phases of slightly
     displaced bodies then have little effect, and such a body fits better than none."""
-    doubted, _ = search_placement(params, told.scores(config.placement_spectra, "covariances"))
+    doubted, _ = search_placement(params, told.scores(config.position_std_spectra, "covariances"))
     return told.scores(config.spectra, "covariances")([doubted])[0]
 
 
-def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[np.ndarray, " k"]:
+def absent_movers(params: WaveParams, told: Told, config: CalibrationConfig) -> Int[np.ndarray, " k"]:
     """Returns the rigid bodies without which snapshots fit significantly better, each tested without the previous ones; never
     all bodies."""
     highest = BELIEVED * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
@@ -114,13 +114,13 @@ def absent_movers(params: WaveParams, told: Told, config: SearchConfig) -> Int[n
     if not low.any():
         return np.zeros(0, int)
     own, params = _each_by_itself(params, told)
-    own = dataclasses.replace(own, spectra=own.spectra[low][: config.absent_spectra])
+    own = dataclasses.replace(own, spectra=own.spectra[low][: config.spurious_spectra])
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
     # The modified parameters first: scoring the current ones then needs no separate program (objective.py).
-    without_one = score([_of_air(params, one) for one in tried], config.absent_glance)
-    gains = score([params], config.absent_glance) - without_one
+    without_one = score([_of_air(params, one) for one in tried], config.spurious_glance)
+    gains = score([params], config.spurious_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
     now, gone = score([params])[0], list[int]()
     closely = (now - score([_of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)
@@ -185,7 +185,7 @@ class ClutterReport:
 
 
 def search_clutter(
-    params: WaveParams, told: Told, config: SearchConfig, rng: np.random.Generator
+    params: WaveParams, told: Told, config: CalibrationConfig, rng: np.random.Generator
 ) -> tuple[WaveParams, Told, ClutterReport | None]:
     """Returns parameters and field with an absorption grid if it fits significantly better, else unchanged, and a report, which
     is None if there are too few transmitters. `told` are training spectra with the field.
@@ -201,8 +201,8 @@ def search_clutter(
     if len(judges) < FEWEST:
         return params, told, None
     judge = np.isin(tx, judges)
-    judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.clutter_spectra])
-    batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.clutter_steps, BATCH, rng)
+    judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.absorption_spectra])
+    batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.absorption_steps, BATCH, rng)
     field = told.field.with_absorption()
     clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.prepared, told.data, batches)
     others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)

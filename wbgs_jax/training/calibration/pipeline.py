@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from wbgs_jax._util.pytree import same
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
@@ -65,11 +65,11 @@ def unusual_level(told: Told) -> float:
 
 
 @dataclass(frozen=True)
-class Search(Hook):
+class Calibration(Hook):
     """The hook that calibrates a `Calibratable` field, whose parameters contain antennas and `materials` and whose links are
     prepared."""
 
-    config: SearchConfig
+    config: CalibrationConfig
     stream: int = 6
 
     def due(self, step: int, steps: int) -> bool:
@@ -110,7 +110,7 @@ class Search(Hook):
             say("calibration: materials")
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
-            if config.absent_spectra and data.snapshots is not None:
+            if config.spurious_spectra and data.snapshots is not None:
                 params, told, absent = search_absent(params, told, config, say)
                 report["absent"] = dataclasses.asdict(absent)
                 if absent.centres:
@@ -123,13 +123,13 @@ class Search(Hook):
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
-                params, _ = search_materials(params, told, config.ideal_spectra, config)
+                params, _ = search_materials(params, told, config.propagation_spectra, config)
             say("calibration: position uncertainty")
-            _, guessed = search_placement(params, told.scores(config.placement_spectra, "covariances"))
+            _, guessed = search_placement(params, told.scores(config.position_std_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             field = self._tuning(params, told, report)
             told = dataclasses.replace(told, field=field)
-            if config.geometry and guessed.spread_mm > 1e3 * config.geometry_doubt:
+            if config.geometry and guessed.spread_mm > 1e3 * config.geometry_position_std:
                 place, moved = learn_geometry(Place(field, params, prepared), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
                 if "antennas" in report:  # the alignment may have reverted some of them
@@ -140,14 +140,14 @@ class Search(Hook):
                 told = Told(field, prepared, data, spectra)
                 field = self._tuning(params, told, report)
                 told = dataclasses.replace(told, field=field)
-            params, guessed = search_placement(params, told.scores(config.placement_spectra, "spectra"))
+            params, guessed = search_placement(params, told.scores(config.position_std_spectra, "spectra"))
             report["placement"] = dataclasses.asdict(guessed)
             params, field = self._clutter(params, told, report, rng, say)
             thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
             report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # materials may have changed
         if data.snapshots is not None and (level := unusual_level(told)):
             told = dataclasses.replace(told, field=field)  # which may have an absorption grid now
-            params, report["gain_db"] = search_gain(params, told.scores(config.placement_spectra, "powers"), level)
+            params, report["gain_db"] = search_gain(params, told.scores(config.position_std_spectra, "powers"), level)
         return Edit(params, (), None, report, field, prepared)
 
     def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
@@ -160,7 +160,7 @@ class Search(Hook):
 
     def _tuning(self, params: WaveParams, told: Told, report: dict[str, Any]) -> Calibratable:
         """Returns the field with calibrated array gains, which needs at least two transmitters."""
-        count = self.config.tuning_spectra
+        count = self.config.array_gain_spectra
         if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
             return told.field
         field, found = search_tuning(params, told, count)
@@ -171,7 +171,7 @@ class Search(Hook):
         self, params: WaveParams, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say
     ) -> tuple[WaveParams, Calibratable]:
         """Returns parameters and field with an absorption grid, if it fits better."""
-        if not self.config.clutter_spectra:
+        if not self.config.absorption_spectra:
             return params, told.field
         say("calibration: absorption grid")
         params, told, found = search_clutter(params, told, self.config, rng)

@@ -10,7 +10,7 @@ which training spectra reveal.
 import dataclasses
 from dataclasses import dataclass
 
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.training.calibration.material_fit import search_materials
 from wbgs_jax.training.calibration.objective import Told, surely_better
@@ -31,10 +31,12 @@ class Idealisation:
     """Whether the option is set as in reality."""
 
 
-def search_idealisations(params: WaveParams, told: Told, config: SearchConfig) -> tuple[WaveParams, dict[str, Idealisation]]:
+def search_idealisations(
+    params: WaveParams, told: Told, config: CalibrationConfig
+) -> tuple[WaveParams, dict[str, Idealisation]]:
     """Returns parameters with options set as in reality if spectra fit significantly better, and the results by option. Before
     the finite thickness of walls is tested, materials are chosen again with it. `told` are training spectra with the field."""
-    once, found, count = dataclasses.replace(config, rounds=1), {}, config.ideal_spectra
+    once, found, count = dataclasses.replace(config, rounds=1), {}, config.propagation_spectra
     score, tx_index = told.scores(count), told.tx_index(count)
     for name in ("curved", "thick"):
         if float(getattr(params, name)):

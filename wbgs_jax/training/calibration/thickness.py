@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wbgs_jax.config import SearchConfig
+from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import Materials, WaveParams
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.calibration.material_fit import (
@@ -67,7 +67,7 @@ path."""
 def search_slabs(
     params: WaveParams,
     told: Told,
-    config: SearchConfig,
+    config: CalibrationConfig,
     count: int,
     compared: Compared = "snapshots",
     likely: Likely | None = None,
@@ -103,7 +103,7 @@ def _sized(
     params: WaveParams,
     unknown: Bool[np.ndarray, " m"],
     told: Told,
-    config: SearchConfig,
+    config: CalibrationConfig,
     compared: Compared,
     likely: Likely | None,
 ) -> tuple[WaveParams, Likely]:

@@ -1,0 +1,15 @@
+from .deepmimo import as_deepmimo as as_deepmimo
+from .deepmimo import from_deepmimo as from_deepmimo
+from .deepmimo import load_deepmimo as load_deepmimo
+from .deepmimo import read_deepmimo as read_deepmimo
+from .deepmimo import write_deepmimo as write_deepmimo
+from .gaussian_ply import read_gaussians as read_gaussians
+from .gaussian_ply import write_gaussians as write_gaussians
+from .ray_paths import RayPaths as RayPaths
+from .ray_paths import from_paths as from_paths
+from .ray_paths import from_sionna as from_sionna
+from .ray_paths import load_paths as load_paths
+from .ray_paths import save_paths as save_paths
+from .scenes import scene_of_paths as scene_of_paths
+from .scenes import scene_of_snapshots as scene_of_snapshots
+from .sionna_arrays import scene_of_sionna as scene_of_sionna

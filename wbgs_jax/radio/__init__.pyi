@@ -1,0 +1,13 @@
+from .array import cbf as cbf
+from .array import pas_directions as pas_directions
+from .array import planar_array as planar_array
+from .array import snapshot_to_pas as snapshot_to_pas
+from .array import steering_vector as steering_vector
+from .channel import NO_PATH_DB as NO_PATH_DB
+from .channel import angular_spread_deg as angular_spread_deg
+from .channel import correlation as correlation
+from .channel import delay_spread_s as delay_spread_s
+from .channel import doppler_hz as doppler_hz
+from .channel import free_space_db as free_space_db
+from .channel import k_factor_db as k_factor_db
+from .channel import received_power_db as received_power_db
