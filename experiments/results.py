@@ -24,6 +24,7 @@ from experiments.jobs import BASELINES, PICTURED_GHZ, Job
 from experiments.settings import differences, unlike_preset
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_text
+from wbgs_jax.config import present_name
 
 FOLDER = Path(__file__).parent / "results"
 EDITION = 3
@@ -70,7 +71,8 @@ class Result:
         scene = self.values.get("job", {}).get("scene", "")
         if not job.is_released and Path(scene).absolute() != Path(job.scene).absolute():
             return False
-        own = unlike_preset(job, self.values.get("settings", {}))
+        made = {present_name(name): value for name, value in self.values.get("settings", {}).items()}
+        own = unlike_preset(job, made)
         return self.values.get("presets") == EDITION and own == differences(job)
 
 

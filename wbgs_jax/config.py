@@ -34,8 +34,8 @@ RENAMED: Mapping[str, str] = {
 
 def present_name(name: str) -> str:
     """Returns the present name of a setting, SECTION.NAME, which may be that of an earlier version."""
-    section, _, rest = name.partition(".")
-    return RENAMED.get(name) or f"{RENAMED.get(section, section)}.{rest}"
+    section, dot, rest = name.partition(".")
+    return RENAMED.get(name) or RENAMED.get(section, section) + dot + rest
 
 
 def present_option(argument: str) -> str:

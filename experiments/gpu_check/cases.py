@@ -149,6 +149,39 @@ def arrays() -> list[Case]:
     ]
 
 
+def channels() -> list[Case]:
+    """Returns the cases of what engineers read from paths and snapshots."""
+    rng = np.random.default_rng(SEED)
+    amplitude = jnp.asarray(rng.normal(size=(B, 5)) + 1j * rng.normal(size=(B, 5)), jnp.complex64)
+    drawn = rng.normal(size=(3, B, 5, 3))
+    direction = jnp.asarray(drawn / np.linalg.norm(drawn, axis=-1, keepdims=True), jnp.float32)
+    metres, offsets = jnp.asarray(rng.uniform(3, 30, (B, 5)), jnp.float32), jnp.linspace(-2e8, 2e8, 9)
+    snapshot = jnp.asarray(rng.normal(size=(2, B, 16)) + 1j * rng.normal(size=(2, B, 16)), jnp.complex64)
+    velocity = jnp.array([1.0, 2.0, 0.0])
+
+    def paths(amplitude: Any, metres: Any) -> wb.Paths:
+        return wb.Paths(amplitude, direction[0], metres, direction[1], direction[2])
+
+    def of_paths(name: str, function: Callable[[wb.Paths], Any]) -> Case:
+        return Case(name, lambda *own: function(paths(*own)), (amplitude, metres), (0, 1))
+
+    return [
+        of_paths("Paths.cfr", lambda own: own.cfr(offsets)),
+        of_paths("Paths.taps", lambda own: own.taps(4e8, 0, 40)),
+        of_paths("angular_spread_deg", wb.radio.angular_spread_deg),
+        of_paths("delay_spread_s", wb.radio.delay_spread_s),
+        of_paths("k_factor_db", wb.radio.k_factor_db),
+        Case(
+            "doppler_hz",
+            lambda hertz: wb.radio.doppler_hz(paths(amplitude, metres), hertz, velocity, -velocity),
+            (jnp.array(28e9),),
+        ),
+        Case("free_space_db", wb.radio.free_space_db, (metres, jnp.full((B, 5), 28e9)), (0, 1)),
+        Case("received_power_db", wb.radio.received_power_db, (snapshot[0],)),
+        Case("correlation", wb.radio.correlation, tuple(snapshot), (0, 1)),
+    ]
+
+
 def images() -> list[Case]:
     """Returns the cases of encodings and losses."""
     rng = np.random.default_rng(SEED)
@@ -329,6 +362,7 @@ def placing() -> list[Case]:
 ROOMS: dict[str, Callable[[], list[Case]]] = {
     "splatting": splatting,
     "arrays": arrays,
+    "channels": channels,
     "images": images,
     "statistics": statistics,
     "powers": powers,

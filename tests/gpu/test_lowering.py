@@ -49,9 +49,13 @@ def test_every_public_function_lowers_for_cuda(room, costly):
 
 
 def test_every_public_function_is_a_case_or_belongs_to_the_host():
-    functions = {name for name in wb.__all__ if callable(getattr(wb, name)) and not isinstance(getattr(wb, name), type)}
+    groups = (wb, wb.applications, wb.interchange, wb.power_map, wb.radio, wb.splat, wb.fields)
+    public = {name: getattr(group, name) for group in groups for name in group.__all__}
+    functions = {name for name, value in public.items() if callable(value) and not isinstance(value, type)}
     source = inspect.getsource(cases_module)
-    cases = {name for name in functions if f'Case("{name}' in source or f'f"{name}:' in source} | set(AIMS)
+    cases = {
+        name for name in functions if re.search(rf'(Case|of_paths)\(\s*"{name}\b', source) or f'f"{name}:' in source
+    } | set(AIMS)
     assert functions <= cases | ON_THE_HOST, "a new public function is a case of experiments/gpu_check/cases.py"
 
 
