@@ -28,7 +28,8 @@ from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed
 from wbgs_jax.propagation.displacement import Motion, length_changes, path_coherence
 from wbgs_jax.propagation.image_method import Search, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths, trace_paths
+from wbgs_jax.propagation.mechanisms import MECHANISMS, concatenated, sizes_of, trace_paths
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
 from wbgs_jax.radio.antenna import Antenna, upright
 from wbgs_jax.radio.array import (
@@ -75,8 +76,8 @@ class WaveParams:
     facet_correction: Float[Array, "f 2"]
     """Logarithm of amplitude, and phase (radians), of a facet's reflection relative to that of its material."""
     excess_loss: Float[Array, "2 3"]
-    """Additional loss per interaction beyond that of the slab or wedge, nepers. Rows: specular and diffracted paths; columns:
-    transmission, reflection, diffraction."""
+    """Additional loss per interaction beyond that of the slab or wedge, nepers. Rows: specular and diffracted paths (of any
+    further mechanism the last one holds); columns: transmission, reflection, diffraction."""
     log_gain: Float[Array, ""]
     """Logarithm of the overall gain: that of the transmitter, and any other common factor of all snapshots."""
     transmitter: Antenna
@@ -273,10 +274,11 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
     frequency_hz = link.frequency_hz
     slabs, found = slabs_at(params, plan, frequency_hz), []
     clutter = None if params.clutter is None else _clutter_at(params.clutter, frequency_hz)
-    for row, some in enumerate((paths.specular, paths.diffracted)):
+    for some in paths.sets:
         antennas = transmitter_antenna(params, link.transmitter), params.element
-        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
-        gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
+        transport = MECHANISMS[some.mechanism].transport
+        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, transport, *antennas)
+        gain = jnp.exp(params.log_gain) * _corrections(params, some)
         if clutter is not None:
             assert plan.grid is not None, "a field with absorption parameters has a grid"
             gain = gain * jnp.exp(-attenuation(one.points, clutter, plan.grid))
@@ -285,8 +287,7 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
             gain = gain * phasor(-cycles)
         assert one.polarised is not None, "arrivals of traced paths have it"
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
-    joined: Any = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-    return joined._replace(curved=params.curved)
+    return concatenated(found)._replace(curved=params.curved)
 
 
 def no_clutter(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
@@ -312,15 +313,10 @@ def _clutter_at(clutter: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]
     return (1 - share) * at_low + share * at_high
 
 
-def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:
-    """Returns the factors of paths due to facet corrections and additional losses.
-
-    Args:
-        params: parameters.
-        paths: K paths.
-        row: 0 for specular paths, 1 for diffracted paths.
-    """
+def _corrections(params: WaveParams, paths: Paths) -> Complex[Array, " k"]:
+    """Returns the factors of K paths of one mechanism due to facet corrections and additional losses."""
     kind = paths.interaction_type
+    row = min(list(MECHANISMS).index(paths.mechanism), len(params.excess_loss) - 1)
     counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
     reflects = kind == REFLECTED
     correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
@@ -347,7 +343,7 @@ def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedP
         plan = plan_of(int(receiver))  # one at a time: the mirror images of many receivers would need much memory
         found.append(_traced_in_blocks(plan, positions[pairs[:, 0] == receiver]))
         beams.append(plan.beams)
-    paths = TracedPaths(_stacked([one.specular for one in found]), _stacked([one.diffracted for one in found]))
+    paths = TracedPaths(tuple(_stacked(list(sets)) for sets in zip(*(one.sets for one in found), strict=True)))
     surfaces = Surfaces(plan.surfaces.facets, plan.surfaces.edges)
     return PreparedPaths(surfaces, _shared(beams), paths, *jnp.asarray(pairs.T, jnp.int32))
 
@@ -358,8 +354,7 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     config, search = plan.config, plan.surfaces
     if not isinstance(search, Search):
         raise TypeError("a plan with prepared paths traces no others; make a plan without them")
-    sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
-    return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
+    return jax.lax.map(lambda tx: trace_paths(search, tx, sizes_of(config)), tx_position)
 
 
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:

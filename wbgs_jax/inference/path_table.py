@@ -9,13 +9,11 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import paths_of
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
+from wbgs_jax.propagation.paths import InteractionType
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
 from wbgs_jax.types import Query, make_query
 
-WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
-"""Prepositions by type of interaction: through a wall, off a floor, around the edge of a cabinet."""
 SIGHT = "line of sight"
 
 
@@ -88,8 +86,8 @@ def describe_interactions(
 ) -> str:
     """Returns a description of the interactions of a path, such as "off concrete, through glass"."""
     met = [
-        f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"
+        f"{InteractionType(kind).word} {names[material] if material < len(names) else f'material {material}'}"
         for kind, material in zip(kinds, materials, strict=True)
-        if int(kind) in WORDS
+        if kind != InteractionType.NONE
     ]
     return ", ".join(met) or SIGHT

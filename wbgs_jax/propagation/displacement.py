@@ -25,7 +25,8 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.mesh.facets import AnyArray, centres
 from wbgs_jax.propagation.image_method import Surfaces
-from wbgs_jax.propagation.paths import DIFFRACTED, MAX_ORDER, REFLECTED, Paths, TracedPaths
+from wbgs_jax.propagation.mechanisms import MECHANISMS
+from wbgs_jax.propagation.paths import MAX_ORDER, Paths, TracedPaths, is_vertex, on_edge
 from wbgs_jax.propagation.transport import last_leg, legs_of
 from wbgs_jax.radio.array import EXACT
 
@@ -114,7 +115,7 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
 def path_coherence(
     paths: TracedPaths, surfaces: Surfaces, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
 ) -> Float[Array, "k k"]:
-    """Returns the `coherence` of all paths of one transmitter, the specular ones first, at a cost that does not grow with the
+    """Returns the `coherence` of all paths of one transmitter, mechanism by mechanism, at a cost that does not grow with the
     number of rigid bodies: only a path's own mirrors and edges are visited.
 
     Args:
@@ -123,16 +124,17 @@ def path_coherence(
         spread: standard deviation of the position of every rigid body and, last, of the transmitter along each axis, metres.
         wavenumber: radians per metre.
     """
-    specular, diffracted = _bends(paths.specular, surfaces, MAX_ORDER), _bends(paths.diffracted, surfaces, MAX_ORDER - 1)
+    bends = [_bends(some, surfaces, MECHANISMS[some.mechanism].vertices) for some in paths.sets]
     variance = (wavenumber * spread) ** 2
-    mixed = _phase_covariance(specular, diffracted, variance)
-    rows = [
-        [_phase_covariance(specular, specular, variance), mixed],
-        [mixed.T, _phase_covariance(diffracted, diffracted, variance)],
-    ]
+    upper = {(i, j): _phase_covariance(bends[i], bends[j], variance) for i in range(len(bends)) for j in range(i, len(bends))}
+    rows = [[upper[i, j] if i <= j else upper[j, i].T for j in range(len(bends))] for i in range(len(bends))]
     both = jnp.block(rows)
     own = jnp.diagonal(both)
-    return jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
+    found = jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
+    if all(MECHANISMS[some.mechanism].coherent for some in paths.sets):
+        return found
+    adds = jnp.concatenate([jnp.full(some.alive.shape, MECHANISMS[some.mechanism].coherent) for some in paths.sets])
+    return jnp.where(adds[:, None] & adds | jnp.eye(len(adds), dtype=bool), found, 0)
 
 
 class _Bends(NamedTuple):
@@ -186,9 +188,8 @@ def _direction_changes(paths: Paths, surfaces: Surfaces) -> tuple[Float[Array, "
     direction = legs_of(paths).direction
     path, leg = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_leg, direction.shape[1] - 2)
     turn = direction[path, leg] - direction[path, leg + 1]
-    reflects, diffracts = paths.interaction_type == REFLECTED, paths.interaction_type == DIFFRACTED
-    number = paths.interaction_facet
-    facet = jnp.where(reflects, number, 0)
+    bends, at_edge, number = is_vertex(paths.interaction_type), on_edge(paths.interaction_type), paths.interaction_facet
+    facet = jnp.where(bends & ~at_edge, number, 0)
     if surfaces.edges.facet.shape[0]:
-        facet = jnp.where(diffracts, surfaces.edges.facet[jnp.where(diffracts, number, 0)], facet)
-    return jnp.where((reflects | diffracts)[..., None], turn, 0), surfaces.facets.mover[facet]
+        facet = jnp.where(at_edge, surfaces.edges.facet[jnp.where(at_edge, number, 0)], facet)
+    return jnp.where(bends[..., None], turn, 0), surfaces.facets.mover[facet]

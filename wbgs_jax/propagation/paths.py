@@ -7,14 +7,17 @@ strongest of those that pass are kept. The geometry depends neither on the frequ
 differentiated.
 """
 
+import functools
+import operator
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.mesh.facets import AnyArray, Outline
 from wbgs_jax.propagation.image_method import Chains, Search
@@ -25,14 +28,52 @@ MAX_ORDER = 3
 """Maximum number of reflections and diffractions of a path."""
 MAX_INTERACTIONS = 5
 """Maximum number of facets and edges that a path interacts with; a wave that has crossed more of them is negligible."""
-NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
-"""Types of interaction."""
 BEHIND = 1e-6
 """Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start."""
 CUT_AT_ONCE = 32
 """Paths tested together: few enough for a CPU's cache."""
 THROUGH = 0.5
 """Rough amplitude factor of a crossed or reflecting facet, used to rank paths."""
+
+
+class InteractionType(IntEnum):
+    """What happens to a wave at a facet or an edge."""
+
+    word: str
+    """Preposition of a description: through a wall, off a floor, around the edge of a cabinet."""
+    sionna: int
+    """Value of `sionna.rt.InteractionType`."""
+    is_vertex: bool
+    """Whether a segment of the path ends there."""
+    on_edge: bool
+    """Whether paths refer to the index of an edge, not of a facet."""
+
+    def __new__(
+        cls, value: int, word: str = "", sionna: int = 0, is_vertex: bool = False, on_edge: bool = False
+    ) -> "InteractionType":
+        kind = int.__new__(cls, value)
+        kind._value_ = value
+        kind.word, kind.sionna, kind.is_vertex, kind.on_edge = word, sionna, is_vertex, on_edge
+        return kind
+
+    NONE = 0
+    TRANSMITTED = 1, "through", 4
+    REFLECTED = 2, "off", 1, True
+    DIFFRACTED = 3, "around", 8, True, True
+
+
+NONE, TRANSMITTED = InteractionType.NONE, InteractionType.TRANSMITTED
+REFLECTED, DIFFRACTED = InteractionType.REFLECTED, InteractionType.DIFFRACTED
+
+
+def is_vertex(interaction_type: Int[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
+    """Returns which interactions end a segment: all but transmissions and padding."""
+    return functools.reduce(operator.or_, (interaction_type == kind for kind in InteractionType if kind.is_vertex))
+
+
+def on_edge(interaction_type: Int[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
+    """Returns which interactions are with an edge."""
+    return functools.reduce(operator.or_, (interaction_type == kind for kind in InteractionType if kind.on_edge))
 
 
 @pytree
@@ -42,23 +83,42 @@ class Paths:
     points: Float[Array, "*b k 5 3"]
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
     interaction_facet: Int[Array, "*b k 5"]
-    """Indices of the facets (of the edge, if the type is `DIFFRACTED`) in the order of interaction; 0 beyond the last."""
+    """Indices of the facets (of edges, where the type is `on_edge`) in the order of interaction; 0 beyond the last."""
     interaction_type: Int[Array, "*b k 5"]
-    """`TRANSMITTED`, `REFLECTED` or `DIFFRACTED`; `NONE` beyond the last."""
+    """`InteractionType`; `NONE` beyond the last."""
     interaction_leg: Int[Array, "*b k 5"]
     """Index of the segment (0: the first) that ends or is crossed there."""
     alive: Bool[Array, "*b k"]
     """Which of the K entries are paths; the others are padding."""
+    mechanism: str = static(default="specular")
+    """Name of the mechanism of all of them (`mechanisms.MECHANISMS`)."""
 
 
 @pytree
 class TracedPaths:
     """All paths of one transmitter; leading axes are batch axes."""
 
-    specular: Paths
-    """Paths without diffraction, including the line of sight."""
-    diffracted: Paths
-    """Paths with one diffraction each."""
+    sets: tuple[Paths, ...]
+    """Paths of each mechanism, in the order of `mechanisms.MECHANISMS`."""
+
+    def of(self, mechanism: str) -> Paths:
+        """Returns the paths of a mechanism by its name."""
+        return next(paths for paths in self.sets if paths.mechanism == mechanism)
+
+    @property
+    def specular(self) -> Paths:
+        """Paths without diffraction, including the line of sight."""
+        return self.of("specular")
+
+    @property
+    def diffracted(self) -> Paths:
+        """Paths with one diffraction each."""
+        return self.of("diffracted")
+
+    @property
+    def alive(self) -> Bool[Array, "*b k"]:
+        """Which of the paths of all mechanisms, in order, are no padding."""
+        return jnp.concatenate([paths.alive for paths in self.sets], -1)
 
 
 class Candidates(NamedTuple):
@@ -71,33 +131,11 @@ class Candidates(NamedTuple):
     """Rough amplitude; 0 for no path."""
 
 
-def trace_paths(
-    search: Search,
-    tx_position: Float[Array, "3"],
-    specular_tried: int,
-    specular_kept: int,
-    diffracted_tried: int,
-    diffracted_kept: int,
-) -> TracedPaths:
-    """Returns the paths of one transmitter. Use `jax.lax.map` for several: batching them needs a lot of memory.
-
-    Args:
-        search: image tree of the receiver (`image_method.make_search`).
-        tx_position: world frame, metres.
-        specular_tried, diffracted_tried: number of candidates that are tested for intersections with all facets.
-        specular_kept, diffracted_kept: number of paths returned, the strongest of these; fewer if fewer are tried.
-    """
-    return TracedPaths(
-        specular_paths(tx_position, search, specular_tried, specular_kept),
-        diffracted_paths(tx_position, search, diffracted_tried, diffracted_kept),
-    )
-
-
 def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
-    mirrored = (_promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
+    mirrored = (promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
     parts = [_direct(tx, search.receiver_position), *mirrored]
-    return _select(parts, search, tried, kept, MAX_ORDER + 1)
+    return select_paths("specular", parts, search, tried, kept, MAX_ORDER + 1)
 
 
 def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
@@ -105,17 +143,17 @@ def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: in
     pairs = search.diffracted
     parts = [
         _diffracted_only(tx, search),
-        _promising(lambda some: _diffracted_then_mirrored(tx, search, *some), (pairs.after, pairs.after_image), tried),
-        _promising(lambda some: _mirrored_then_diffracted(tx, search, some), pairs.before, tried),
+        promising(lambda some: _diffracted_then_mirrored(tx, search, *some), (pairs.after, pairs.after_image), tried),
+        promising(lambda some: _mirrored_then_diffracted(tx, search, some), pairs.before, tried),
     ]
-    return _select(parts, search, tried, kept, 3)
+    return select_paths("diffracted", parts, search, tried, kept, 3)
 
 
 def _diffracted_only(tx, search: Search) -> Candidates:
     """Returns one candidate per edge."""
     edge = jnp.arange(search.edges.length.size)
     point, strength = _diffracted(tx, search.receiver_position, edge, search.edges)
-    return _candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
+    return make_candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
 def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
@@ -125,7 +163,7 @@ def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
     mirror, valid = _on_mirror(point, image, search.facets.normal[facet], search.facets.offset[facet])
     strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
     vertices = [(point, edge, DIFFRACTED), (mirror, facet, REFLECTED)]
-    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, search.receiver_position, vertices, strength, edge.size)
 
 
 def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
@@ -139,10 +177,10 @@ def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
     mirror, valid = _on_mirror(point, image, normal, offset)
     strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
     vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
-    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, search.receiver_position, vertices, strength, edge.size)
 
 
-def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
+def make_candidates(tx, rx, vertices, score, count: int) -> Candidates:
     """Returns candidates from their vertices (point, facet or edge, type of interaction) in order."""
 
     def rows(value, shape):
@@ -159,7 +197,7 @@ def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
 def _direct(tx, rx) -> Candidates:
     """Returns the line of sight as a candidate; there is none if the transmitter is at the receiver's position."""
     distance = jnp.linalg.norm(jax.lax.stop_gradient(tx - rx))
-    return _candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
+    return make_candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
 
 
 def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
@@ -173,7 +211,7 @@ def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
         valid &= hits & _inside(here, search.outline, facet)
         vertices.append((here, facet, REFLECTED))
     length = jnp.linalg.norm(chains.image[:, 0] - tx, axis=-1)
-    return _candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
+    return make_candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
 
 
 def _on_mirror(start, goal, normal, offset):
@@ -220,8 +258,18 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     return point, jnp.where(valid, strength, 0)
 
 
-def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
-    """Returns the best paths among the best candidates after these have been tested for intersections with all facets."""
+def select_paths(mechanism: str, parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
+    """Returns the best paths of a mechanism among its best candidates, after these have been tested for intersections with all
+    facets.
+
+    Args:
+        mechanism: its name.
+        parts: candidates of all kinds.
+        search: image tree of the receiver.
+        tried: number of candidates that are tested.
+        kept: number of paths returned; fewer if fewer are tried.
+        legs: largest number of segments of a path.
+    """
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
     cut = _of_living(lambda c: crossed(c.points[: legs + 1], search.planes), found)
@@ -230,10 +278,10 @@ def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs
     score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
     found = jax.tree.map(lambda leaf: leaf[best], found)
     facet, types, leg = jax.vmap(lambda path, words: _in_order(path, words, search))(found, cut[best])
-    return Paths(found.points, facet, types, leg, score > 0)
+    return Paths(found.points, facet, types, leg, score > 0, mechanism)
 
 
-def _promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
+def promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
     """Returns the best candidates of a kind. All are scored first and the best built again: the points are most of the work."""
     score = build(rows).score
     best = jax.lax.top_k(score, min(most, score.size))[1]

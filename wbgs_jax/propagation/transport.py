@@ -5,6 +5,7 @@ The electric field is a complex vector perpendicular to the ray. At every slab i
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from wbgs_jax._util.complex_math import phasor
 from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.materials import Slabs, slab_coefficients
-from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
+from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, Paths, is_vertex, on_edge
 from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
@@ -42,8 +43,16 @@ class Legs(NamedTuple):
     """Length of the whole path, metres."""
 
 
-class _SlabInteractions(NamedTuple):
+Transport = Callable[..., tuple[Complex[Array, "k 3"], Float[Array, " k"]]]
+"""(field at the transmitter (k, 3), paths, segments, slabs along them, surfaces, materials, frequency_hz) -> the field at the
+receiver without spreading (k, 3), and the spreading factors (k,), per metre."""
+
+
+class SlabInteractions(NamedTuple):
     """Slabs along K paths: the basis in which they split the field, and their coefficients."""
+
+    active: Bool[Array, "k 5"]
+    """Which interactions are with a slab; everything else is meaningless for the others."""
 
     across: Float[Array, "k 5 3"]
     """Unit vectors perpendicular to the plane of incidence (TE)."""
@@ -55,26 +64,26 @@ class _SlabInteractions(NamedTuple):
     tm: Complex[Array, "k 5"]
 
 
-@partial(jax.jit, static_argnames="diffracted")
+@partial(jax.jit, static_argnames="transport")
 def arrivals(
     paths: Paths,
     surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
     receiver: Receiver,
-    diffracted: bool,
+    transport: Transport,
     transmitter: Antenna | None = None,
     element: Antenna | None = None,
 ) -> Arrivals:
     """Returns the amplitudes that a transmitter of unit power produces over K paths.
 
     Args:
-        paths: of one transmitter (`paths.trace_paths`).
+        paths: of one transmitter and one mechanism (`mechanisms.trace_paths`).
         surfaces: surfaces in which the paths were found; paths refer to their facets and edges by index.
         slabs: materials of the facets at this frequency.
         frequency_hz: of the carrier.
         receiver: the receiver at the end of the paths.
-        diffracted: whether all paths have one diffraction or none has any; static under `jax.jit`.
+        transport: that of the mechanism of the paths (`mechanisms.Mechanism`); static under `jax.jit`.
         transmitter: its antenna in the world frame; by default vertically polarised and isotropic.
         element: an antenna factor of every array element in addition to its given pattern, in the receiver's frame; by default
             vertically polarised and isotropic, which changes nothing.
@@ -87,11 +96,7 @@ def arrivals(
     legs = legs_of(paths)
     field = transmitter.field(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, legs, surfaces, slabs, frequency_hz)
-    active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
-    if diffracted:
-        field, spreading = _over_edges(field, paths, legs, interactions, active, surfaces.edges, slabs, frequency_hz)
-    else:
-        field, spreading = _through_slabs(field, interactions, active), 1 / legs.total
+    field, spreading = transport(field, paths, legs, interactions, surfaces, slabs, frequency_hz)
     last = last_leg(paths)
     arrival = legs.direction[jnp.arange(len(last)), last]
     local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
@@ -116,9 +121,9 @@ def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "
 def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
     """Returns the material index at every interaction; -1 where there is none."""
     kind, number = paths.interaction_type, paths.interaction_facet
-    facet = jnp.where(kind == DIFFRACTED, 0, number)
+    facet = jnp.where(on_edge(kind), 0, number)
     if surfaces.edges.facet.shape[0]:
-        facet = jnp.where(kind == DIFFRACTED, surfaces.edges.facet[jnp.where(kind == DIFFRACTED, number, 0)], facet)
+        facet = jnp.where(on_edge(kind), surfaces.edges.facet[jnp.where(on_edge(kind), number, 0)], facet)
     return jnp.where(kind == NONE, -1, surfaces.facets.material[facet])
 
 
@@ -216,15 +221,14 @@ def legs_of(paths: Paths) -> Legs:
 
 def last_leg(paths: Paths) -> Int[Array, " k"]:
     """Returns the index of the segment that ends at the receiver."""
-    ends_leg = (paths.interaction_type == REFLECTED) | (paths.interaction_type == DIFFRACTED)
-    return jnp.sum(ends_leg, -1)
+    return jnp.sum(is_vertex(paths.interaction_type), -1)
 
 
 def _slab_interactions(
     paths: Paths, legs: Legs, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
-) -> _SlabInteractions:
+) -> SlabInteractions:
     """Returns the slab basis and coefficients at every interaction; meaningless where an interaction is not with a slab."""
-    facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
+    facet = jnp.where(on_edge(paths.interaction_type), 0, paths.interaction_facet)
     along = jnp.take_along_axis(legs.direction, paths.interaction_leg[..., None], 1)
     normal, reflects = surfaces.facets.normal[facet], paths.interaction_type == REFLECTED
     cosine = _dot(along, normal)
@@ -232,7 +236,8 @@ def _slab_interactions(
     across = _across(along, normal)
     within = jnp.cross(across, along)
     mirrored = along - 2 * cosine[..., None] * normal
-    return _SlabInteractions(
+    return SlabInteractions(
+        (paths.interaction_type != NONE) & ~on_edge(paths.interaction_type),
         across,
         within,
         jnp.where(reflects[..., None], jnp.cross(across, mirrored), within),
@@ -242,12 +247,12 @@ def _slab_interactions(
 
 
 def _through_slabs(
-    field: Complex[Array, "k 3"], interactions: _SlabInteractions, active: Bool[Array, "k 5"]
+    field: Complex[Array, "k 3"], interactions: SlabInteractions, active: Bool[Array, "k 5"]
 ) -> Complex[Array, "k 3"]:
-    """Returns the field behind the active slabs, applied in order."""
+    """Returns the field behind the active ones of the slabs, applied in order."""
 
     def through(field, one):
-        (across, into, out, te, tm), active = one
+        (_, across, into, out, te, tm), active = one
         changed = (te * _dot(field, across))[:, None] * across + (tm * _dot(field, into))[:, None] * out
         return jnp.where(active[:, None], changed, field).astype(field.dtype), None
 
@@ -262,25 +267,37 @@ def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[
     return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, other), s))
 
 
-def _over_edges(
+def specular_transport(
     field: Complex[Array, "k 3"],
     paths: Paths,
     legs: Legs,
-    interactions: _SlabInteractions,
-    active: Bool[Array, "k 5"],
-    edges: Edges,
+    interactions: SlabInteractions,
+    surfaces: Surfaces,
+    slabs: Slabs,
+    frequency_hz: Float[Array, ""],
+) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
+    """Returns the field behind all slabs, and the spreading factor."""
+    return _through_slabs(field, interactions, interactions.active), 1 / legs.total
+
+
+def diffracted_transport(
+    field: Complex[Array, "k 3"],
+    paths: Paths,
+    legs: Legs,
+    interactions: SlabInteractions,
+    surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
 ) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
     """Returns the field after the slabs before an edge, the edge, and the slabs behind it; and the spreading factor."""
     k, place = jnp.arange(len(field)), jnp.arange(MAX_INTERACTIONS)
-    slot = jnp.argmax(paths.interaction_type == DIFFRACTED, -1)
+    slot, active = jnp.argmax(on_edge(paths.interaction_type), -1), interactions.active
     leg, edge = paths.interaction_leg[k, slot], paths.interaction_facet[k, slot]
     before = jnp.sum(jnp.where(jnp.arange(legs.length.shape[1]) <= leg[:, None], legs.length, 0), -1)
     after = jnp.maximum(legs.total - before, SHORTEST)
     field = _through_slabs(field, interactions, active & (place < slot[:, None]))
     rays = legs.direction[k, leg], legs.direction[k, leg + 1]
-    field = _diffract(field, *rays, before, after, edge, edges, slabs, frequency_hz)
+    field = _diffract(field, *rays, before, after, edge, surfaces.edges, slabs, frequency_hz)
     field = _through_slabs(field, interactions, active & (place > slot[:, None]))
     return field, 1 / jnp.sqrt(before * after * legs.total)
 

@@ -29,7 +29,7 @@ class Arrivals(NamedTuple):
     polarised: Complex[Array, "*b k 2"] | None = None
     """Amplitudes at isotropic elements polarised along theta-hat and along phi-hat of the receiver's frame."""
     interaction: Int[Array, "*b k 5"] | None = None
-    """Types of interaction in order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
+    """Types of interaction in order: `propagation.paths.InteractionType`; 0 beyond the last."""
     material: Int[Array, "*b k 5"] | None = None
     """Index of the material at each interaction; -1 beyond the last."""
     curved: Float[Array, "*b"] | None = None
