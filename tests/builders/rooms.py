@@ -9,7 +9,7 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.mesh.edges import Edges, edges_of_facets
 from wbgs_jax.mesh.facets import Facets, facets_from_mesh
-from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
 from wbgs_jax.propagation.mechanisms import MECHANISMS, trace_paths
 from wbgs_jax.propagation.paths import TracedPaths
@@ -67,10 +67,10 @@ def edges_of(*parts, material=None) -> Edges:
     return edges_of_facets(facets_of(*parts, material=material))
 
 
-def search_of(parts, rx, mirror_areas=(0.0, 0.0, 0.0), material=None) -> Search:
+def search_of(parts, rx, mirror_areas=(0.0, 0.0, 0.0), material=None) -> ImageTree:
     """What the paths to a receiver are searched in."""
     facets = facets_of(*parts, material=material)
-    return make_search(facets, edges_of_facets(facets), np.asarray(rx, np.float32), mirror_areas, 0.5, 3.0)
+    return make_image_tree(facets, edges_of_facets(facets), np.asarray(rx, np.float32), mirror_areas, 0.5, 3.0)
 
 
 _trace = jax.jit(trace_paths, static_argnums=2)
@@ -91,7 +91,7 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 
 
 @jax.jit
-def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
+def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
     found = [
         arrivals(some, search, slabs, frequency, receiver, MECHANISMS[some.mechanism].transport, *antennas)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from wbgs_jax.propagation.image_method import Search
+from wbgs_jax.propagation.image_method import ImageTree
 from wbgs_jax.propagation.paths import MAX_ORDER, Paths, TracedPaths, diffracted_paths, specular_paths
 from wbgs_jax.propagation.transport import Transport, diffracted_transport, specular_transport
 
@@ -19,7 +19,7 @@ class Mechanism(NamedTuple):
     """A mechanism. Its name is stored in the paths; its place in the table is its row in `WaveParams.excess_loss`."""
 
     name: str
-    trace: Callable[[Float[Array, "3"], Search, int, int], Paths]
+    trace: Callable[[Float[Array, "3"], ImageTree, int, int], Paths]
     """(transmitter, image tree of the receiver, candidates tested, paths kept) -> paths of this mechanism."""
     transport: Transport
     vertices: int
@@ -51,16 +51,16 @@ def sizes_of(config: Any) -> Sizes:
     return tuple((name, tried, kept) for name, tried, kept in sizes if kept)
 
 
-def trace_paths(search: Search, tx_position: Float[Array, "3"], sizes: Sizes) -> TracedPaths:
+def trace_paths(tree: ImageTree, tx_position: Float[Array, "3"], sizes: Sizes) -> TracedPaths:
     """Returns the paths of one transmitter. Use `jax.lax.map` for several: batching them needs a lot of memory.
 
     Args:
-        search: image tree of the receiver (`image_method.make_search`).
+        tree: image tree of the receiver (`image_method.make_image_tree`).
         tx_position: world frame, metres.
         sizes: number of candidates that are tested for intersections with all facets, and number of paths returned, the
             strongest of these, by mechanism; fewer paths if fewer are tried.
     """
-    return TracedPaths(tuple(MECHANISMS[name].trace(tx_position, search, tried, kept) for name, tried, kept in sizes))
+    return TracedPaths(tuple(MECHANISMS[name].trace(tx_position, tree, tried, kept) for name, tried, kept in sizes))
 
 
 def concatenated(parts: list[Any]) -> Any:

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.mesh.edges import Edges
-from wbgs_jax.mesh.facets import AnyArray, Outline
-from wbgs_jax.propagation.image_method import Chains, Search
+from wbgs_jax.mesh.facets import AnyArray, HalfPlanes
+from wbgs_jax.propagation.image_method import ImageTree, ReflectionSequences
 from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of
 from wbgs_jax.radio.array import EXACT
 
@@ -86,7 +86,7 @@ class Paths:
     """Indices of the facets (of edges, where the type is `on_edge`) in the order of interaction; 0 beyond the last."""
     interaction_type: Int[Array, "*b k 5"]
     """`InteractionType`; `NONE` beyond the last."""
-    interaction_leg: Int[Array, "*b k 5"]
+    interaction_segment: Int[Array, "*b k 5"]
     """Index of the segment (0: the first) that ends or is crossed there."""
     alive: Bool[Array, "*b k"]
     """Which of the K entries are paths; the others are padding."""
@@ -131,53 +131,53 @@ class Candidates(NamedTuple):
     """Rough amplitude; 0 for no path."""
 
 
-def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+def specular_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
-    mirrored = (promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
-    parts = [_direct(tx, search.receiver_position), *mirrored]
-    return select_paths("specular", parts, search, tried, kept, MAX_ORDER + 1)
+    mirrored = (promising(lambda some: _mirrored(tx, tree, some), sequences, tried) for sequences in tree.sequences)
+    parts = [_direct(tx, tree.receiver_position), *mirrored]
+    return select_paths("specular", parts, tree, tried, kept, MAX_ORDER + 1)
 
 
-def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
-    pairs = search.diffracted
+    pairs = tree.diffracted
     parts = [
-        _diffracted_only(tx, search),
-        promising(lambda some: _diffracted_then_mirrored(tx, search, *some), (pairs.after, pairs.after_image), tried),
-        promising(lambda some: _mirrored_then_diffracted(tx, search, some), pairs.before, tried),
+        _diffracted_only(tx, tree),
+        promising(lambda some: _diffracted_then_mirrored(tx, tree, *some), (pairs.after, pairs.after_image), tried),
+        promising(lambda some: _mirrored_then_diffracted(tx, tree, some), pairs.before, tried),
     ]
-    return select_paths("diffracted", parts, search, tried, kept, 3)
+    return select_paths("diffracted", parts, tree, tried, kept, 3)
 
 
-def _diffracted_only(tx, search: Search) -> Candidates:
+def _diffracted_only(tx, tree: ImageTree) -> Candidates:
     """Returns one candidate per edge."""
-    edge = jnp.arange(search.edges.length.size)
-    point, strength = _diffracted(tx, search.receiver_position, edge, search.edges)
-    return make_candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
+    edge = jnp.arange(tree.edges.length.size)
+    point, strength = _diffracted(tx, tree.receiver_position, edge, tree.edges)
+    return make_candidates(tx, tree.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
-def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
+def _diffracted_then_mirrored(tx, tree: ImageTree, pairs, image) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror behind it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
-    point, strength = _diffracted(tx, image, edge, search.edges)
-    mirror, valid = _on_mirror(point, image, search.facets.normal[facet], search.facets.offset[facet])
-    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    point, strength = _diffracted(tx, image, edge, tree.edges)
+    mirror, valid = _on_mirror(point, image, tree.facets.normal[facet], tree.facets.offset[facet])
+    strength = jnp.where(valid & _inside(mirror, tree.half_planes, facet), strength * THROUGH, 0)
     vertices = [(point, edge, DIFFRACTED), (mirror, facet, REFLECTED)]
-    return make_candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, tree.receiver_position, vertices, strength, edge.size)
 
 
-def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
+def _mirrored_then_diffracted(tx, tree: ImageTree, pairs) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror in front of it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
-    normal, offset = search.facets.normal[facet], search.facets.offset[facet]
+    normal, offset = tree.facets.normal[facet], tree.facets.offset[facet]
     image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
-    point, strength = _diffracted(image, search.receiver_position, edge, search.edges)
+    point, strength = _diffracted(image, tree.receiver_position, edge, tree.edges)
     # Relative to the image, the point must lie behind the mirror: the wave runs from the transmitter to the point of
     # reflection.
     mirror, valid = _on_mirror(point, image, normal, offset)
-    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    strength = jnp.where(valid & _inside(mirror, tree.half_planes, facet), strength * THROUGH, 0)
     vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
-    return make_candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, tree.receiver_position, vertices, strength, edge.size)
 
 
 def make_candidates(tx, rx, vertices, score, count: int) -> Candidates:
@@ -200,18 +200,18 @@ def _direct(tx, rx) -> Candidates:
     return make_candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
 
 
-def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
+def _mirrored(tx, tree: ImageTree, sequences: ReflectionSequences) -> Candidates:
     """Returns one candidate per reflection sequence."""
-    facets, (c, order) = search.facets, chains.facet.shape
+    facets, (c, order) = tree.facets, sequences.facet.shape
     here, valid = jnp.broadcast_to(tx, (c, 3)), jnp.ones(c, bool)
     vertices = []
     for j in range(order):
-        facet = chains.facet[:, j]
-        here, hits = _on_mirror(here, chains.image[:, j], facets.normal[facet], facets.offset[facet])
-        valid &= hits & _inside(here, search.outline, facet)
+        facet = sequences.facet[:, j]
+        here, hits = _on_mirror(here, sequences.image[:, j], facets.normal[facet], facets.offset[facet])
+        valid &= hits & _inside(here, tree.half_planes, facet)
         vertices.append((here, facet, REFLECTED))
-    length = jnp.linalg.norm(chains.image[:, 0] - tx, axis=-1)
-    return make_candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
+    length = jnp.linalg.norm(sequences.image[:, 0] - tx, axis=-1)
+    return make_candidates(tx, tree.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
 
 
 def _on_mirror(start, goal, normal, offset):
@@ -227,9 +227,9 @@ def _length(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     return jnp.sqrt(jnp.maximum(jnp.sum(vector**2, -1), NEAR**2))
 
 
-def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
+def _inside(point: Float[Array, "*n 3"], half_planes: HalfPlanes, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
     """Returns whether points of a facet's plane lie inside its sides."""
-    return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
+    return (jnp.sum(half_planes.inward[facet] * point[..., None, :], -1) >= half_planes.offset[facet]).all(-1)
 
 
 def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
@@ -258,27 +258,27 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     return point, jnp.where(valid, strength, 0)
 
 
-def select_paths(mechanism: str, parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
+def select_paths(mechanism: str, parts: list[Candidates], tree: ImageTree, tried: int, kept: int, segments: int) -> Paths:
     """Returns the best paths of a mechanism among its best candidates, after these have been tested for intersections with all
     facets.
 
     Args:
         mechanism: its name.
         parts: candidates of all kinds.
-        search: image tree of the receiver.
+        tree: image tree of the receiver.
         tried: number of candidates that are tested.
         kept: number of paths returned; fewer if fewer are tried.
-        legs: largest number of segments of a path.
+        segments: largest number of segments of a path.
     """
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
-    cut = _of_living(lambda c: crossed(c.points[: legs + 1], search.planes), found)
+    cut = _of_living(lambda c: crossed(c.points[: segments + 1], tree.planes), found)
     crossings = jnp.sum(counted(cut), -1)
     whole = crossings + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
     score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
     found = jax.tree.map(lambda leaf: leaf[best], found)
-    facet, types, leg = jax.vmap(lambda path, words: _in_order(path, words, search))(found, cut[best])
-    return Paths(found.points, facet, types, leg, score > 0, mechanism)
+    facet, types, segment = jax.vmap(lambda path, words: _in_order(path, words, tree))(found, cut[best])
+    return Paths(found.points, facet, types, segment, score > 0, mechanism)
 
 
 def promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
@@ -310,15 +310,15 @@ def _in_blocks(leaf: Array, blocks: int) -> Array:
     return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
 
 
-def _in_order(candidate: Candidates, cut: UInt32[Array, "legs words"], search: Search):
+def _in_order(candidate: Candidates, cut: UInt32[Array, "segments words"], tree: ImageTree):
     """Returns the interactions of one path in order: facet or edge, type, segment."""
     number, crosses = first_of(cut.reshape(-1), MAX_INTERACTIONS)
-    leg, facet = jnp.divmod(number, cut.shape[1] * WORD)
-    share = crossing_share(candidate.points[leg], candidate.points[leg + 1], facet, search.planes)
+    segment, facet = jnp.divmod(number, cut.shape[1] * WORD)
+    share = crossing_share(candidate.points[segment], candidate.points[segment + 1], facet, tree.planes)
     vertex, types = jnp.arange(MAX_ORDER), candidate.interaction_type
-    crossing = jnp.where(crosses, leg + jnp.clip(share, BEHIND, 1), jnp.inf)
+    crossing = jnp.where(crosses, segment + jnp.clip(share, BEHIND, 1), jnp.inf)
     order = jnp.argsort(jnp.concatenate([crossing, jnp.where(types != NONE, vertex + 1.0, jnp.inf)]))[:MAX_INTERACTIONS]
     interactions = jnp.where(crosses, TRANSMITTED, NONE), types
     facets = jnp.where(crosses, facet, 0), candidate.interaction_facet
-    types, facet, leg = (jnp.concatenate(both)[order] for both in (interactions, facets, (leg, vertex)))
-    return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, leg, 0)
+    types, facet, segment = (jnp.concatenate(both)[order] for both in (interactions, facets, (segment, vertex)))
+    return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, segment, 0)

@@ -205,8 +205,8 @@ def normal_equations(
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(queried)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
-        if plan.tuning is not None:
-            voltages = voltages * element_gains(plan.tuning)
+        if plan.array_gains is not None:
+            voltages = voltages * element_gains(plan.array_gains)
         number, derivative = _terms(prepared, paths, queried.receiver_index, movers)
         lengths = jnp.zeros((len(number), q + 1)).at[jnp.arange(len(number))[:, None], place[number]].add(derivative)
         parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
