@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
+from wbgs_jax._util.pytree import pytree, static, to_device
 from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, heard_alone, register
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
@@ -297,9 +297,14 @@ class WaveField(Calibratable):
         }
         if params is None:
             return groups, None
-        clutter = [] if params.clutter is None else ["clutter"]
-        found = *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
-        return groups, with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
+        group_of = {"materials": "materials", "transmitter": "antennas", "element": "antennas", "placement": "placement"}
+        group_of |= {"thick": "ideal", "curved": "ideal", "clutter": "clutter"}
+
+        def label(path: Any, _: Any) -> str:
+            *_, last = path
+            return "thickness" if last.name == "log_thickness" else group_of.get(path[0].name, "corrections")
+
+        return groups, jax.tree_util.tree_map_with_path(label, params)
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:

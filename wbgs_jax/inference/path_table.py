@@ -12,7 +12,7 @@ from wbgs_jax.fields.base import paths_of
 from wbgs_jax.propagation.paths import InteractionType
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Arrivals, decibels, doppler_hz
-from wbgs_jax.types import Query, make_query
+from wbgs_jax.types import Query
 
 SIGHT = "line of sight"
 
@@ -21,6 +21,7 @@ def path_table(
     field: Field,
     params: Any,
     plan: Any,
+    queries: Query,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
     velocities: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
@@ -37,6 +38,7 @@ def path_table(
         field: a field that predicts paths.
         params: its parameters.
         plan: its plan for the receiver.
+        queries: of every transmitter at every frequency, which varies fastest.
         tx_positions: world frame, metres.
         frequencies_hz: carrier frequencies.
         velocities: velocities of transmitter and receiver, metres per second, world frame.
@@ -44,8 +46,9 @@ def path_table(
     """
     moving, tables = [jnp.asarray(velocity, jnp.float32) for velocity in velocities], []
     for number, position in enumerate(tx_positions):
-        for frequency in frequencies_hz:
-            found, shift = _link(field, params, plan, make_query(position[None], frequency[None]), *moving)
+        for column, frequency in enumerate(frequencies_hz):
+            row = number * len(frequencies_hz) + column
+            found, shift = _link(field, params, plan, jax.tree.map(lambda leaf, i=row: leaf[i : i + 1], queries), *moving)
             link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
             tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, materials))
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}

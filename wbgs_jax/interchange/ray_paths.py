@@ -23,7 +23,8 @@ from wbgs_jax.propagation.paths import InteractionType, is_vertex
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
-NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
+NONE, SPECULAR, DIFFUSE = (kind.sionna for kind in (InteractionType.NONE, InteractionType.REFLECTED, InteractionType.SCATTERED))
+REFRACTION, DIFFRACTION = InteractionType.TRANSMITTED.sionna, InteractionType.DIFFRACTED.sionna
 """Values of `sionna.rt.InteractionType`."""
 NEEDED = ("a", "tau", "theta_t", "phi_t", "theta_r", "phi_r")
 OF_PATHS = (*NEEDED, "valid", "interactions", "vertices")

@@ -60,6 +60,7 @@ class InteractionType(IntEnum):
     TRANSMITTED = 1, "through", 4
     REFLECTED = 2, "off", 1, True
     DIFFRACTED = 3, "around", 8, True, True
+    SCATTERED = 4, "scattered by", 2, True  # in paths of other programs
 
 
 NONE, TRANSMITTED = InteractionType.NONE, InteractionType.TRANSMITTED
