@@ -253,7 +253,7 @@ def _slab_interactions(
     )
 
 
-def _through_slabs(
+def through_slabs(
     field: Complex[Array, "k 3"], interactions: SlabInteractions, active: Bool[Array, "k 5"]
 ) -> Complex[Array, "k 3"]:
     """Returns the field behind the active ones of the slabs, applied in order."""
@@ -284,7 +284,7 @@ def specular_transport(
     frequency_hz: Float[Array, ""],
 ) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
     """Returns the field behind all slabs, and the spreading factor."""
-    return _through_slabs(field, interactions, interactions.active), 1 / segments.total
+    return through_slabs(field, interactions, interactions.active), 1 / segments.total
 
 
 def diffracted_transport(
@@ -302,10 +302,10 @@ def diffracted_transport(
     segment, edge = paths.interaction_segment[k, slot], paths.interaction_facet[k, slot]
     before = jnp.sum(jnp.where(jnp.arange(segments.length.shape[1]) <= segment[:, None], segments.length, 0), -1)
     after = jnp.maximum(segments.total - before, SHORTEST)
-    field = _through_slabs(field, interactions, active & (place < slot[:, None]))
+    field = through_slabs(field, interactions, active & (place < slot[:, None]))
     rays = segments.direction[k, segment], segments.direction[k, segment + 1]
     field = _diffract(field, *rays, before, after, edge, surfaces.edges, slabs, frequency_hz)
-    field = _through_slabs(field, interactions, active & (place > slot[:, None]))
+    field = through_slabs(field, interactions, active & (place > slot[:, None]))
     return field, 1 / jnp.sqrt(before * after * segments.total)
 
 
