@@ -27,7 +27,7 @@ from wbgs_jax.data.scene import in_sight
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields import Observation
 from wbgs_jax.fields.calibratable import Calibratable
-from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED
+from wbgs_jax.propagation.paths import REFLECTED, TRANSMITTED, TracedPaths
 from wbgs_jax.radio import pas_directions
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.training.batches import training_data
@@ -91,7 +91,7 @@ def keep(prepared: coherent.PreparedPaths, mask: np.ndarray) -> coherent.Prepare
     """Returns the paths of a mask alone."""
     specular = prepared.paths.specular
     specular = dataclasses.replace(specular, alive=specular.alive & jnp.asarray(mask))
-    return dataclasses.replace(prepared, paths=dataclasses.replace(prepared.paths, specular=specular))
+    return dataclasses.replace(prepared, paths=TracedPaths((specular, *prepared.paths.sets[1:])))
 
 
 @jax.jit

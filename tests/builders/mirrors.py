@@ -11,10 +11,10 @@ from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.fields import Field, Observation
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.propagation.paths import REFLECTED
-from wbgs_jax.radio.array import beams_of, covariance_to_pas, planar_array, steering_vector
+from wbgs_jax.radio.array import covariance_to_pas, make_lag_basis, planar_array, steering_vector
 from wbgs_jax.radio.channel import Paths, decibels
 
-BEAMS = beams_of(planar_array())
+BEAMS = make_lag_basis(planar_array())
 
 
 @pytree

@@ -9,9 +9,10 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.mesh.edges import Edges, edges_of_facets
 from wbgs_jax.mesh.facets import Facets, facets_from_mesh
-from wbgs_jax.propagation.image_method import Search, make_search
+from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.paths import TracedPaths, trace_paths
+from wbgs_jax.propagation.mechanisms import MECHANISMS, trace_paths
+from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.types import Mesh, Receiver, make_receiver
@@ -66,18 +67,19 @@ def edges_of(*parts, material=None) -> Edges:
     return edges_of_facets(facets_of(*parts, material=material))
 
 
-def search_of(parts, rx, mirror_areas=(0.0, 0.0, 0.0), material=None) -> Search:
+def search_of(parts, rx, mirror_areas=(0.0, 0.0, 0.0), material=None) -> ImageTree:
     """What the paths to a receiver are searched in."""
     facets = facets_of(*parts, material=material)
-    return make_search(facets, edges_of_facets(facets), np.asarray(rx, np.float32), mirror_areas, 0.5, 3.0)
+    return make_image_tree(facets, edges_of_facets(facets), np.asarray(rx, np.float32), mirror_areas, 0.5, 3.0)
 
 
-_trace = jax.jit(trace_paths, static_argnums=(2, 3, 4, 5))
+_trace = jax.jit(trace_paths, static_argnums=2)
 
 
 def trace(search, tx, specular=(512, 128), diffracted=(1024, 256)) -> TracedPaths:
     """All paths of one transmitter; (tried, kept) of either kind."""
-    return _trace(search, jnp.asarray(tx, search.receiver_position.dtype), *specular, *diffracted)
+    sizes = ("specular", *specular), ("diffracted", *diffracted)
+    return _trace(search, jnp.asarray(tx, search.receiver_position.dtype), sizes)
 
 
 def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0.1) -> Slabs:
@@ -89,11 +91,13 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 
 
 @jax.jit
-def arrivals_of(search: Search, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
+def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
-    specular = arrivals(traced.specular, search, slabs, frequency, receiver, False, *antennas)
-    diffracted = arrivals(traced.diffracted, search, slabs, frequency, receiver, True, *antennas)
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), specular, diffracted)
+    found = [
+        arrivals(some, search, slabs, frequency, receiver, MECHANISMS[some.mechanism].transport, *antennas)
+        for some in traced.sets
+    ]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
 
 
 def snapshot_of(search, tx, frequency, receiver=None, antennas=(), **slab) -> np.ndarray:

@@ -21,7 +21,7 @@ from wbgs_jax.fields import coherent, get_field, wideband
 from wbgs_jax.fields.nerf2 import Nerf2Config, Nerf2Field
 from wbgs_jax.propagation.materials import Slabs
 from wbgs_jax.propagation.paths import Paths
-from wbgs_jax.propagation.transport import arrivals
+from wbgs_jax.propagation.transport import arrivals, specular_transport
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.splat import TileLimits
 from wbgs_jax.types import Query, Receiver, Transmitter
@@ -241,7 +241,7 @@ def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
     def gradients(points, orientation):
         paths = Paths(points, nothing, nothing, nothing, jnp.array([True, False]))
         receiver = dataclasses.replace(plan.receiver, orientation=orientation)
-        return arrivals(paths, plan.surfaces, slabs, jnp.asarray(3e9), receiver, diffracted=False).amplitude.real.sum()
+        return arrivals(paths, plan.surfaces, slabs, jnp.asarray(3e9), receiver, specular_transport).amplitude.real.sum()
 
     for gradient in map(np.asarray, gradients(jnp.asarray(points), plan.receiver.orientation)):
         assert np.isfinite(gradient).all() and gradient.any()

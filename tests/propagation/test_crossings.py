@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from builders.rooms import box, facets_of, room, search_of, trace
 
-from wbgs_jax.mesh.facets import Facets, outline_of
+from wbgs_jax.mesh.facets import Facets, half_planes_of
 from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of, planes_of
 from wbgs_jax.propagation.paths import NONE, TRANSMITTED
 
@@ -25,7 +25,7 @@ def random_facets(rng, count) -> Facets:
 
 def shares(facets, start, end):
     """After which share of a leg it crosses every facet, infinite where it does not, and how many metres decide that."""
-    outline = outline_of(facets)
+    outline = half_planes_of(facets)
     here, there = (facets.normal @ p - facets.offset for p in (start, end))
     share = here / (here - there)
     point = start + share[:, None] * (end - start)
@@ -97,8 +97,8 @@ def crossings_compared(rng) -> int:
                 continue  # rounding decides
             through = paths.interaction_type[k] == TRANSMITTED
             assert paths.interaction_facet[k][through].tolist() == [f for _, f in sorted(crossings)]
-            leg = paths.interaction_leg[k][paths.interaction_type[k] != NONE]
-            assert (np.diff(leg) >= 0).all() and paths.interaction_leg[k][through].tolist() == [int(p) for p in places]
+            leg = paths.interaction_segment[k][paths.interaction_type[k] != NONE]
+            assert (np.diff(leg) >= 0).all() and paths.interaction_segment[k][through].tolist() == [int(p) for p in places]
             met += len(crossings)
     return met
 

@@ -12,7 +12,7 @@ from builders.rooms import box, edges_of, facets_of, mesh_of, rectangle, room
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.mesh.edges import edges_of_facets
-from wbgs_jax.mesh.facets import areas, facets_from_mesh, outline_of
+from wbgs_jax.mesh.facets import areas, facets_from_mesh, half_planes_of
 
 
 def segments(edges):
@@ -56,7 +56,7 @@ def test_facets_cover_every_point_of_a_plane_once(rng):
         ]
     )
     facets = facets_of(wall)
-    outline = outline_of(facets)
+    outline = half_planes_of(facets)
     points = np.stack([np.zeros(500), rng.uniform(0, 5, 500), rng.uniform(0, 3, 500)], -1)
     depth = np.einsum("fed,nd->nfe", outline.inward, points) - outline.offset
     inside = (depth > 0).all(-1).sum(-1)
@@ -209,6 +209,6 @@ def test_bodies_of_one_part_that_touch_keep_both_faces():
 def test_what_hits_a_seam_hits_one_of_its_facets():
     """Two panels meet at y = 0, and so do what stands on either side."""
     sheets = [rectangle((0, -2, 0), (0, 2, 0), (0, 0, 3)), rectangle((0, 0, 0), (0, 2, 0), (0, 0, 3))]
-    outline = outline_of(facets_from_mesh(mesh_of(*sheets)))
+    outline = half_planes_of(facets_from_mesh(mesh_of(*sheets)))
     inside = (outline.inward @ np.array([0.0, 0.0, 1.3]) >= outline.offset).all(-1)
     assert inside.sum() == 1

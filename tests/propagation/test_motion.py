@@ -20,7 +20,7 @@ from wbgs_jax.propagation.displacement import (
     path_coherence,
     still,
 )
-from wbgs_jax.propagation.image_method import make_search
+from wbgs_jax.propagation.image_method import make_image_tree
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED
 
 RX, TX = (1.0, 1.0, 1.2), (4.1, 2.9, 1.7)
@@ -61,7 +61,7 @@ def test_lengths_follow_surfaces_and_ends(kind, rng):
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
     motion = drawn(rng, turn=3e-4)
     there = moved(facets, motion.shift, motion.turn)
-    moved_search = make_search(there, edges_of_facets(there), np.add(RX, motion.receiver), (0.0, 0.0), 0.5, 3.0)
+    moved_search = make_image_tree(there, edges_of_facets(there), np.add(RX, motion.receiver), (0.0, 0.0), 0.5, 3.0)
     before, after = (getattr(trace(s, TX), kind) for s in (search, moved_search))
     expected = np.asarray(length_changes(before, search, motion))
     first, second = lengths(before), lengths(after)

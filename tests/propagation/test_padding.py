@@ -9,7 +9,7 @@ from builders.rooms import box, edges_of, facets_of, mesh_of, room, trace
 
 from wbgs_jax.fields.coherent import WaveConfig, make_field
 from wbgs_jax.mesh.edges import edges_of_facets, padded_edges, padded_size
-from wbgs_jax.propagation.image_method import make_search
+from wbgs_jax.propagation.image_method import make_image_tree
 from wbgs_jax.types import make_receiver
 
 SIZE = np.array([6.0, 4.0, 3.0])
@@ -33,8 +33,8 @@ def test_padding_adds_no_path(rng):
     facets = facets_of(*furnished(rng))
     edges = edges_of_facets(facets)
     own = rx, (0.0, 0.0, 0.0), 0.5, 3.0
-    search, padded = make_search(facets, edges, *own), make_search(facets, padded_edges(edges), *own, padded=True)
-    assert any(len(more.facet) > len(own.facet) for more, own in zip(padded.chains, search.chains, strict=True))
+    search, padded = make_image_tree(facets, edges, *own), make_image_tree(facets, padded_edges(edges), *own, padded=True)
+    assert any(len(more.facet) > len(own.facet) for more, own in zip(padded.sequences, search.sequences, strict=True))
     found, again = (trace(one, tx) for one in (search, padded))
     for paths, others in ((found.specular, again.specular), (found.diffracted, again.diffracted)):
         alive = np.asarray(paths.alive)

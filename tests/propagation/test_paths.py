@@ -8,7 +8,7 @@ from builders.rooms import box, edges_of, facets_of, rectangle, room, search_of,
 
 from wbgs_jax.mesh.facets import areas
 from wbgs_jax.propagation import image_method
-from wbgs_jax.propagation.image_method import make_search
+from wbgs_jax.propagation.image_method import make_image_tree
 from wbgs_jax.propagation.paths import DIFFRACTED, NONE, REFLECTED, TRANSMITTED
 
 SIZE = np.array([6.0, 4.0, 3.0])
@@ -138,10 +138,10 @@ def test_swapping_the_ends_reverses_the_paths(rng):
 def test_a_search_holds_device_arrays_and_no_mirror_that_is_too_small():
     """13 square metres leave floor, ceiling and the long walls to the first order; 100 leave nothing to the second."""
     facets, edges = facets_of(*room(SIZE)), edges_of(*room(SIZE))
-    search = make_search(facets, edges, jnp.array([1.0, 1.0, 1.0]), (13.0, 100.0, 0.0), 0.5, 3.0)
+    search = make_image_tree(facets, edges, jnp.array([1.0, 1.0, 1.0]), (13.0, 100.0, 0.0), 0.5, 3.0)
     leaves = jax.tree.leaves(search)
     assert all(isinstance(leaf, jax.Array) for leaf in leaves) and {str(leaf.dtype) for leaf in leaves} == {"float32", "int32"}
-    assert [chains.facet.shape for chains in search.chains] == [(4, 1), (0, 2), (0, 3)]
+    assert [chains.facet.shape for chains in search.sequences] == [(4, 1), (0, 2), (0, 3)]
     assert traced(search, (3.0, 2.0, 1.0)).specular.alive.sum() == 1 + 4
 
 
@@ -153,20 +153,20 @@ def test_of_too_many_chains_those_of_the_largest_mirrors_are_left(rng, monkeypat
         np.array([2.0, 3.0, 1.1]),
         int(rng.integers(20, 400)),
     )
-    everything = make_search(facets, edges, rx, (0.0, 0.0, 0.0), 0.5, 0.5)
+    everything = make_image_tree(facets, edges, rx, (0.0, 0.0, 0.0), 0.5, 0.5)
     monkeypatch.setattr(image_method, "MOST_TRIED", most)
     monkeypatch.setattr(image_method, "MOST_PAIRS", 3 * len(edges.length))
-    limited = make_search(facets, edges, rx, (0.0, 0.0, 0.0), 0.5, 0.5)
+    limited = make_image_tree(facets, edges, rx, (0.0, 0.0, 0.0), 0.5, 0.5)
     order = np.argsort(-areas(facets), kind="stable")
     before = np.zeros((1, 0), int)
-    for own, full in zip(limited.chains, everything.chains, strict=True):
+    for own, full in zip(limited.sequences, everything.sequences, strict=True):
         tried = [k for k in range(len(order) + 1) if k * np.isin(before, order[:k]).all(-1).sum() <= most]
         large = order[: max(tried)]
         kept = {tuple(row) for row in before[np.isin(before, large).all(-1)].tolist()}
         expected = [row for row in np.asarray(full.facet).tolist() if row[0] in large and tuple(row[1:]) in kept]
         assert sorted(np.asarray(own.facet).tolist()) == sorted(expected)
         before = np.asarray(own.facet)
-    assert len(limited.chains[2].facet) < len(everything.chains[2].facet)
+    assert len(limited.sequences[2].facet) < len(everything.sequences[2].facet)
     assert set(np.asarray(limited.diffracted.before)[:, 0]) == set(order[:3])
     assert set(np.asarray(limited.diffracted.after)[:, 0]) <= set(order[:3])
 

@@ -23,6 +23,7 @@ from builders.rooms import (
 )
 
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity, slab_coefficients
+from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import _across, element_voltages, snapshots_from_paths
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.antenna import Antenna, element_gain
@@ -108,7 +109,7 @@ def specular_only(search, tx, frequency, receiver=None, kept=128, **slab):
     """The snapshot without diffraction."""
     traced = trace(search, tx, specular=(512, kept))
     dark = dataclasses.replace(traced.diffracted, alive=jnp.zeros_like(traced.diffracted.alive))
-    return snapshot_over(search, dataclasses.replace(traced, diffracted=dark), frequency, receiver, **slab)
+    return snapshot_over(search, TracedPaths((traced.specular, dark)), frequency, receiver, **slab)
 
 
 def test_the_field_is_continuous_where_the_shadow_of_metal_begins():

@@ -9,9 +9,9 @@ from wbgs_jax.data import load_dataset
 from wbgs_jax.radio import array
 from wbgs_jax.radio.array import (
     PAS_SHAPE,
-    beams_of,
     covariance_to_pas,
     lag_basis,
+    make_lag_basis,
     normalise,
     pas_directions,
     planar_array,
@@ -171,7 +171,7 @@ def test_the_spectrum_of_a_snapshots_own_product_is_its_own(rng):
     y = rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))
     y = jnp.asarray(y / np.linalg.norm(y, axis=-1, keepdims=True), jnp.complex64)
     covariance, truth = y[:, :, None] * y[:, None].conj(), snapshot_to_pas(y, jnp.asarray(positions))
-    np.testing.assert_allclose(covariance_to_pas(covariance, beams_of(positions)), truth, atol=2e-3)
+    np.testing.assert_allclose(covariance_to_pas(covariance, make_lag_basis(positions)), truth, atol=2e-3)
     everywhere = jnp.broadcast_to(jnp.asarray(positions, jnp.float32), (3, 16, 3))
     np.testing.assert_allclose(wide_covariance_to_pas(covariance, everywhere), truth, atol=2e-3)
 
@@ -184,17 +184,17 @@ def test_beams_of_any_array_add_the_powers_of_what_is_not_coherent(rng):
     covariance = np.einsum("pe,pf->ef", steering * [[0.14], [0.06]], steering.conj())
     grid = np.exp(2j * np.pi * pas_directions() @ positions.T)
     power = sum(share * np.abs(grid.conj() @ one) ** 2 for share, one in zip((0.14, 0.06), steering, strict=True))
-    found = covariance_to_pas(jnp.asarray(covariance, jnp.complex64), beams_of(positions))
+    found = covariance_to_pas(jnp.asarray(covariance, jnp.complex64), make_lag_basis(positions))
     np.testing.assert_allclose(found, np.sqrt(power / power.max()), atol=2e-3)
 
 
 def test_a_regular_array_has_few_lags():
-    assert beams_of(planar_array()).basis.shape == (90 * 360, 2 * 25)  # 49 differences, opposite ones alike
+    assert make_lag_basis(planar_array()).basis.shape == (90 * 360, 2 * 25)  # 49 differences, opposite ones alike
 
 
 def test_of_nothing_there_is_nothing_to_see():
     nothing = jnp.zeros((1, 16, 16), jnp.complex64)
-    assert not np.any(covariance_to_pas(nothing, beams_of(planar_array())))
+    assert not np.any(covariance_to_pas(nothing, make_lag_basis(planar_array())))
     assert not np.any(wide_covariance_to_pas(nothing, jnp.asarray(planar_array(), jnp.float32)[None]))
-    slope = jax.grad(lambda r: jnp.sum(covariance_to_pas(r * (1 + 0j), beams_of(planar_array()))))(nothing.real)
+    slope = jax.grad(lambda r: jnp.sum(covariance_to_pas(r * (1 + 0j), make_lag_basis(planar_array()))))(nothing.real)
     assert np.isfinite(slope).all()

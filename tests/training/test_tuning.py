@@ -94,5 +94,5 @@ def test_another_receiver_is_in_tune(run, rng):
     field = run.field.with_gains(draw_gains(rng)[None])
     known = run.dataset.receiver()
     other = dataclasses.replace(known, position=known.position + 0.5)
-    np.testing.assert_array_equal(field.plan(None, other).tuning, 0)
-    assert np.any(field.plan(None, known).tuning)
+    np.testing.assert_array_equal(field.plan(None, other).array_gains, 0)
+    assert np.any(field.plan(None, known).array_gains)

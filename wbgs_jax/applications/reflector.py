@@ -20,7 +20,7 @@ from wbgs_jax.applications.antenna_placement import NARROWEST_M, Powers, soft_mi
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
-from wbgs_jax.propagation.paths import TRANSMITTED
+from wbgs_jax.propagation.paths import is_vertex
 from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
 from wbgs_jax.radio.channel import decibels, free_space_db
@@ -176,7 +176,7 @@ def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any
     def at(plan: Any, places: Float[Array, "k 3"], frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
         arrived = paths_of(field, params, plan, make_query(places, frequency_hz))
         assert arrived.interaction is not None, "arrivals of traced paths have interactions"
-        straight = jnp.all(arrived.interaction <= TRANSMITTED, -1)
+        straight = ~jnp.any(is_vertex(arrived.interaction), -1)
         return decibels(jnp.sum(jnp.where(straight, squared_magnitude(arrived.amplitude), 0), -1))
 
     def powers(places: Any, blur: Any = 0.0) -> Float[Array, "k ends"]:

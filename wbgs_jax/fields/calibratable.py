@@ -62,7 +62,7 @@ class Calibratable(Field):
         """Returns the field with surfaces and receivers displaced further (host)."""
 
     @abstractmethod
-    def without(self, movers: Int[np.ndarray, " k"]) -> "Calibratable":
+    def without(self, rigid_bodies: Int[np.ndarray, " k"]) -> "Calibratable":
         """Returns the field without some rigid bodies, given by their indices (host)."""
 
     @abstractmethod

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax._util.pytree import pytree, static, to_device, with_leaves
+from wbgs_jax._util.pytree import pytree, static, to_device
 from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, heard_alone, register
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
@@ -28,7 +28,6 @@ from wbgs_jax.fields.coherent_model import (
     arrivals_at,
     densities,
     first_params,
-    no_clutter,
     observe,
     path_arrivals,
     path_covariances,
@@ -37,6 +36,7 @@ from wbgs_jax.fields.coherent_model import (
     prepare_paths,
     slabs_at,
     trace,
+    transparent_grid,
 )
 from wbgs_jax.fields.coherent_settings import PRESETS, WaveConfig
 from wbgs_jax.fields.losses import snapshot_losses
@@ -46,8 +46,8 @@ from wbgs_jax.mesh.facets import moved as move_facets
 from wbgs_jax.mesh.simplification import facets_that_fit
 from wbgs_jax.propagation.absorption import Grid, grid_around
 from wbgs_jax.propagation.displacement import Motion, still
-from wbgs_jax.propagation.image_method import Search, make_search
-from wbgs_jax.radio.array import Beams, beams_of
+from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
+from wbgs_jax.radio.array import LagBasis, make_lag_basis
 from wbgs_jax.radio.channel import Arrivals
 from wbgs_jax.radio.geometry import turned
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_receiver
@@ -127,11 +127,13 @@ class WaveField(Calibratable):
     ) -> WavePlan:
         """Returns a plan with all mirror images of a receiver (host), or without them if its paths are prepared."""
         check_receiver(receiver)
-        receiver, tuning = self._as_found(receiver)
-        surfaces, beams = (
-            (self._search(receiver), _beams(receiver)) if prepared is None else (prepared.surfaces, prepared.beams)
+        receiver, array_gains = self._as_found(receiver)
+        surfaces, lag_basis = (
+            (self._image_tree(receiver), _lag_basis(receiver)) if prepared is None else (prepared.surfaces, prepared.lag_basis)
         )
-        return WavePlan(surfaces, receiver, tuning, self.known_thickness, None, beams, self.grid, prepared, self.config)
+        return WavePlan(
+            surfaces, receiver, array_gains, self.known_thickness, None, lag_basis, self.grid, prepared, self.config
+        )
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
         """Returns a plan whose surfaces and receiver are displaced, to first order, from where its paths were traced.
@@ -143,7 +145,7 @@ class WaveField(Calibratable):
         orientation = turned(plan.receiver.orientation, jnp.asarray(motion.receiver_turn))
         return dataclasses.replace(plan, motion=motion, receiver=dataclasses.replace(plan.receiver, orientation=orientation))
 
-    def _search(self, receiver: Receiver) -> Search:
+    def _image_tree(self, receiver: Receiver) -> ImageTree:
         config = self.config
         if _traced(self.facets, self.edges, receiver.position):
             raise TypeError(
@@ -151,7 +153,7 @@ class WaveField(Calibratable):
                 "be traced or differentiated; close over both, or make the plan outside jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
-        return make_search(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
+        return make_image_tree(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
         """Returns a receiver of the data at its estimated position and orientation, with its array gains; any other receiver is
@@ -172,8 +174,8 @@ class WaveField(Calibratable):
             with jax.ensure_compile_time_eval():
                 position = jnp.asarray(position)
         orientation = turned(receiver.orientation, found(self.motion.receiver_turn))
-        tuning = None if self.tuning is None else found(self.tuning)
-        return dataclasses.replace(receiver, position=position, orientation=orientation), tuning
+        array_gains = None if self.tuning is None else found(self.tuning)
+        return dataclasses.replace(receiver, position=position, orientation=orientation), array_gains
 
     def prepare(self, links: Links, receivers: Receiver) -> PreparedPaths:
         """Returns the paths between the transmitters and receivers of links (host); geometry is not trained."""
@@ -218,9 +220,9 @@ class WaveField(Calibratable):
         facets = move_facets(self.facets, np.asarray(motion.shift), np.asarray(motion.turn))
         return self._of(facets, jax.tree.map(lambda a, b: a + b, self.motion, motion))
 
-    def without(self, movers: Int[np.ndarray, " k"]) -> "WaveField":
+    def without(self, rigid_bodies: Int[np.ndarray, " k"]) -> "WaveField":
         """Returns the field without some rigid bodies, given by their indices (host)."""
-        stays = np.setdiff1d(np.arange(len(self.motion.shift)), movers)
+        stays = np.setdiff1d(np.arange(len(self.motion.shift)), rigid_bodies)
         motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
         placement = self.first_placement[np.append(stays, -1)]
         return dataclasses.replace(self._of(remaining(self.facets, stays), motion), first_placement=placement)
@@ -239,7 +241,7 @@ class WaveField(Calibratable):
         (host)."""
         around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
         grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
-        return dataclasses.replace(self, grid=to_device(grid), first_clutter=no_clutter(shape))
+        return dataclasses.replace(self, grid=to_device(grid), first_clutter=transparent_grid(shape))
 
     def material_properties(self, params: WaveParams) -> MaterialProperties:
         """Returns the learned properties of the materials (host)."""
@@ -295,9 +297,14 @@ class WaveField(Calibratable):
         }
         if params is None:
             return groups, None
-        clutter = [] if params.clutter is None else ["clutter"]
-        found = *["corrections"] * 3, *["antennas"] * 4, "placement", "ideal", "ideal"
-        return groups, with_leaves(params, *["materials"] * 3, "thickness", *found, *clutter)
+        group_of = {"materials": "materials", "transmitter": "antennas", "element": "antennas", "placement": "placement"}
+        group_of |= {"thick": "ideal", "curved": "ideal", "clutter": "clutter"}
+
+        def label(path: Any, _: Any) -> str:
+            *_, last = path
+            return "thickness" if last.name == "log_thickness" else group_of.get(path[0].name, "corrections")
+
+        return groups, jax.tree_util.tree_map_with_path(label, params)
 
 
 def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()) -> WaveField:
@@ -311,19 +318,19 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     config = config or WaveConfig()
     facets = facets_that_fit(mesh, config.max_facets)
     edges = padded_edges(edges_of_facets(facets))
-    movers = int(facets.mover.max()) + 1
-    placement = jnp.full(movers + 1, np.log(config.placement), jnp.float32)
+    rigid_bodies = int(facets.mover.max()) + 1
+    placement = jnp.full(rigid_bodies + 1, np.log(config.placement), jnp.float32)
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
-    motion = to_device(still(movers, len(known)))
+    motion = to_device(still(rigid_bodies, len(known)))
     return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, None, None, config)
 
 
-def _beams(receiver: Receiver) -> Beams | None:
-    """Returns the beams of an array whose positions are in wavelengths and available on the host; None for any other array."""
+def _lag_basis(receiver: Receiver) -> LagBasis | None:
+    """Returns the lag basis of an array with positions in wavelengths that are available on the host, else None."""
     positions = receiver.element_positions
     if receiver.unit != "wavelengths" or _traced(positions):
         return None
-    return beams_of(np.asarray(positions))
+    return make_lag_basis(np.asarray(positions))
 
 
 def _traced(*trees: Any) -> bool:

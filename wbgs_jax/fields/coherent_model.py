@@ -26,15 +26,16 @@ from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.coherent_settings import WaveConfig
 from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed
 from wbgs_jax.propagation.displacement import Motion, length_changes, path_coherence
-from wbgs_jax.propagation.image_method import Search, Surfaces
+from wbgs_jax.propagation.image_method import ImageTree, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths, trace_paths
+from wbgs_jax.propagation.mechanisms import MECHANISMS, concatenated, sizes_of, trace_paths
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
 from wbgs_jax.radio.antenna import Antenna, upright
 from wbgs_jax.radio.array import (
     EXACT,
     SPEED_OF_LIGHT,
-    Beams,
+    LagBasis,
     covariance_to_pas,
     wide_covariance_to_pas,
 )
@@ -44,7 +45,7 @@ from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 FAINTEST_SUM = 1e-12
 """Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
 there is no spectrum."""
-CLUTTER_HZ = 1e9, 1e11
+DENSITIES_HZ = 1e9, 1e11
 """Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
 between, constant beyond."""
 THIN = 1e-3
@@ -75,8 +76,8 @@ class WaveParams:
     facet_correction: Float[Array, "f 2"]
     """Logarithm of amplitude, and phase (radians), of a facet's reflection relative to that of its material."""
     excess_loss: Float[Array, "2 3"]
-    """Additional loss per interaction beyond that of the slab or wedge, nepers. Rows: specular and diffracted paths; columns:
-    transmission, reflection, diffraction."""
+    """Additional loss per interaction beyond that of the slab or wedge, nepers. Rows: specular and diffracted paths (of any
+    further mechanism the last one holds); columns: transmission, reflection, diffraction."""
     log_gain: Float[Array, ""]
     """Logarithm of the overall gain: that of the transmitter, and any other common factor of all snapshots."""
     transmitter: Antenna
@@ -93,7 +94,7 @@ class WaveParams:
     """Propagation option: 1 for spherical waves at the array, as in reality, 0 for plane waves
     (`transport.element_voltages`)."""
     clutter: Float[Array, "x y z 2"] | None
-    """Stored (unconstrained) density of the absorption grid at both of `CLUTTER_HZ`, for objects that are not in the mesh;
+    """Stored (unconstrained) density of the absorption grid at both of `DENSITIES_HZ`, for objects that are not in the mesh;
     `densities` returns nepers per metre. None without an absorption grid."""
 
 
@@ -103,8 +104,8 @@ class PreparedPaths:
 
     surfaces: Surfaces
     """Facets and edges, shared by all receivers."""
-    beams: Beams | None
-    """Beams of the receivers' array; None if they depend on the frequency or on the receiver."""
+    lag_basis: LagBasis | None
+    """Lag basis of the receivers' array; None if they depend on the frequency or on the receiver."""
     paths: TracedPaths
     """Paths; the leading axis is that of the pairs, sorted by receiver, then by transmitter."""
     receiver_index: Int[Array, " pairs"]
@@ -136,15 +137,15 @@ class WavePlan:
     """Everything that is independent of the query: geometry only, no parameters."""
 
     surfaces: Surfaces
-    """Facets and edges; a `Search` with the receiver's mirror images unless paths are prepared."""
+    """Facets and edges; a `ImageTree` with the receiver's mirror images unless paths are prepared."""
     receiver: Receiver
-    tuning: Float[Array, "elements 2"] | None
+    array_gains: Float[Array, "elements 2"] | None
     """Array gains of the receiver: logarithm of amplitude, and phase (radians), of its elements; None for ideal elements."""
     known_thickness: Float[Array, " m"]
     motion: Motion | None
     """Displacements of rigid bodies and of this receiver since the paths were traced, while they are being estimated."""
-    beams: Beams | None
-    """Beams of the array; None if they depend on the frequency, or if the positions of its elements are traced by JAX."""
+    lag_basis: LagBasis | None
+    """Lag basis of the array; None if they depend on the frequency, or if the positions of its elements are traced by JAX."""
     grid: Grid | None
     """Cells of the absorption grid, or None without one."""
     prepared: PreparedPaths | None
@@ -194,12 +195,12 @@ def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, links:
 
 def _snapshots(plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
     y = jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
-    return y if plan.tuning is None else y * element_gains(plan.tuning)
+    return y if plan.array_gains is None else y * element_gains(plan.array_gains)
 
 
-def element_gains(tuning: Float[Array, "elements 2"]) -> Complex[Array, " elements"]:
+def element_gains(array_gains: Float[Array, "elements 2"]) -> Complex[Array, " elements"]:
     """Returns the complex gains of elements from their stored logarithms and phases."""
-    return jnp.exp(tuning[:, 0] + 1j * tuning[:, 1])
+    return jnp.exp(array_gains[:, 0] + 1j * array_gains[:, 1])
 
 
 @jax.jit
@@ -211,8 +212,8 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query
     arrived, frequency_hz = path_arrivals(params, plan, paths, links), links.frequency_hz
     y, elements = _snapshots(plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
-    if plan.beams is not None:
-        pas = covariance_to_pas(covariance, plan.beams)
+    if plan.lag_basis is not None:
+        pas = covariance_to_pas(covariance, plan.lag_basis)
     else:
         pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (y.shape[0], *elements.shape[-2:])))
     return Observation(pas, y, decibels(power), covariance, arrived)
@@ -232,8 +233,8 @@ def path_covariances(
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
         coherence = path_coherence(paths, plan.surfaces, spread, 2 * jnp.pi * f / SPEED_OF_LIGHT)
         covariance = covariance_from_paths(arrived, plan.receiver, f, coherence)
-        if plan.tuning is not None:
-            gains = element_gains(plan.tuning)
+        if plan.array_gains is not None:
+            gains = element_gains(plan.array_gains)
             covariance = covariance * gains[:, None] * gains.conj()
         trace = jnp.trace(covariance).real
         return covariance / jnp.maximum(trace, FAINTEST_SUM), trace / len(covariance) * strongest**2
@@ -272,31 +273,31 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
     """Returns the arrivals over all paths of one link."""
     frequency_hz = link.frequency_hz
     slabs, found = slabs_at(params, plan, frequency_hz), []
-    clutter = None if params.clutter is None else _clutter_at(params.clutter, frequency_hz)
-    for row, some in enumerate((paths.specular, paths.diffracted)):
+    density = None if params.clutter is None else _density_at(params.clutter, frequency_hz)
+    for some in paths.sets:
         antennas = transmitter_antenna(params, link.transmitter), params.element
-        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, row == 1, *antennas)
-        gain = jnp.exp(params.log_gain) * _corrections(params, some, row)
-        if clutter is not None:
+        transport = MECHANISMS[some.mechanism].transport
+        one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, transport, *antennas)
+        gain = jnp.exp(params.log_gain) * _corrections(params, some)
+        if density is not None:
             assert plan.grid is not None, "a field with absorption parameters has a grid"
-            gain = gain * jnp.exp(-attenuation(one.points, clutter, plan.grid))
+            gain = gain * jnp.exp(-attenuation(one.points, density, plan.grid))
         if plan.motion is not None:
             cycles = frequency_hz / SPEED_OF_LIGHT * length_changes(some, plan.surfaces, plan.motion)
             gain = gain * phasor(-cycles)
         assert one.polarised is not None, "arrivals of traced paths have it"
         found.append(one._replace(amplitude=one.amplitude * gain, polarised=one.polarised * gain[:, None]))
-    joined: Any = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-    return joined._replace(curved=params.curved)
+    return concatenated(found)._replace(spherical_wave=params.curved)
 
 
-def no_clutter(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
+def transparent_grid(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
     """Returns the initial `WaveParams.clutter`, which is nearly transparent (`THIN`)."""
-    return stored(jnp.full((*shape, len(CLUTTER_HZ)), THIN, jnp.float32))
+    return stored(jnp.full((*shape, len(DENSITIES_HZ)), THIN, jnp.float32))
 
 
-def densities(clutter: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
+def densities(stored_density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
     """Returns the densities, nepers per metre, of stored values."""
-    return jax.nn.softplus(clutter)
+    return jax.nn.softplus(stored_density)
 
 
 def stored(density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
@@ -304,23 +305,18 @@ def stored(density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
     return jnp.log(jnp.expm1(density))
 
 
-def _clutter_at(clutter: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]) -> Float[Array, "x y z"]:
+def _density_at(stored_density: Float[Array, "x y z 2"], frequency_hz: Float[Array, ""]) -> Float[Array, "x y z"]:
     """Returns the smoothed density at one frequency, nepers per metre."""
-    low, high = CLUTTER_HZ
+    low, high = DENSITIES_HZ
     share = jnp.clip(jnp.log(frequency_hz / low) / np.log(high / low), 0, 1)
-    at_low, at_high = jnp.moveaxis(smoothed(densities(clutter)), -1, 0)  # computed once for all links of a batch
+    at_low, at_high = jnp.moveaxis(smoothed(densities(stored_density)), -1, 0)  # computed once for all links of a batch
     return (1 - share) * at_low + share * at_high
 
 
-def _corrections(params: WaveParams, paths: Paths, row: int) -> Complex[Array, " k"]:
-    """Returns the factors of paths due to facet corrections and additional losses.
-
-    Args:
-        params: parameters.
-        paths: K paths.
-        row: 0 for specular paths, 1 for diffracted paths.
-    """
+def _corrections(params: WaveParams, paths: Paths) -> Complex[Array, " k"]:
+    """Returns the factors of K paths of one mechanism due to facet corrections and additional losses."""
     kind = paths.interaction_type
+    row = min(list(MECHANISMS).index(paths.mechanism), len(params.excess_loss) - 1)
     counts = jnp.stack([jnp.sum(kind == one, -1) for one in (TRANSMITTED, REFLECTED, DIFFRACTED)], -1)
     reflects = kind == REFLECTED
     correction = params.facet_correction[jnp.where(reflects, paths.interaction_facet, 0)]
@@ -342,24 +338,23 @@ def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedP
     """
     numbers = np.stack([np.asarray(links.receiver_index), np.asarray(links.tx_index)], -1)
     pairs, first = np.unique(numbers, axis=0, return_index=True)
-    positions, found, beams = np.asarray(links.tx_position)[first], [], []
+    positions, found, bases = np.asarray(links.tx_position)[first], [], []
     for receiver in np.unique(pairs[:, 0]):
         plan = plan_of(int(receiver))  # one at a time: the mirror images of many receivers would need much memory
         found.append(_traced_in_blocks(plan, positions[pairs[:, 0] == receiver]))
-        beams.append(plan.beams)
-    paths = TracedPaths(_stacked([one.specular for one in found]), _stacked([one.diffracted for one in found]))
+        bases.append(plan.lag_basis)
+    paths = TracedPaths(tuple(_stacked(list(sets)) for sets in zip(*(one.sets for one in found), strict=True)))
     surfaces = Surfaces(plan.surfaces.facets, plan.surfaces.edges)
-    return PreparedPaths(surfaces, _shared(beams), paths, *jnp.asarray(pairs.T, jnp.int32))
+    return PreparedPaths(surfaces, _shared(bases), paths, *jnp.asarray(pairs.T, jnp.int32))
 
 
 @jax.jit
 def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
     """Returns the paths of B transmitters; independent of frequency and materials."""
-    config, search = plan.config, plan.surfaces
-    if not isinstance(search, Search):
+    config, tree = plan.config, plan.surfaces
+    if not isinstance(tree, ImageTree):
         raise TypeError("a plan with prepared paths traces no others; make a plan without them")
-    sizes = config.specular_tried, config.specular_kept, config.diffracted_tried, config.diffracted_kept
-    return jax.lax.map(lambda tx: trace_paths(search, tx, *sizes), tx_position)
+    return jax.lax.map(lambda tx: trace_paths(tree, tx, sizes_of(config)), tx_position)
 
 
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:
@@ -380,7 +375,7 @@ def _stacked(some: list[Paths]) -> Paths:
     return dataclasses.replace(together, alive=jnp.asarray(alive))
 
 
-def _shared(beams: list[Beams | None]) -> Beams | None:
-    """Returns the beams of all receivers if they are the same, else None."""
-    first, *others = beams
+def _shared(bases: list[LagBasis | None]) -> LagBasis | None:
+    """Returns the lag basis of all receivers if they are the same, else None."""
+    first, *others = bases
     return first if all(same(first, other) for other in others) else None

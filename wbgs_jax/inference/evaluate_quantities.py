@@ -75,6 +75,10 @@ class LoadedField:
         levels = {name: round(float(own.level), 4) for name, own in learned.items() if own is not None}
         return {"scene": self.dataset.name, "version": wbgs_jax.__version__, "receiver": receiver} | origin | levels
 
+    def query(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
+        """Returns queries for every transmitter at every frequency, which varies fastest."""
+        return make_query(*Queries(tx_positions, frequencies_hz).flat())
+
     def evaluate(
         self, what: str, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
     ) -> Answer:
@@ -155,11 +159,6 @@ def known_quantities(field: Field, dataset: Dataset) -> list[str]:
     return found
 
 
-def _queries(tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
-    """Returns queries for every transmitter at every frequency; the frequency varies fastest."""
-    return make_query(*Queries(tx_positions, frequencies_hz).flat())
-
-
 def _shaped(found: Any, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> np.ndarray:
     values = np.asarray(found)
     return values.reshape(len(tx_positions), len(frequencies_hz), *values.shape[1:])
@@ -168,7 +167,7 @@ def _shaped(found: Any, tx_positions: np.ndarray, frequencies_hz: np.ndarray) ->
 def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns spectra `pas` (tx, freq, 90, 360) and, with prediction intervals, `expected` (tx, freq, 3): the expected SSIM and
     the ends of its interval."""
-    query = _queries(tx_positions, frequencies_hz)
+    query = at.query(tx_positions, frequencies_hz)
     seen = observe_queries(at.trained, at.receiver, query)
     answer = {"pas": _shaped(seen.pas, tx_positions, frequencies_hz)}
     confidence = for_receiver(at.trained.intervals, at.receiver)
@@ -182,13 +181,13 @@ def _spectra(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarr
 
 
 def _snapshots(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
-    found = observe_queries(at.trained, at.receiver, _queries(tx_positions, frequencies_hz), "snapshots")
+    found = observe_queries(at.trained, at.receiver, at.query(tx_positions, frequencies_hz), "snapshots")
     return {"snapshots": _shaped(found, tx_positions, frequencies_hz)}
 
 
 def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns received powers, dB relative to the transmitted power, and their prediction intervals if the run has them."""
-    query, learned = _queries(tx_positions, frequencies_hz), at.trained.power_intervals
+    query, learned = at.query(tx_positions, frequencies_hz), at.trained.power_intervals
     power = observe_queries(at.trained, at.receiver, query, "power_db")
     answer = {"power_db": power}
     if learned is not None:
@@ -199,7 +198,7 @@ def _power(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
 
 def _best_beams(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns the indices of the beams of `radio.array.codebook` with the highest received power."""
-    spectra = observe_queries(at.trained, at.receiver, _queries(tx_positions, frequencies_hz), "pas")
+    spectra = observe_queries(at.trained, at.receiver, at.query(tx_positions, frequencies_hz), "pas")
     return {"best_beam": _shaped(best_beams(spectra), tx_positions, frequencies_hz)}
 
 
@@ -209,7 +208,7 @@ def _from_arrivals(
     """Returns a quantity that is computed from the paths of each link."""
     found = map_blocks(
         lambda block: _measure(at.trained.field, at.trained.params, at.plan, at.receiver, block, function),
-        _queries(tx_positions, frequencies_hz),
+        at.query(tx_positions, frequencies_hz),
         BLOCK,
     )
     return {name: _shaped(found, tx_positions, frequencies_hz)}
@@ -244,7 +243,8 @@ def _paths(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray
     """Returns a table (`path_table`)."""
     velocities = at.options.tx_velocity, at.options.rx_velocity
     field, params = at.trained.field, at.trained.params
-    return path_table(field, params, at.plan, tx_positions, frequencies_hz, velocities, at.materials)
+    query = at.query(tx_positions, frequencies_hz)
+    return path_table(field, params, at.plan, query, tx_positions, frequencies_hz, velocities, at.materials)
 
 
 def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
@@ -254,7 +254,7 @@ def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_h
     band_hz, points = at.options.band_hz, at.options.points
     offsets = (np.arange(points) - points // 2) * band_hz / points
     bands = frequencies_hz[:, None] + offsets
-    query = _queries(tx_positions, bands.reshape(-1))
+    query = at.query(tx_positions, bands.reshape(-1))
     response = observe_queries(at.trained, at.receiver, query, "snapshots").reshape(len(tx_positions), *bands.shape, -1)
     return {
         "frequency_response": response,
@@ -282,7 +282,7 @@ def mimo_matrices(
     elements = jnp.asarray(tx_elements, jnp.float32)
     found = map_blocks(
         lambda block: _matrices(at.trained.field, at.trained.params, at.plan, block, at.receiver, elements),
-        _queries(tx_positions, frequencies_hz),
+        at.query(tx_positions, frequencies_hz),
         1,
     )
     return _shaped(found, tx_positions, frequencies_hz)

@@ -9,13 +9,11 @@ from jaxtyping import Array, Float, Int
 
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import paths_of
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
+from wbgs_jax.propagation.paths import InteractionType
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Paths, decibels, doppler_hz
-from wbgs_jax.types import Query, make_query
+from wbgs_jax.types import Query
 
-WORDS = {TRANSMITTED: "through", REFLECTED: "off", DIFFRACTED: "around"}
-"""Prepositions by type of interaction: through a wall, off a floor, around the edge of a cabinet."""
 SIGHT = "line of sight"
 
 
@@ -23,6 +21,7 @@ def path_table(
     field: Field,
     params: Any,
     plan: Any,
+    queries: Query,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
     velocities: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
@@ -39,6 +38,7 @@ def path_table(
         field: a field that predicts paths.
         params: its parameters.
         plan: its plan for the receiver.
+        queries: of every transmitter at every frequency, which varies fastest.
         tx_positions: world frame, metres.
         frequencies_hz: carrier frequencies.
         velocities: velocities of transmitter and receiver, metres per second, world frame.
@@ -46,8 +46,9 @@ def path_table(
     """
     moving, tables = [jnp.asarray(velocity, jnp.float32) for velocity in velocities], []
     for number, position in enumerate(tx_positions):
-        for frequency in frequencies_hz:
-            found, shift = _link(field, params, plan, make_query(position[None], frequency[None]), *moving)
+        for column, frequency in enumerate(frequencies_hz):
+            row = number * len(frequencies_hz) + column
+            found, shift = _link(field, params, plan, jax.tree.map(lambda leaf, i=row: leaf[i : i + 1], queries), *moving)
             link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
             tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, materials))
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
@@ -88,8 +89,8 @@ def describe_interactions(
 ) -> str:
     """Returns a description of the interactions of a path, such as "off concrete, through glass"."""
     met = [
-        f"{WORDS[int(kind)]} {names[material] if material < len(names) else f'material {material}'}"
+        f"{InteractionType(kind).word} {names[material] if material < len(names) else f'material {material}'}"
         for kind, material in zip(kinds, materials, strict=True)
-        if int(kind) in WORDS
+        if kind != InteractionType.NONE
     ]
     return ", ".join(met) or SIGHT

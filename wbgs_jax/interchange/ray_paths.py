@@ -19,13 +19,13 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, read_arrays
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
+from wbgs_jax.propagation.paths import InteractionType, is_vertex
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.types import LOWEST_OF_PATHS_HZ, MAX_FREQUENCY_HZ
 
-NONE, SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION = 0, 1, 2, 4, 8
+NONE, SPECULAR, DIFFUSE = (kind.sionna for kind in (InteractionType.NONE, InteractionType.REFLECTED, InteractionType.SCATTERED))
+REFRACTION, DIFFRACTION = InteractionType.TRANSMITTED.sionna, InteractionType.DIFFRACTED.sionna
 """Values of `sionna.rt.InteractionType`."""
-INTERACTION = {TRANSMITTED: REFRACTION, REFLECTED: SPECULAR, DIFFRACTED: DIFFRACTION}
 NEEDED = ("a", "tau", "theta_t", "phi_t", "theta_r", "phi_r")
 OF_PATHS = (*NEEDED, "valid", "interactions", "vertices")
 SINGLE, ARRAYS = 3, 5
@@ -181,8 +181,8 @@ def from_paths(arrivals: Any, tx_positions: Any, rx_position: Any, frequency_hz:
     theta_r, phi_r = _angles(-np.asarray(arrivals.arrival, np.float64))
     own = np.asarray(arrivals.interaction)
     met = np.zeros_like(own)
-    for kind, name in INTERACTION.items():
-        met = np.where(own == kind, name, met)
+    for kind in InteractionType:
+        met = np.where(own == kind, kind.sionna, met)
     valid = np.abs(amplitude) > 0
     one = {"tau": np.where(valid, tau, -1), "theta_t": theta_t, "phi_t": phi_t, "theta_r": theta_r, "phi_r": phi_r}
     return RayPaths(
@@ -313,7 +313,7 @@ def _vertices(interaction: Int[np.ndarray, "t k d"], points: Any) -> Float[np.nd
     found = np.full((*interaction.shape, 3), np.nan)
     if points is None:
         return found
-    has_place = (interaction == REFLECTED) | (interaction == DIFFRACTED)
+    has_place = np.asarray(is_vertex(interaction))
     number = np.minimum(np.cumsum(has_place, -1), np.shape(points)[-2] - 1)
     placed = np.take_along_axis(np.asarray(points, np.float64), number[..., None], -2)
     return np.where(has_place[..., None], placed, found)

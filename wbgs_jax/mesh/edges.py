@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from wbgs_jax._util.pytree import pytree
-from wbgs_jax.mesh.facets import CORNERS, WELD, AnyArray, Facets, outline_of
+from wbgs_jax.mesh.facets import CORNERS, WELD, AnyArray, Facets, half_planes_of
 
 SHARPEST = 0.05
 """Radians: edges with a smaller angle between their normals are part of a smooth surface."""
@@ -118,7 +118,7 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
         np.linalg.norm(out, axis=-1, keepdims=True), WELD
     )  # the outward direction between the two faces of a sheet is zero
     middle = edges.start + edges.direction * edges.length[:, None] / 2
-    normal, outline = np.asarray(facets.normal), outline_of(facets)
+    normal, half_planes = np.asarray(facets.normal), half_planes_of(facets)
     covered = np.zeros(len(middle), bool)
     for i, (point, way) in enumerate(zip(middle, out, strict=True)):
         height = normal @ point - np.asarray(facets.offset)
@@ -126,7 +126,7 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
         distance = -height / np.where(along == 0, 1, along)
         near = np.flatnonzero((along != 0) & (distance > WELD) & (distance < GAP))
         there = point + distance[near, None] * way
-        inside = (np.einsum("fed,fd->fe", outline.inward[near], there) >= outline.offset[near]).all(-1)
+        inside = (np.einsum("fed,fd->fe", half_planes.inward[near], there) >= half_planes.offset[near]).all(-1)
         covered[i] = inside.any()
     return covered
 

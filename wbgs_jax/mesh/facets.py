@@ -51,7 +51,7 @@ class Facets:
 
 
 @pytree
-class Outline:
+class HalfPlanes:
     """Half-planes of all facets: a point of the plane lies inside where inward . point >= offset for all four sides."""
 
     inward: Float[AnyArray, "f 4 3"]
@@ -73,12 +73,12 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     piece = piece.reshape(-1)[kept]
     material = pieces[piece, 1]
     body = _bodies(triangles, piece, pieces[:, 1])
-    mover = _rigid_bodies(triangles, body)
+    rigid_body = _rigid_bodies(triangles, body)
     normal, area = _normals(points, triangles)
     keep = area > SMALLEST_AREA
     if not keep.any():
         raise UserError("the mesh has no triangle with an area; omit the mesh, or provide one with surfaces")
-    triangles, normal, body, material, mover = (a[keep] for a in (triangles, normal, body, material, mover))
+    triangles, normal, body, material, rigid_body = (a[keep] for a in (triangles, normal, body, material, rigid_body))
     polygons: list[Polygon] = []
     first = []  # a triangle in every polygon's plane
     for group in _coplanar(triangles, normal, body):
@@ -91,14 +91,14 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     order = np.argsort(-sizes, kind="stable")
     owner = np.array(first, int)[order]
     offset = np.sum(normals[order] * corners[order].mean(1), -1)
-    _, rigid_body = np.unique(mover[owner], return_inverse=True)
+    _, rigid_body = np.unique(rigid_body[owner], return_inverse=True)
     numbers = (values.astype(np.int32) for values in (body[owner], material[owner], rigid_body.reshape(-1)))
     return Facets(corners[order], normals[order], offset, *numbers)
 
 
-def centres(facets: Facets, movers: int) -> Float[Array, "m 3"]:
+def centres(facets: Facets, rigid_bodies: int) -> Float[Array, "m 3"]:
     """Returns the centres about which the rigid bodies rotate: the means of their facets' corners, metres."""
-    start = jnp.zeros((movers, 3)), jnp.zeros((movers, 1))
+    start = jnp.zeros((rigid_bodies, 3)), jnp.zeros((rigid_bodies, 1))
     total = start[0].at[facets.mover].add(jnp.mean(jnp.asarray(facets.corners, jnp.float32), 1))
     return total / jnp.maximum(start[1].at[facets.mover].add(1), 1)
 
@@ -111,23 +111,23 @@ def moved(facets: Facets, shift: Float[np.ndarray, "m 3"], turn: Float[np.ndarra
         shift: of every rigid body, metres.
         turn: rotation vector of every rigid body, radians.
     """
-    mover, corners = np.asarray(facets.mover), np.asarray(facets.corners, np.float64)
-    centre, rotation = np.asarray(centres(facets, len(shift)), np.float64)[mover], Rotation.from_rotvec(turn[mover])
+    rigid_body, corners = np.asarray(facets.mover), np.asarray(facets.corners, np.float64)
+    centre, rotation = np.asarray(centres(facets, len(shift)), np.float64)[rigid_body], Rotation.from_rotvec(turn[rigid_body])
     arms = corners - centre[:, None]
     rotated = np.stack([rotation.apply(arms[:, k]) for k in range(CORNERS)], 1)
-    corners = centre[:, None] + rotated + np.asarray(shift, np.float64)[mover][:, None]
+    corners = centre[:, None] + rotated + np.asarray(shift, np.float64)[rigid_body][:, None]
     normal = rotation.apply(np.asarray(facets.normal, np.float64))
     return dataclasses.replace(facets, corners=corners, normal=normal, offset=np.sum(normal * corners.mean(1), -1))
 
 
-def remaining(facets: Facets, movers: Int[np.ndarray, " k"]) -> Facets:
+def remaining(facets: Facets, rigid_bodies: Int[np.ndarray, " k"]) -> Facets:
     """Returns the facets of the given rigid bodies (indices, ascending), which are renumbered in that order."""
-    own = np.isin(np.asarray(facets.mover), movers)
+    own = np.isin(np.asarray(facets.mover), rigid_bodies)
     left: Facets = jax.tree.map(lambda leaf: np.asarray(leaf)[own], facets)
-    return dataclasses.replace(left, mover=np.searchsorted(movers, left.mover).astype(np.int32))
+    return dataclasses.replace(left, mover=np.searchsorted(rigid_bodies, left.mover).astype(np.int32))
 
 
-def outline_of(facets: Facets) -> Outline:
+def half_planes_of(facets: Facets) -> HalfPlanes:
     """Returns the half-planes of all facets (float64). Where two facets meet, one of them ends `WELD` before the other begins,
     so that a point on the seam, as is common in rooms with round dimensions, hits exactly one of them."""
     corners = np.asarray(facets.corners, np.float64)
@@ -136,7 +136,7 @@ def outline_of(facets: Facets) -> Outline:
     length = np.linalg.norm(inward, axis=-1, keepdims=True)
     inward = np.where(length > WELD, inward / np.maximum(length, WELD), 0)
     first = np.take_along_axis(inward, np.argmax(np.abs(inward) > FLAT, -1)[..., None], -1)[..., 0]
-    return Outline(inward, np.sum(inward * corners, -1) + WELD * (first < 0))
+    return HalfPlanes(inward, np.sum(inward * corners, -1) + WELD * (first < 0))
 
 
 def areas(facets: Facets) -> Float[np.ndarray, " f"]:

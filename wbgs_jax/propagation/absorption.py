@@ -63,13 +63,13 @@ def attenuation(points: Float[Array, "k p 3"], density: Float[Array, "x y z"], g
         density: nepers per metre of every cell; beyond the grid, that of the nearest cell.
         grid: position and size of the cells.
     """
-    start, leg = points[:, :-1], jnp.diff(points, axis=1)
-    length = jnp.sqrt(jnp.maximum(jnp.sum(leg**2, -1), SHORTEST**2))
+    start, segment = points[:, :-1], jnp.diff(points, axis=1)
+    length = jnp.sqrt(jnp.maximum(jnp.sum(segment**2, -1), SHORTEST**2))
     passed = jnp.cumsum(length, -1) - length
     total = jnp.sum(length, -1)
     at = (jnp.arange(SAMPLES) + 0.5) / SAMPLES * total[:, None]
     share = jnp.clip((at[..., None] - passed[:, None]) / length[:, None], 0, 1)  # of every segment: the fraction passed so far
-    place = start[:, None, 0] + jnp.sum(share[..., None] * leg[:, None], -2)
+    place = start[:, None, 0] + jnp.sum(share[..., None] * segment[:, None], -2)
     last = jnp.asarray(density.shape) - 1
     x, y, z = jnp.moveaxis(jnp.clip(jnp.floor((place - grid.low) / grid.cell).astype(jnp.int32), 0, last), -1, 0)
     return total * jnp.mean(density[x, y, z], -1)

@@ -25,8 +25,9 @@ from jaxtyping import Array, Float, Int
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.mesh.facets import AnyArray, centres
 from wbgs_jax.propagation.image_method import Surfaces
-from wbgs_jax.propagation.paths import DIFFRACTED, MAX_ORDER, REFLECTED, Paths, TracedPaths
-from wbgs_jax.propagation.transport import last_leg, legs_of
+from wbgs_jax.propagation.mechanisms import MECHANISMS
+from wbgs_jax.propagation.paths import MAX_ORDER, Paths, TracedPaths, is_vertex, on_edge
+from wbgs_jax.propagation.transport import last_segment, segments_of
 from wbgs_jax.radio.array import EXACT
 
 
@@ -48,9 +49,9 @@ class Motion:
         return dataclasses.replace(self, receiver=self.receiver[number], receiver_turn=self.receiver_turn[number])
 
 
-def still(movers: int, receivers: int = 1) -> Motion:
+def still(rigid_bodies: int, receivers: int = 1) -> Motion:
     """Returns the motion without any displacement (float32)."""
-    nothing, none = np.zeros((movers, 3), np.float32), np.zeros((receivers, 3), np.float32)
+    nothing, none = np.zeros((rigid_bodies, 3), np.float32), np.zeros((receivers, 3), np.float32)
     return Motion(nothing, nothing, none, none)
 
 
@@ -58,41 +59,43 @@ def still(movers: int, receivers: int = 1) -> Motion:
 def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Array, " k"]:
     """Returns the growth (metres) of the K paths from one transmitter to one receiver under a motion of surfaces and of that
     receiver (`Motion.of_receiver`); rotating the receiver changes no length."""
-    turn, mover = _direction_changes(paths, surfaces)
-    arm = _lever_arms(paths, surfaces, mover, len(motion.shift))
-    own = jnp.asarray(motion.shift)[mover] + jnp.cross(jnp.asarray(motion.turn)[mover], arm)
+    turn, rigid_body = _direction_changes(paths, surfaces)
+    arm = _lever_arms(paths, surfaces, rigid_body, len(motion.shift))
+    own = jnp.asarray(motion.shift)[rigid_body] + jnp.cross(jnp.asarray(motion.turn)[rigid_body], arm)
     return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(_arrival_directions(paths), motion.receiver, precision=EXACT)
 
 
-def length_terms(paths: Paths, surfaces: Surfaces, movers: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
+def length_terms(paths: Paths, surfaces: Surfaces, rigid_bodies: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
     """Returns the indices of the entries of a motion (of one receiver, in the order of `ravel_pytree`) that the lengths of K
     paths depend on, and the derivatives of `length_changes` with respect to them. If an index occurs twice, its derivatives
     add."""
-    turn, mover = _direction_changes(paths, surfaces)
-    lever = jnp.cross(_lever_arms(paths, surfaces, mover, movers), turn)
+    turn, rigid_body = _direction_changes(paths, surfaces)
+    lever = jnp.cross(_lever_arms(paths, surfaces, rigid_body, rigid_bodies), turn)
     # A segment ends at one vertex at most.
-    legs = [(paths.interaction_leg == leg) & jnp.any(turn != 0, -1) for leg in range(MAX_ORDER)]
-    here = jnp.stack(legs, 1)
+    segments = [(paths.interaction_segment == segment) & jnp.any(turn != 0, -1) for segment in range(MAX_ORDER)]
+    here = jnp.stack(segments, 1)
     bends = [jnp.sum(jnp.where(here[..., None], of[:, None], 0), 2) for of in (turn, lever)]
-    first = 3 * jnp.sum(jnp.where(here, mover[:, None], 0), 2)
+    first = 3 * jnp.sum(jnp.where(here, rigid_body[:, None], 0), 2)
     shift = first[..., None] + jnp.arange(3)
-    receiver = jnp.broadcast_to(6 * movers + jnp.arange(3), (len(turn), 3))
-    number = jnp.stack([shift, shift + 3 * movers], 1).reshape(len(turn), 6 * MAX_ORDER)
+    receiver = jnp.broadcast_to(6 * rigid_bodies + jnp.arange(3), (len(turn), 3))
+    number = jnp.stack([shift, shift + 3 * rigid_bodies], 1).reshape(len(turn), 6 * MAX_ORDER)
     derivative = jnp.stack(bends, 1).reshape(number.shape)
     return jnp.concatenate([number, receiver], 1), jnp.concatenate([derivative, _arrival_directions(paths)], 1)
 
 
-def length_gradient(paths: Paths, surfaces: Surfaces, movers: int) -> Float[Array, "k places 3"]:
+def length_gradient(paths: Paths, surfaces: Surfaces, rigid_bodies: int) -> Float[Array, "k places 3"]:
     """Returns the derivatives of the K path lengths of one transmitter with respect to the shifts of all rigid bodies and,
     last, of the transmitter."""
-    turn, mover = _direction_changes(paths, surfaces)
-    departing = -legs_of(paths).direction[:, :1]
-    return jnp.concatenate([_by_mover(turn, mover, movers), departing], 1)
+    turn, rigid_body = _direction_changes(paths, surfaces)
+    departing = -segments_of(paths).direction[:, :1]
+    return jnp.concatenate([_by_rigid_body(turn, rigid_body, rigid_bodies), departing], 1)
 
 
-def _by_mover(values: Float[Array, "k 5 3"], mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k movers 3"]:
+def _by_rigid_body(
+    values: Float[Array, "k 5 3"], rigid_body: Int[Array, "k 5"], rigid_bodies: int
+) -> Float[Array, "k rigid_bodies 3"]:
     """Returns values at the interactions of paths, summed over interactions with the same rigid body."""
-    return jnp.zeros((len(values), movers, 3)).at[jnp.arange(len(values))[:, None], mover].add(values)
+    return jnp.zeros((len(values), rigid_bodies, 3)).at[jnp.arange(len(values))[:, None], rigid_body].add(values)
 
 
 def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], wavenumber: Float[Array, ""]) -> Float[Array, "k k"]:
@@ -114,7 +117,7 @@ def coherence(gradient: Float[Array, "k m 3"], spread: Float[Array, " m"], waven
 def path_coherence(
     paths: TracedPaths, surfaces: Surfaces, spread: Float[Array, " places"], wavenumber: Float[Array, ""]
 ) -> Float[Array, "k k"]:
-    """Returns the `coherence` of all paths of one transmitter, the specular ones first, at a cost that does not grow with the
+    """Returns the `coherence` of all paths of one transmitter, mechanism by mechanism, at a cost that does not grow with the
     number of rigid bodies: only a path's own mirrors and edges are visited.
 
     Args:
@@ -123,16 +126,17 @@ def path_coherence(
         spread: standard deviation of the position of every rigid body and, last, of the transmitter along each axis, metres.
         wavenumber: radians per metre.
     """
-    specular, diffracted = _bends(paths.specular, surfaces, MAX_ORDER), _bends(paths.diffracted, surfaces, MAX_ORDER - 1)
+    bends = [_bends(some, surfaces, MECHANISMS[some.mechanism].vertices) for some in paths.sets]
     variance = (wavenumber * spread) ** 2
-    mixed = _phase_covariance(specular, diffracted, variance)
-    rows = [
-        [_phase_covariance(specular, specular, variance), mixed],
-        [mixed.T, _phase_covariance(diffracted, diffracted, variance)],
-    ]
+    upper = {(i, j): _phase_covariance(bends[i], bends[j], variance) for i in range(len(bends)) for j in range(i, len(bends))}
+    rows = [[upper[i, j] if i <= j else upper[j, i].T for j in range(len(bends))] for i in range(len(bends))]
     both = jnp.block(rows)
     own = jnp.diagonal(both)
-    return jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
+    found = jnp.exp(-0.5 * jnp.maximum(own[:, None] + own - 2 * both, 0))
+    if all(MECHANISMS[some.mechanism].coherent for some in paths.sets):
+        return found
+    adds = jnp.concatenate([jnp.full(some.alive.shape, MECHANISMS[some.mechanism].coherent) for some in paths.sets])
+    return jnp.where(adds[:, None] & adds | jnp.eye(len(adds), dtype=bool), found, 0)
 
 
 class _Bends(NamedTuple):
@@ -140,7 +144,7 @@ class _Bends(NamedTuple):
 
     turn: Float[Array, "v k 3"]
     """Change of direction (incoming minus outgoing unit vector) at the vertex; 0 where there is none."""
-    mover: Int[Array, "v k"]
+    rigid_body: Int[Array, "v k"]
     """Index of the rigid body."""
     departing: Float[Array, "k 3"]
     """Unit vector opposite to the direction in which the wave leaves the transmitter."""
@@ -148,20 +152,20 @@ class _Bends(NamedTuple):
 
 def _bends(paths: Paths, surfaces: Surfaces, most: int) -> _Bends:
     """Returns the changes of direction of paths, segment by segment; transmissions change no direction."""
-    turn, mover = _direction_changes(paths, surfaces)
-    here = jnp.any(turn != 0, -1) & (paths.interaction_leg == jnp.arange(most)[:, None, None])
-    found = (jnp.sum(jnp.where(here[..., None], turn, 0), -2), jnp.sum(jnp.where(here, mover, 0), -1))
-    return _Bends(*found, -legs_of(paths).direction[:, 0])
+    turn, rigid_body = _direction_changes(paths, surfaces)
+    here = jnp.any(turn != 0, -1) & (paths.interaction_segment == jnp.arange(most)[:, None, None])
+    found = (jnp.sum(jnp.where(here[..., None], turn, 0), -2), jnp.sum(jnp.where(here, rigid_body, 0), -1))
+    return _Bends(*found, -segments_of(paths).direction[:, 0])
 
 
 def _phase_covariance(first: _Bends, second: _Bends, variance: Float[Array, " places"]) -> Float[Array, "k l"]:
     """Returns the covariance of the phases of K paths with those of L others. The sums over vertices and components are written
     out, so that no array larger than K L is ever stored."""
     total = variance[-1] * _dot_products(first.departing, second.departing)
-    for turn, mover in zip(first.turn, first.mover, strict=True):
-        weighted = turn * variance[mover][:, None]
-        for other, its in zip(second.turn, second.mover, strict=True):
-            total += jnp.where(mover[:, None] == its, _dot_products(weighted, other), 0)
+    for turn, rigid_body in zip(first.turn, first.rigid_body, strict=True):
+        weighted = turn * variance[rigid_body][:, None]
+        for other, its in zip(second.turn, second.rigid_body, strict=True):
+            total += jnp.where(rigid_body[:, None] == its, _dot_products(weighted, other), 0)
     return total
 
 
@@ -169,26 +173,25 @@ def _dot_products(a: Float[Array, "k 3"], b: Float[Array, "l 3"]) -> Float[Array
     return a[:, None, 0] * b[:, 0] + a[:, None, 1] * b[:, 1] + a[:, None, 2] * b[:, 2]
 
 
-def _lever_arms(paths: Paths, surfaces: Surfaces, mover: Int[Array, "k 5"], movers: int) -> Float[Array, "k 5 3"]:
+def _lever_arms(paths: Paths, surfaces: Surfaces, rigid_body: Int[Array, "k 5"], rigid_bodies: int) -> Float[Array, "k 5 3"]:
     """Returns the points of interaction relative to the centres of the rigid bodies that they lie on."""
-    leg = jnp.minimum(paths.interaction_leg, paths.points.shape[1] - 2)
-    point = jnp.take_along_axis(paths.points, leg[..., None] + 1, 1)
-    return point - centres(surfaces.facets, movers)[mover]
+    segment = jnp.minimum(paths.interaction_segment, paths.points.shape[1] - 2)
+    point = jnp.take_along_axis(paths.points, segment[..., None] + 1, 1)
+    return point - centres(surfaces.facets, rigid_bodies)[rigid_body]
 
 
 def _arrival_directions(paths: Paths) -> Float[Array, "k 3"]:
     """Returns the directions of the last segments."""
-    return jnp.take_along_axis(legs_of(paths).direction, last_leg(paths)[:, None, None], 1)[:, 0]
+    return jnp.take_along_axis(segments_of(paths).direction, last_segment(paths)[:, None, None], 1)[:, 0]
 
 
 def _direction_changes(paths: Paths, surfaces: Surfaces) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:
     """Returns the change of direction at every interaction (zero for transmissions), and the index of its rigid body."""
-    direction = legs_of(paths).direction
-    path, leg = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_leg, direction.shape[1] - 2)
-    turn = direction[path, leg] - direction[path, leg + 1]
-    reflects, diffracts = paths.interaction_type == REFLECTED, paths.interaction_type == DIFFRACTED
-    number = paths.interaction_facet
-    facet = jnp.where(reflects, number, 0)
+    direction = segments_of(paths).direction
+    path, segment = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_segment, direction.shape[1] - 2)
+    turn = direction[path, segment] - direction[path, segment + 1]
+    bends, at_edge, number = is_vertex(paths.interaction_type), on_edge(paths.interaction_type), paths.interaction_facet
+    facet = jnp.where(bends & ~at_edge, number, 0)
     if surfaces.edges.facet.shape[0]:
-        facet = jnp.where(diffracts, surfaces.edges.facet[jnp.where(diffracts, number, 0)], facet)
-    return jnp.where((reflects | diffracts)[..., None], turn, 0), surfaces.facets.mover[facet]
+        facet = jnp.where(at_edge, surfaces.edges.facet[jnp.where(at_edge, number, 0)], facet)
+    return jnp.where(bends[..., None], turn, 0), surfaces.facets.mover[facet]

@@ -1,9 +1,9 @@
 """Image method: every sequence of facets that can reflect a wave on its way to a fixed receiver.
 
-A reflection sequence (`Chains`) names its facets (f1, ..., fm) in the order in which they reflect the wave. Its images are the
-receiver mirrored in fm, then in f(m-1), and so on; the wave travels in straight lines towards them. The receiver is fixed, so
-all sequences are found once, on the host, and serve every transmitter and frequency (`make_search`). A sequence is kept if its
-facets are visible through one another from the image; occlusion is tested in `paths.py`.
+A reflection sequence (`ReflectionSequences`) names its facets (f1, ..., fm) in the order in which they reflect the wave. Its
+images are the receiver mirrored in fm, then in f(m-1), and so on; the wave travels in straight lines towards them. The receiver
+is fixed, so all sequences are found once, on the host, and serve every transmitter and frequency (`make_image_tree`). A
+sequence is kept if its facets are visible through one another from the image; occlusion is tested in `paths.py`.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.pytree import pytree, to_device
 from wbgs_jax.mesh.edges import Edges, filled
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, Outline, areas, outline_of
+from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, HalfPlanes, areas, half_planes_of
 from wbgs_jax.propagation.occlusion import planes_of
 
 SIDE = 1e-4
@@ -33,18 +33,18 @@ left out."""
 
 
 @pytree
-class Chains:
+class ReflectionSequences:
     """All reflection sequences of one order m >= 1."""
 
-    facet: Int[AnyArray, "chains m"]
+    facet: Int[AnyArray, "sequences m"]
     """Indices of the facets in the order in which they reflect the wave."""
-    image: Float[AnyArray, "chains m 3"]
+    image: Float[AnyArray, "sequences m 3"]
     """Point that the wave heads for before facet j reflects it: the receiver, mirrored in facets m ... j. World frame,
     metres."""
 
 
 @pytree
-class DiffractedChains:
+class DiffractedPairs:
     """Pairs of a mirror and an edge.
 
     A mirror behind the edge must be visible from the receiver; one in front of it may be any large facet, because the
@@ -68,21 +68,21 @@ class Surfaces:
 
 
 @pytree
-class Search(Surfaces):
+class ImageTree(Surfaces):
     """Image tree of a receiver, in which its paths are searched: independent of the transmitter and of the frequency."""
 
     receiver_position: Float[AnyArray, "3"]
     """World frame, metres."""
-    outline: Outline
+    half_planes: HalfPlanes
     """Half-planes along the sides of the facets."""
     planes: Float[AnyArray, "5 4 p"]
     """Planes of the facets and of their sides, for the test of occlusion (`occlusion.planes_of`)."""
-    chains: tuple[Chains, ...]
+    sequences: tuple[ReflectionSequences, ...]
     """Reflection sequences of orders 1, 2, ..."""
-    diffracted: DiffractedChains
+    diffracted: DiffractedPairs
 
 
-def make_search(
+def make_image_tree(
     facets: Facets,
     edges: Edges,
     receiver_position: Float[AnyArray, "3"],
@@ -90,7 +90,7 @@ def make_search(
     mirror_area_after_edge: float,
     mirror_area_before_edge: float,
     padded: bool = False,
-) -> Search:
+) -> ImageTree:
     """Returns the image tree of a receiver, computed on the host in double precision (not under `jax.jit`).
 
     Args:
@@ -106,25 +106,25 @@ def make_search(
     """
     facets, edges = jax.tree.map(_on_host, (facets, edges))
     rx = np.asarray(receiver_position, np.float64)
-    chains = receiver_chains(facets, rx, mirror_areas)
-    pairs = diffracted_chains(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge)
+    sequences = reflection_sequences(facets, rx, mirror_areas)
+    pairs = diffracted_pairs(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge)
     if padded:
-        chains, pairs = tuple(_padded(one, facets) for one in chains), _padded_pairs(pairs, facets)
-    search: Search = to_device(Search(facets, edges, rx, outline_of(facets), planes_of(facets), chains, pairs))
-    return search
+        sequences, pairs = tuple(_padded(one, facets) for one in sequences), _padded_pairs(pairs, facets)
+    found: ImageTree = to_device(ImageTree(facets, edges, rx, half_planes_of(facets), planes_of(facets), sequences, pairs))
+    return found
 
 
-def _padded(chains: Chains, facets: Facets) -> Chains:
+def _padded(sequences: ReflectionSequences, facets: Facets) -> ReflectionSequences:
     """Returns the sequences, followed by padding that reflects nothing."""
-    facet = filled(chains.facet)
-    return Chains(facet, _in_the_plane(chains.image, facets, facet))
+    facet = filled(sequences.facet)
+    return ReflectionSequences(facet, _in_the_plane(sequences.image, facets, facet))
 
 
-def _padded_pairs(pairs: DiffractedChains, facets: Facets) -> DiffractedChains:
+def _padded_pairs(pairs: DiffractedPairs, facets: Facets) -> DiffractedPairs:
     """Returns the pairs; those with a mirror behind the edge are followed by padding that reflects nothing. The number of the
     others already follows from the padded edges."""
     after = filled(pairs.after)
-    return DiffractedChains(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), pairs.before)
+    return DiffractedPairs(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), pairs.before)
 
 
 def _in_the_plane(image: Float[AnyArray, "*n 3"], facets: Facets, mirror: Int[np.ndarray, "*k"]) -> Float[np.ndarray, "*k 3"]:
@@ -138,9 +138,9 @@ def _on_host(leaf: AnyArray) -> np.ndarray:
     return array.astype(np.float64 if np.issubdtype(array.dtype, np.floating) else np.int32)
 
 
-def receiver_chains(
+def reflection_sequences(
     facets: Facets, rx: Float[np.ndarray, "3"], min_areas: Sequence[float], slack: float = SLACK
-) -> tuple[Chains, ...]:
+) -> tuple[ReflectionSequences, ...]:
     """Returns the reflection sequences of orders 1, 2, ... len(min_areas) as float64 and int32 NumPy arrays.
 
     Args:
@@ -152,32 +152,32 @@ def receiver_chains(
     area = areas(facets)
     largest_first = np.argsort(-area, kind="stable")
     corners, normal, offset = (np.asarray(a, np.float64) for a in (facets.corners, facets.normal, facets.offset))
-    chains = []
+    sequences = []
     facet = np.zeros((1, 0), np.int64)
     image = np.broadcast_to(np.asarray(rx, np.float64), (1, 1, 3))  # the last one of a row is the receiver
     for smallest in min_areas:
         large, keep = _limit_mirrors(facet, largest_first[: np.count_nonzero(area >= smallest)])
         facet, image = _prepend(facet[keep], image[keep], large, corners, normal, offset, slack)
-        chains.append(Chains(facet.astype(np.int32), image[:, :-1]))
-    return tuple(chains)
+        sequences.append(ReflectionSequences(facet.astype(np.int32), image[:, :-1]))
+    return tuple(sequences)
 
 
 def _limit_mirrors(
-    facet: Int[np.ndarray, "chains m"], mirrors: Int[np.ndarray, " k"]
-) -> tuple[Int[np.ndarray, " large"], Bool[np.ndarray, " chains"]]:
+    facet: Int[np.ndarray, "sequences m"], mirrors: Int[np.ndarray, " k"]
+) -> tuple[Int[np.ndarray, " large"], Bool[np.ndarray, " sequences"]]:
     """Returns as many of the mirrors (largest first) as can be tried in front of every sequence made of them alone within
     `MOST_TRIED` pairs, in ascending order; and a mask of those sequences."""
     rank = np.full(max(facet.max(initial=-1), mirrors.max(initial=-1)) + 1, len(mirrors))
     rank[mirrors] = np.arange(len(mirrors))
     worst = rank[facet].max(-1, initial=-1)  # rank of the smallest mirror of every sequence
-    chains_of = np.cumsum(np.bincount(worst + 1, minlength=len(mirrors) + 1))  # made of the first 0, 1, ... mirrors
-    count = int(np.searchsorted(np.arange(len(mirrors) + 1) * chains_of[: len(mirrors) + 1], MOST_TRIED, "right")) - 1
+    sequences_of = np.cumsum(np.bincount(worst + 1, minlength=len(mirrors) + 1))  # made of the first 0, 1, ... mirrors
+    count = int(np.searchsorted(np.arange(len(mirrors) + 1) * sequences_of[: len(mirrors) + 1], MOST_TRIED, "right")) - 1
     return np.sort(mirrors[:count]), worst < count
 
 
-def diffracted_chains(
+def diffracted_pairs(
     facets: Facets, edges: Edges, rx: Float[np.ndarray, "3"], after_area: float, before_area: float, slack: float = SLACK
-) -> DiffractedChains:
+) -> DiffractedPairs:
     """Returns the pairs of an edge and a mirror behind or in front of it (float64 and int32 NumPy arrays).
 
     Args:
@@ -201,21 +201,21 @@ def diffracted_chains(
     after = np.stack([mirrors[place], edge], 1)
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= before_area), most)])
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)
-    return DiffractedChains(after.astype(np.int32), image[place], before.astype(np.int32))
+    return DiffractedPairs(after.astype(np.int32), image[place], before.astype(np.int32))
 
 
 def _prepend(facet, image, candidates, corners, normal, offset, slack):
     """Returns facets and images of every sequence, extended by every facet that its beam reaches."""
     source = image[:, 0]
-    height = source @ normal[candidates].T - offset[candidates]  # (chains, candidates)
+    height = source @ normal[candidates].T - offset[candidates]  # (sequences, candidates)
     visible = np.abs(height) > SIDE
     if facet.shape[1]:
         visible &= candidates != facet[:, :1]
         visible &= _inside_beams(source, image[:, 1], facet[:, 0], corners[candidates], corners, normal, offset, slack)
-    chain, place = np.nonzero(visible)
+    sequence, place = np.nonzero(visible)
     mirror = candidates[place]
-    mirrored = source[chain] - 2 * height[chain, place, None] * normal[mirror]
-    return np.column_stack([mirror, facet[chain]]), np.concatenate([mirrored[:, None], image[chain]], 1)
+    mirrored = source[sequence] - 2 * height[sequence, place, None] * normal[mirror]
+    return np.column_stack([mirror, facet[sequence]]), np.concatenate([mirrored[:, None], image[sequence]], 1)
 
 
 def _inside_beams(source, before, window, candidates, corners, normal, offset, slack):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, outline_of
+from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, half_planes_of
 
 NEAR = 1e-3
 """Metres: a segment does not cross facets within this distance of its ends (those that reflect it)."""
@@ -24,16 +24,18 @@ NOWHERE = 1.0
 def planes_of(facets: Facets) -> Float[np.ndarray, "5 4 f"]:
     """Returns the planes of all facets and the half-planes of their four sides (float64): unit normals and offsets, with facets
     along the last axis, padded to whole words."""
-    outline = outline_of(facets)
+    half_planes = half_planes_of(facets)
     rows = np.zeros((CORNERS + 1, 4, -(-len(facets.offset) // WORD) * WORD))
     rows[:, 3] = NOWHERE
     count = len(facets.offset)
     rows[0, :3, :count], rows[0, 3, :count] = np.asarray(facets.normal).T, facets.offset
-    rows[1:, :3, :count], rows[1:, 3, :count] = np.moveaxis(np.asarray(outline.inward), 0, -1), outline.offset.T
+    rows[1:, :3, :count], rows[1:, 3, :count] = np.moveaxis(np.asarray(half_planes.inward), 0, -1), half_planes.offset.T
     return rows
 
 
-def crossed(points: Float[Array, "p 3"], planes: Float[AnyArray, "5 4 f"], near: float = NEAR) -> UInt32[Array, "legs words"]:
+def crossed(
+    points: Float[Array, "p 3"], planes: Float[AnyArray, "5 4 f"], near: float = NEAR
+) -> UInt32[Array, "segments words"]:
     """Returns which facets the segments between consecutive points cross, one bit each: facet f is bit f % 32 of word f // 32.
 
     Args:
@@ -51,7 +53,7 @@ def crossed(points: Float[Array, "p 3"], planes: Float[AnyArray, "5 4 f"], near:
     return _packed(inside)
 
 
-def _height(point: Float[Array, "legs 3 1"], plane: Float[Array, "4 f"]) -> Float[Array, "legs f"]:
+def _height(point: Float[Array, "segments 3 1"], plane: Float[Array, "4 f"]) -> Float[Array, "segments f"]:
     """Returns signed distances of points from planes. Written out, so that it is fused into its uses and never stored."""
     return point[:, 0] * plane[0] + point[:, 1] * plane[1] + point[:, 2] * plane[2] - plane[3]
 

@@ -7,17 +7,20 @@ strongest of those that pass are kept. The geometry depends neither on the frequ
 differentiated.
 """
 
+import functools
+import operator
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.mesh.edges import Edges
-from wbgs_jax.mesh.facets import AnyArray, Outline
-from wbgs_jax.propagation.image_method import Chains, Search
+from wbgs_jax.mesh.facets import AnyArray, HalfPlanes
+from wbgs_jax.propagation.image_method import ImageTree, ReflectionSequences
 from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of
 from wbgs_jax.radio.array import EXACT
 
@@ -25,14 +28,53 @@ MAX_ORDER = 3
 """Maximum number of reflections and diffractions of a path."""
 MAX_INTERACTIONS = 5
 """Maximum number of facets and edges that a path interacts with; a wave that has crossed more of them is negligible."""
-NONE, TRANSMITTED, REFLECTED, DIFFRACTED = 0, 1, 2, 3
-"""Types of interaction."""
 BEHIND = 1e-6
 """Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start."""
 CUT_AT_ONCE = 32
 """Paths tested together: few enough for a CPU's cache."""
 THROUGH = 0.5
 """Rough amplitude factor of a crossed or reflecting facet, used to rank paths."""
+
+
+class InteractionType(IntEnum):
+    """What happens to a wave at a facet or an edge."""
+
+    word: str
+    """Preposition of a description: through a wall, off a floor, around the edge of a cabinet."""
+    sionna: int
+    """Value of `sionna.rt.InteractionType`."""
+    is_vertex: bool
+    """Whether a segment of the path ends there."""
+    on_edge: bool
+    """Whether paths refer to the index of an edge, not of a facet."""
+
+    def __new__(
+        cls, value: int, word: str = "", sionna: int = 0, is_vertex: bool = False, on_edge: bool = False
+    ) -> "InteractionType":
+        kind = int.__new__(cls, value)
+        kind._value_ = value
+        kind.word, kind.sionna, kind.is_vertex, kind.on_edge = word, sionna, is_vertex, on_edge
+        return kind
+
+    NONE = 0
+    TRANSMITTED = 1, "through", 4
+    REFLECTED = 2, "off", 1, True
+    DIFFRACTED = 3, "around", 8, True, True
+    SCATTERED = 4, "scattered by", 2, True  # in paths of other programs
+
+
+NONE, TRANSMITTED = InteractionType.NONE, InteractionType.TRANSMITTED
+REFLECTED, DIFFRACTED = InteractionType.REFLECTED, InteractionType.DIFFRACTED
+
+
+def is_vertex(interaction_type: Int[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
+    """Returns which interactions end a segment: all but transmissions and padding."""
+    return functools.reduce(operator.or_, (interaction_type == kind for kind in InteractionType if kind.is_vertex))
+
+
+def on_edge(interaction_type: Int[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
+    """Returns which interactions are with an edge."""
+    return functools.reduce(operator.or_, (interaction_type == kind for kind in InteractionType if kind.on_edge))
 
 
 @pytree
@@ -42,23 +84,42 @@ class Paths:
     points: Float[Array, "*b k 5 3"]
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
     interaction_facet: Int[Array, "*b k 5"]
-    """Indices of the facets (of the edge, if the type is `DIFFRACTED`) in the order of interaction; 0 beyond the last."""
+    """Indices of the facets (of edges, where the type is `on_edge`) in the order of interaction; 0 beyond the last."""
     interaction_type: Int[Array, "*b k 5"]
-    """`TRANSMITTED`, `REFLECTED` or `DIFFRACTED`; `NONE` beyond the last."""
-    interaction_leg: Int[Array, "*b k 5"]
+    """`InteractionType`; `NONE` beyond the last."""
+    interaction_segment: Int[Array, "*b k 5"]
     """Index of the segment (0: the first) that ends or is crossed there."""
     alive: Bool[Array, "*b k"]
     """Which of the K entries are paths; the others are padding."""
+    mechanism: str = static(default="specular")
+    """Name of the mechanism of all of them (`mechanisms.MECHANISMS`)."""
 
 
 @pytree
 class TracedPaths:
     """All paths of one transmitter; leading axes are batch axes."""
 
-    specular: Paths
-    """Paths without diffraction, including the line of sight."""
-    diffracted: Paths
-    """Paths with one diffraction each."""
+    sets: tuple[Paths, ...]
+    """Paths of each mechanism, in the order of `mechanisms.MECHANISMS`."""
+
+    def of(self, mechanism: str) -> Paths:
+        """Returns the paths of a mechanism by its name."""
+        return next(paths for paths in self.sets if paths.mechanism == mechanism)
+
+    @property
+    def specular(self) -> Paths:
+        """Paths without diffraction, including the line of sight."""
+        return self.of("specular")
+
+    @property
+    def diffracted(self) -> Paths:
+        """Paths with one diffraction each."""
+        return self.of("diffracted")
+
+    @property
+    def alive(self) -> Bool[Array, "*b k"]:
+        """Which of the paths of all mechanisms, in order, are no padding."""
+        return jnp.concatenate([paths.alive for paths in self.sets], -1)
 
 
 class Candidates(NamedTuple):
@@ -71,78 +132,56 @@ class Candidates(NamedTuple):
     """Rough amplitude; 0 for no path."""
 
 
-def trace_paths(
-    search: Search,
-    tx_position: Float[Array, "3"],
-    specular_tried: int,
-    specular_kept: int,
-    diffracted_tried: int,
-    diffracted_kept: int,
-) -> TracedPaths:
-    """Returns the paths of one transmitter. Use `jax.lax.map` for several: batching them needs a lot of memory.
-
-    Args:
-        search: image tree of the receiver (`image_method.make_search`).
-        tx_position: world frame, metres.
-        specular_tried, diffracted_tried: number of candidates that are tested for intersections with all facets.
-        specular_kept, diffracted_kept: number of paths returned, the strongest of these; fewer if fewer are tried.
-    """
-    return TracedPaths(
-        specular_paths(tx_position, search, specular_tried, specular_kept),
-        diffracted_paths(tx_position, search, diffracted_tried, diffracted_kept),
-    )
-
-
-def specular_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+def specular_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
-    mirrored = (_promising(lambda some: _mirrored(tx, search, some), chains, tried) for chains in search.chains)
-    parts = [_direct(tx, search.receiver_position), *mirrored]
-    return _select(parts, search, tried, kept, MAX_ORDER + 1)
+    mirrored = (promising(lambda some: _mirrored(tx, tree, some), sequences, tried) for sequences in tree.sequences)
+    parts = [_direct(tx, tree.receiver_position), *mirrored]
+    return select_paths("specular", parts, tree, tried, kept, MAX_ORDER + 1)
 
 
-def diffracted_paths(tx: Float[Array, "3"], search: Search, tried: int, kept: int) -> Paths:
+def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
     """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
-    pairs = search.diffracted
+    pairs = tree.diffracted
     parts = [
-        _diffracted_only(tx, search),
-        _promising(lambda some: _diffracted_then_mirrored(tx, search, *some), (pairs.after, pairs.after_image), tried),
-        _promising(lambda some: _mirrored_then_diffracted(tx, search, some), pairs.before, tried),
+        _diffracted_only(tx, tree),
+        promising(lambda some: _diffracted_then_mirrored(tx, tree, *some), (pairs.after, pairs.after_image), tried),
+        promising(lambda some: _mirrored_then_diffracted(tx, tree, some), pairs.before, tried),
     ]
-    return _select(parts, search, tried, kept, 3)
+    return select_paths("diffracted", parts, tree, tried, kept, 3)
 
 
-def _diffracted_only(tx, search: Search) -> Candidates:
+def _diffracted_only(tx, tree: ImageTree) -> Candidates:
     """Returns one candidate per edge."""
-    edge = jnp.arange(search.edges.length.size)
-    point, strength = _diffracted(tx, search.receiver_position, edge, search.edges)
-    return _candidates(tx, search.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
+    edge = jnp.arange(tree.edges.length.size)
+    point, strength = _diffracted(tx, tree.receiver_position, edge, tree.edges)
+    return make_candidates(tx, tree.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
-def _diffracted_then_mirrored(tx, search: Search, pairs, image) -> Candidates:
+def _diffracted_then_mirrored(tx, tree: ImageTree, pairs, image) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror behind it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
-    point, strength = _diffracted(tx, image, edge, search.edges)
-    mirror, valid = _on_mirror(point, image, search.facets.normal[facet], search.facets.offset[facet])
-    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    point, strength = _diffracted(tx, image, edge, tree.edges)
+    mirror, valid = _on_mirror(point, image, tree.facets.normal[facet], tree.facets.offset[facet])
+    strength = jnp.where(valid & _inside(mirror, tree.half_planes, facet), strength * THROUGH, 0)
     vertices = [(point, edge, DIFFRACTED), (mirror, facet, REFLECTED)]
-    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, tree.receiver_position, vertices, strength, edge.size)
 
 
-def _mirrored_then_diffracted(tx, search: Search, pairs) -> Candidates:
+def _mirrored_then_diffracted(tx, tree: ImageTree, pairs) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror in front of it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
-    normal, offset = search.facets.normal[facet], search.facets.offset[facet]
+    normal, offset = tree.facets.normal[facet], tree.facets.offset[facet]
     image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
-    point, strength = _diffracted(image, search.receiver_position, edge, search.edges)
+    point, strength = _diffracted(image, tree.receiver_position, edge, tree.edges)
     # Relative to the image, the point must lie behind the mirror: the wave runs from the transmitter to the point of
     # reflection.
     mirror, valid = _on_mirror(point, image, normal, offset)
-    strength = jnp.where(valid & _inside(mirror, search.outline, facet), strength * THROUGH, 0)
+    strength = jnp.where(valid & _inside(mirror, tree.half_planes, facet), strength * THROUGH, 0)
     vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
-    return _candidates(tx, search.receiver_position, vertices, strength, edge.size)
+    return make_candidates(tx, tree.receiver_position, vertices, strength, edge.size)
 
 
-def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
+def make_candidates(tx, rx, vertices, score, count: int) -> Candidates:
     """Returns candidates from their vertices (point, facet or edge, type of interaction) in order."""
 
     def rows(value, shape):
@@ -159,21 +198,21 @@ def _candidates(tx, rx, vertices, score, count: int) -> Candidates:
 def _direct(tx, rx) -> Candidates:
     """Returns the line of sight as a candidate; there is none if the transmitter is at the receiver's position."""
     distance = jnp.linalg.norm(jax.lax.stop_gradient(tx - rx))
-    return _candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
+    return make_candidates(tx, rx, [], jnp.where(distance > NEAR, 1 / jnp.maximum(distance, NEAR), 0), 1)
 
 
-def _mirrored(tx, search: Search, chains: Chains) -> Candidates:
+def _mirrored(tx, tree: ImageTree, sequences: ReflectionSequences) -> Candidates:
     """Returns one candidate per reflection sequence."""
-    facets, (c, order) = search.facets, chains.facet.shape
+    facets, (c, order) = tree.facets, sequences.facet.shape
     here, valid = jnp.broadcast_to(tx, (c, 3)), jnp.ones(c, bool)
     vertices = []
     for j in range(order):
-        facet = chains.facet[:, j]
-        here, hits = _on_mirror(here, chains.image[:, j], facets.normal[facet], facets.offset[facet])
-        valid &= hits & _inside(here, search.outline, facet)
+        facet = sequences.facet[:, j]
+        here, hits = _on_mirror(here, sequences.image[:, j], facets.normal[facet], facets.offset[facet])
+        valid &= hits & _inside(here, tree.half_planes, facet)
         vertices.append((here, facet, REFLECTED))
-    length = jnp.linalg.norm(chains.image[:, 0] - tx, axis=-1)
-    return _candidates(tx, search.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
+    length = jnp.linalg.norm(sequences.image[:, 0] - tx, axis=-1)
+    return make_candidates(tx, tree.receiver_position, vertices, valid * THROUGH**order / jnp.maximum(length, NEAR), c)
 
 
 def _on_mirror(start, goal, normal, offset):
@@ -189,9 +228,9 @@ def _length(vector: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
     return jnp.sqrt(jnp.maximum(jnp.sum(vector**2, -1), NEAR**2))
 
 
-def _inside(point: Float[Array, "*n 3"], outline: Outline, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
+def _inside(point: Float[Array, "*n 3"], half_planes: HalfPlanes, facet: Int[AnyArray, "*n"]) -> Bool[Array, "*n"]:
     """Returns whether points of a facet's plane lie inside its sides."""
-    return (jnp.sum(outline.inward[facet] * point[..., None, :], -1) >= outline.offset[facet]).all(-1)
+    return (jnp.sum(half_planes.inward[facet] * point[..., None, :], -1) >= half_planes.offset[facet]).all(-1)
 
 
 def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
@@ -220,20 +259,30 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     return point, jnp.where(valid, strength, 0)
 
 
-def _select(parts: list[Candidates], search: Search, tried: int, kept: int, legs: int) -> Paths:
-    """Returns the best paths among the best candidates after these have been tested for intersections with all facets."""
+def select_paths(mechanism: str, parts: list[Candidates], tree: ImageTree, tried: int, kept: int, segments: int) -> Paths:
+    """Returns the best paths of a mechanism among its best candidates, after these have been tested for intersections with all
+    facets.
+
+    Args:
+        mechanism: its name.
+        parts: candidates of all kinds.
+        tree: image tree of the receiver.
+        tried: number of candidates that are tested.
+        kept: number of paths returned; fewer if fewer are tried.
+        segments: largest number of segments of a path.
+    """
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
-    cut = _of_living(lambda c: crossed(c.points[: legs + 1], search.planes), found)
+    cut = _of_living(lambda c: crossed(c.points[: segments + 1], tree.planes), found)
     crossings = jnp.sum(counted(cut), -1)
     whole = crossings + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
     score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
     found = jax.tree.map(lambda leaf: leaf[best], found)
-    facet, types, leg = jax.vmap(lambda path, words: _in_order(path, words, search))(found, cut[best])
-    return Paths(found.points, facet, types, leg, score > 0)
+    facet, types, segment = jax.vmap(lambda path, words: _in_order(path, words, tree))(found, cut[best])
+    return Paths(found.points, facet, types, segment, score > 0, mechanism)
 
 
-def _promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
+def promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
     """Returns the best candidates of a kind. All are scored first and the best built again: the points are most of the work."""
     score = build(rows).score
     best = jax.lax.top_k(score, min(most, score.size))[1]
@@ -262,15 +311,15 @@ def _in_blocks(leaf: Array, blocks: int) -> Array:
     return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
 
 
-def _in_order(candidate: Candidates, cut: UInt32[Array, "legs words"], search: Search):
+def _in_order(candidate: Candidates, cut: UInt32[Array, "segments words"], tree: ImageTree):
     """Returns the interactions of one path in order: facet or edge, type, segment."""
     number, crosses = first_of(cut.reshape(-1), MAX_INTERACTIONS)
-    leg, facet = jnp.divmod(number, cut.shape[1] * WORD)
-    share = crossing_share(candidate.points[leg], candidate.points[leg + 1], facet, search.planes)
+    segment, facet = jnp.divmod(number, cut.shape[1] * WORD)
+    share = crossing_share(candidate.points[segment], candidate.points[segment + 1], facet, tree.planes)
     vertex, types = jnp.arange(MAX_ORDER), candidate.interaction_type
-    crossing = jnp.where(crosses, leg + jnp.clip(share, BEHIND, 1), jnp.inf)
+    crossing = jnp.where(crosses, segment + jnp.clip(share, BEHIND, 1), jnp.inf)
     order = jnp.argsort(jnp.concatenate([crossing, jnp.where(types != NONE, vertex + 1.0, jnp.inf)]))[:MAX_INTERACTIONS]
     interactions = jnp.where(crosses, TRANSMITTED, NONE), types
     facets = jnp.where(crosses, facet, 0), candidate.interaction_facet
-    types, facet, leg = (jnp.concatenate(both)[order] for both in (interactions, facets, (leg, vertex)))
-    return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, leg, 0)
+    types, facet, segment = (jnp.concatenate(both)[order] for both in (interactions, facets, (segment, vertex)))
+    return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, segment, 0)

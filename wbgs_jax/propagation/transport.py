@@ -5,6 +5,7 @@ The electric field is a complex vector perpendicular to the ray. At every slab i
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from wbgs_jax._util.complex_math import phasor
 from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.materials import Slabs, slab_coefficients
-from wbgs_jax.propagation.paths import DIFFRACTED, MAX_INTERACTIONS, NONE, REFLECTED, Paths
+from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, Paths, is_vertex, on_edge
 from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
@@ -31,7 +32,7 @@ SOMEWHERE = np.arange(5)[:, None] * np.array([0.3, 0.5, 0.7])
 """Vertices (metres) of padded paths, on a line that is not parallel to any edge or normal."""
 
 
-class Legs(NamedTuple):
+class Segments(NamedTuple):
     """Straight segments of K paths."""
 
     length: Float[Array, "k 4"]
@@ -42,8 +43,16 @@ class Legs(NamedTuple):
     """Length of the whole path, metres."""
 
 
-class _SlabInteractions(NamedTuple):
+Transport = Callable[..., tuple[Complex[Array, "k 3"], Float[Array, " k"]]]
+"""(field at the transmitter (k, 3), paths, segments, slabs along them, surfaces, materials, frequency_hz) -> the field at the
+receiver without spreading (k, 3), and the spreading factors (k,), per metre."""
+
+
+class SlabInteractions(NamedTuple):
     """Slabs along K paths: the basis in which they split the field, and their coefficients."""
+
+    active: Bool[Array, "k 5"]
+    """Which interactions are with a slab; everything else is meaningless for the others."""
 
     across: Float[Array, "k 5 3"]
     """Unit vectors perpendicular to the plane of incidence (TE)."""
@@ -55,26 +64,26 @@ class _SlabInteractions(NamedTuple):
     tm: Complex[Array, "k 5"]
 
 
-@partial(jax.jit, static_argnames="diffracted")
+@partial(jax.jit, static_argnames="transport")
 def arrivals(
     paths: Paths,
     surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
     receiver: Receiver,
-    diffracted: bool,
+    transport: Transport,
     transmitter: Antenna | None = None,
     element: Antenna | None = None,
 ) -> Arrivals:
     """Returns the amplitudes that a transmitter of unit power produces over K paths.
 
     Args:
-        paths: of one transmitter (`paths.trace_paths`).
+        paths: of one transmitter and one mechanism (`mechanisms.trace_paths`).
         surfaces: surfaces in which the paths were found; paths refer to their facets and edges by index.
         slabs: materials of the facets at this frequency.
         frequency_hz: of the carrier.
         receiver: the receiver at the end of the paths.
-        diffracted: whether all paths have one diffraction or none has any; static under `jax.jit`.
+        transport: that of the mechanism of the paths (`mechanisms.Mechanism`); static under `jax.jit`.
         transmitter: its antenna in the world frame; by default vertically polarised and isotropic.
         element: an antenna factor of every array element in addition to its given pattern, in the receiver's frame; by default
             vertically polarised and isotropic, which changes nothing.
@@ -84,24 +93,20 @@ def arrivals(
     # Padded paths may have segments of zero length, whose directions have no derivative.
     somewhere = jnp.asarray(SOMEWHERE, paths.points.dtype)
     paths = dataclasses.replace(paths, points=jnp.where(paths.alive[:, None, None], paths.points, somewhere))
-    legs = legs_of(paths)
-    field = transmitter.field(legs.direction[:, 0]).astype(slabs.permittivity.dtype)
-    interactions = _slab_interactions(paths, legs, surfaces, slabs, frequency_hz)
-    active = (paths.interaction_type != NONE) & (paths.interaction_type != DIFFRACTED)
-    if diffracted:
-        field, spreading = _over_edges(field, paths, legs, interactions, active, surfaces.edges, slabs, frequency_hz)
-    else:
-        field, spreading = _through_slabs(field, interactions, active), 1 / legs.total
-    last = last_leg(paths)
-    arrival = legs.direction[jnp.arange(len(last)), last]
+    segments = segments_of(paths)
+    field = transmitter.field(segments.direction[:, 0]).astype(slabs.permittivity.dtype)
+    interactions = _slab_interactions(paths, segments, surfaces, slabs, frequency_hz)
+    field, spreading = transport(field, paths, segments, interactions, surfaces, slabs, frequency_hz)
+    last = last_segment(paths)
+    arrival = segments.direction[jnp.arange(len(last)), last]
     local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
     theta, wavelength = zenith_vector(local), SPEED_OF_LIGHT / frequency_hz
     own = _element_field(receiver.antenna, element, local)
     parts = jnp.stack([_dot(here, basis) for basis in (own, theta, jnp.cross(local, theta))], -1)
-    scale = wavelength / (4 * jnp.pi) * spreading * phasor(-legs.total / wavelength)
+    scale = wavelength / (4 * jnp.pi) * spreading * phasor(-segments.total / wavelength)
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
     met = paths.interaction_type, _materials(paths, surfaces)
-    arrived = amplitudes[:, 0], local, legs.total, legs.direction[:, 0], arrival, amplitudes[:, 1:]
+    arrived = amplitudes[:, 0], local, segments.total, segments.direction[:, 0], arrival, amplitudes[:, 1:]
     return Arrivals(*arrived, *met, points=paths.points)
 
 
@@ -116,15 +121,18 @@ def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "
 def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
     """Returns the material index at every interaction; -1 where there is none."""
     kind, number = paths.interaction_type, paths.interaction_facet
-    facet = jnp.where(kind == DIFFRACTED, 0, number)
+    facet = jnp.where(on_edge(kind), 0, number)
     if surfaces.edges.facet.shape[0]:
-        facet = jnp.where(kind == DIFFRACTED, surfaces.edges.facet[jnp.where(kind == DIFFRACTED, number, 0)], facet)
+        facet = jnp.where(on_edge(kind), surfaces.edges.facet[jnp.where(on_edge(kind), number, 0)], facet)
     return jnp.where(kind == NONE, -1, surfaces.facets.material[facet])
 
 
 @jax.jit
 def element_voltages(
-    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
+    arrived: Arrivals,
+    receiver: Receiver,
+    frequency_hz: Float[Array, ""],
+    spherical_wave: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "k elements"]:
     """Returns the complex voltage of every element for every single path.
 
@@ -132,11 +140,12 @@ def element_voltages(
         arrived: amplitudes and geometry of K paths at the receiver.
         receiver: the array.
         frequency_hz: of the carrier; needed for element positions in metres.
-        curved: 0 for plane waves; 1 for spherical waves around mirrored sources at a distance of the path's length. A wave
-            diffracted by an edge is more strongly curved across the edge than this. By default `arrived.curved`, or else 0.
+        spherical_wave: 0 for plane waves; 1 for spherical waves around mirrored sources at a distance of the path's length. A
+            wave diffracted by an edge is more strongly curved across the edge than this. By default `arrived.spherical_wave`,
+            or else 0.
     """
-    if curved is None:
-        curved = 0.0 if arrived.curved is None else arrived.curved
+    if spherical_wave is None:
+        spherical_wave = 0.0 if arrived.spherical_wave is None else arrived.spherical_wave
     positions = receiver.element_wavelengths(frequency_hz)
     plane = arrived.amplitude[:, None] * steering_vector(positions, arrived.direction)
     metres, far = positions * (SPEED_OF_LIGHT / frequency_hz), jnp.maximum(arrived.length, SHORTEST)[:, None]
@@ -144,16 +153,19 @@ def element_voltages(
     across = jnp.maximum(jnp.sum(metres**2, -1) - along**2, 0)
     distance = jnp.sqrt((far - along) ** 2 + across + SHORTEST**2)
     longer = across / (distance + jnp.abs(far - along))  # than for a plane wave, without a difference of large numbers
-    turns = -frequency_hz / SPEED_OF_LIGHT * curved * longer
-    return plane * phasor(turns) * (1 + curved * (far / distance - 1))
+    turns = -frequency_hz / SPEED_OF_LIGHT * spherical_wave * longer
+    return plane * phasor(turns) * (1 + spherical_wave * (far / distance - 1))
 
 
 def snapshots_from_paths(
-    arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""], curved: Float[Array, ""] | float | None = None
+    arrived: Arrivals,
+    receiver: Receiver,
+    frequency_hz: Float[Array, ""],
+    spherical_wave: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, " elements"]:
     """Returns the complex voltages of the receiver's elements, summed over paths; use `jax.vmap` for several transmitters.
     Arguments are those of `element_voltages`."""
-    return jnp.sum(element_voltages(arrived, receiver, frequency_hz, curved), 0)
+    return jnp.sum(element_voltages(arrived, receiver, frequency_hz, spherical_wave), 0)
 
 
 def mimo_matrix(
@@ -161,17 +173,17 @@ def mimo_matrix(
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     tx_elements: Float[Array, "m 3"],
-    curved: Float[Array, ""] | float | None = None,
+    spherical_wave: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "elements m"]:
     """Returns the complex voltages of the receiver's elements for each of M transmit elements. These are identical, and plane
     waves leave them.
 
     Args:
-        arrived, receiver, frequency_hz, curved: as in `element_voltages`.
+        arrived, receiver, frequency_hz, spherical_wave: as in `element_voltages`.
         tx_elements: positions relative to the transmitter's, in wavelengths, world frame.
     """
     assert arrived.departure is not None, "arrivals of traced paths have a departure direction"
-    voltages = element_voltages(arrived, receiver, frequency_hz, curved)
+    voltages = element_voltages(arrived, receiver, frequency_hz, spherical_wave)
     return jnp.matmul(voltages.T, steering_vector(tx_elements, arrived.departure), precision=EXACT)
 
 
@@ -181,16 +193,16 @@ def covariance_from_paths(
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     coherence: Float[Array, "k k"],
-    curved: Float[Array, ""] | float | None = None,
+    spherical_wave: Float[Array, ""] | float | None = None,
 ) -> Complex[Array, "elements elements"]:
     """Returns the mean product y y^H of the snapshots of a transmitter whose K paths are partially coherent.
 
     Args:
-        arrived, receiver, frequency_hz, curved: as in `element_voltages`.
+        arrived, receiver, frequency_hz, spherical_wave: as in `element_voltages`.
         coherence: remaining mean product of two paths' amplitudes (`displacement.coherence`); where it is 1 everywhere, the
             result is the outer product of the snapshot.
     """
-    voltages = element_voltages(arrived, receiver, frequency_hz, curved)
+    voltages = element_voltages(arrived, receiver, frequency_hz, spherical_wave)
     parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # real products: four times as fast on a CPU
     products = jnp.matmul(parts.T, jnp.matmul(coherence, parts, precision=EXACT), precision=EXACT)
     (real, cross), (turned, imaginary) = (jnp.split(half, 2, -1) for half in jnp.split(products, 2))
@@ -207,32 +219,32 @@ def _unit(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     return v / jnp.sqrt(jnp.maximum(_dot(v, v), 1e-12))[..., None]
 
 
-def legs_of(paths: Paths) -> Legs:
+def segments_of(paths: Paths) -> Segments:
     """Returns the segments of paths."""
-    legs = paths.points[:, 1:] - paths.points[:, :-1]
-    lengths = jnp.sqrt(jnp.maximum(_dot(legs, legs), SHORTEST**2))
-    return Legs(lengths, legs / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
+    segments = paths.points[:, 1:] - paths.points[:, :-1]
+    lengths = jnp.sqrt(jnp.maximum(_dot(segments, segments), SHORTEST**2))
+    return Segments(lengths, segments / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
 
 
-def last_leg(paths: Paths) -> Int[Array, " k"]:
+def last_segment(paths: Paths) -> Int[Array, " k"]:
     """Returns the index of the segment that ends at the receiver."""
-    ends_leg = (paths.interaction_type == REFLECTED) | (paths.interaction_type == DIFFRACTED)
-    return jnp.sum(ends_leg, -1)
+    return jnp.sum(is_vertex(paths.interaction_type), -1)
 
 
 def _slab_interactions(
-    paths: Paths, legs: Legs, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
-) -> _SlabInteractions:
+    paths: Paths, segments: Segments, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
+) -> SlabInteractions:
     """Returns the slab basis and coefficients at every interaction; meaningless where an interaction is not with a slab."""
-    facet = jnp.where(paths.interaction_type == DIFFRACTED, 0, paths.interaction_facet)
-    along = jnp.take_along_axis(legs.direction, paths.interaction_leg[..., None], 1)
+    facet = jnp.where(on_edge(paths.interaction_type), 0, paths.interaction_facet)
+    along = jnp.take_along_axis(segments.direction, paths.interaction_segment[..., None], 1)
     normal, reflects = surfaces.facets.normal[facet], paths.interaction_type == REFLECTED
     cosine = _dot(along, normal)
     c = slab_coefficients(jnp.abs(cosine), slabs.permittivity[facet], slabs.thickness[facet], frequency_hz, slabs.air)
     across = _across(along, normal)
     within = jnp.cross(across, along)
     mirrored = along - 2 * cosine[..., None] * normal
-    return _SlabInteractions(
+    return SlabInteractions(
+        (paths.interaction_type != NONE) & ~on_edge(paths.interaction_type),
         across,
         within,
         jnp.where(reflects[..., None], jnp.cross(across, mirrored), within),
@@ -241,13 +253,13 @@ def _slab_interactions(
     )
 
 
-def _through_slabs(
-    field: Complex[Array, "k 3"], interactions: _SlabInteractions, active: Bool[Array, "k 5"]
+def through_slabs(
+    field: Complex[Array, "k 3"], interactions: SlabInteractions, active: Bool[Array, "k 5"]
 ) -> Complex[Array, "k 3"]:
-    """Returns the field behind the active slabs, applied in order."""
+    """Returns the field behind the active ones of the slabs, applied in order."""
 
     def through(field, one):
-        (across, into, out, te, tm), active = one
+        (_, across, into, out, te, tm), active = one
         changed = (te * _dot(field, across))[:, None] * across + (tm * _dot(field, into))[:, None] * out
         return jnp.where(active[:, None], changed, field).astype(field.dtype), None
 
@@ -262,27 +274,39 @@ def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[
     return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, other), s))
 
 
-def _over_edges(
+def specular_transport(
     field: Complex[Array, "k 3"],
     paths: Paths,
-    legs: Legs,
-    interactions: _SlabInteractions,
-    active: Bool[Array, "k 5"],
-    edges: Edges,
+    segments: Segments,
+    interactions: SlabInteractions,
+    surfaces: Surfaces,
+    slabs: Slabs,
+    frequency_hz: Float[Array, ""],
+) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
+    """Returns the field behind all slabs, and the spreading factor."""
+    return through_slabs(field, interactions, interactions.active), 1 / segments.total
+
+
+def diffracted_transport(
+    field: Complex[Array, "k 3"],
+    paths: Paths,
+    segments: Segments,
+    interactions: SlabInteractions,
+    surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
 ) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
     """Returns the field after the slabs before an edge, the edge, and the slabs behind it; and the spreading factor."""
     k, place = jnp.arange(len(field)), jnp.arange(MAX_INTERACTIONS)
-    slot = jnp.argmax(paths.interaction_type == DIFFRACTED, -1)
-    leg, edge = paths.interaction_leg[k, slot], paths.interaction_facet[k, slot]
-    before = jnp.sum(jnp.where(jnp.arange(legs.length.shape[1]) <= leg[:, None], legs.length, 0), -1)
-    after = jnp.maximum(legs.total - before, SHORTEST)
-    field = _through_slabs(field, interactions, active & (place < slot[:, None]))
-    rays = legs.direction[k, leg], legs.direction[k, leg + 1]
-    field = _diffract(field, *rays, before, after, edge, edges, slabs, frequency_hz)
-    field = _through_slabs(field, interactions, active & (place > slot[:, None]))
-    return field, 1 / jnp.sqrt(before * after * legs.total)
+    slot, active = jnp.argmax(on_edge(paths.interaction_type), -1), interactions.active
+    segment, edge = paths.interaction_segment[k, slot], paths.interaction_facet[k, slot]
+    before = jnp.sum(jnp.where(jnp.arange(segments.length.shape[1]) <= segment[:, None], segments.length, 0), -1)
+    after = jnp.maximum(segments.total - before, SHORTEST)
+    field = through_slabs(field, interactions, active & (place < slot[:, None]))
+    rays = segments.direction[k, segment], segments.direction[k, segment + 1]
+    field = _diffract(field, *rays, before, after, edge, surfaces.edges, slabs, frequency_hz)
+    field = through_slabs(field, interactions, active & (place > slot[:, None]))
+    return field, 1 / jnp.sqrt(before * after * segments.total)
 
 
 def _diffract(

@@ -156,7 +156,7 @@ def snapshot_to_pas(
 
 
 @pytree
-class Beams:
+class LagBasis:
     """Linear map from the mean product y y^H of an array's snapshots to its squared spectrum, in terms of lags.
 
     Lags are the differences of element positions.
@@ -170,7 +170,7 @@ class Beams:
     """... and whether the pair counts: only one of two pairs with opposite lags does."""
 
 
-def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
+def make_lag_basis(element_positions: Float[np.ndarray, "elements 3"]) -> LagBasis:
     """Returns the lag basis of an array whose element positions (wavelengths) are available on the host."""
     positions = np.asarray(element_positions, np.float64)
     lags = np.round(positions[None] - positions[:, None], 9) + 0.0
@@ -182,20 +182,20 @@ def beams_of(element_positions: Float[np.ndarray, "elements 3"]) -> Beams:
     phase = 2 * np.pi * (_pas_directions().reshape(-1, 3) @ different.T)
     twice = np.where(np.any(different, -1), 2.0, 1.0)
     basis = np.concatenate([twice * np.cos(phase), -twice * np.sin(phase)], -1)
-    return Beams(jnp.asarray(basis, jnp.float32), jnp.asarray(number), jnp.asarray(once))
+    return LagBasis(jnp.asarray(basis, jnp.float32), jnp.asarray(number), jnp.asarray(once))
 
 
 @jax.jit
-def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], beams: Beams) -> Float[Array, "*n 90 360"]:
+def covariance_to_pas(covariance: Complex[Array, "*n elements elements"], lags: LagBasis) -> Float[Array, "*n 90 360"]:
     """Returns the power angular spectra, each scaled to a maximum of 1, of mean products y y^H of random snapshots: the root of
     the mean of |a^H y|^2. Covariances should have a trace of about 1.
 
     Without randomness this agrees with `snapshot_to_pas`, to the square root of single precision.
     """
-    count, flat = beams.basis.shape[1] // 2, covariance.reshape(-1, *covariance.shape[-2:])
-    counted = jnp.where(beams.once, flat, 0).reshape(flat.shape[0], -1)
-    sums = jax.vmap(lambda pairs: jnp.zeros(count, pairs.dtype).at[beams.lag.reshape(-1)].add(pairs))(counted)
-    power = jnp.matmul(jnp.concatenate([sums.real, sums.imag], -1), beams.basis.T, precision=EXACT)
+    count, flat = lags.basis.shape[1] // 2, covariance.reshape(-1, *covariance.shape[-2:])
+    counted = jnp.where(lags.once, flat, 0).reshape(flat.shape[0], -1)
+    sums = jax.vmap(lambda pairs: jnp.zeros(count, pairs.dtype).at[lags.lag.reshape(-1)].add(pairs))(counted)
+    power = jnp.matmul(jnp.concatenate([sums.real, sums.imag], -1), lags.basis.T, precision=EXACT)
     return normalise(_root(power).reshape(*covariance.shape[:-2], *PAS_SHAPE))
 
 

@@ -34,10 +34,10 @@ class Paths(NamedTuple):
     polarised: Complex[Array, "*b k 2"] | None = None
     """Amplitudes at isotropic elements polarised along theta-hat and along phi-hat of the receiver's frame."""
     interaction: Int[Array, "*b k 5"] | None = None
-    """Types of interaction in order: `propagation.paths.TRANSMITTED` and so on; 0 beyond the last."""
+    """Types of interaction in order: `propagation.paths.InteractionType`; 0 beyond the last."""
     material: Int[Array, "*b k 5"] | None = None
     """Index of the material at each interaction; -1 beyond the last."""
-    curved: Float[Array, "*b"] | None = None
+    spherical_wave: Float[Array, "*b"] | None = None
     """1 for spherical waves at the array, 0 for plane waves (`propagation.transport.element_voltages`)."""
     points: Float[Array, "*b k 5 3"] | None = None
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib import colormaps
 
-from wbgs_jax.propagation.paths import NONE, TRANSMITTED
+from wbgs_jax.propagation.paths import is_vertex
 from wbgs_jax.radio.array import pas_directions
 from wbgs_jax.radio.channel import NO_PATH_DB
 
@@ -51,7 +51,7 @@ def dome(
 
 def bounces(interaction: Int[np.ndarray, "k 5"]) -> Int[np.ndarray, " k"]:
     """Returns the number of reflections and diffractions of paths."""
-    return ((interaction != NONE) & (interaction != TRANSMITTED)).sum(-1)
+    return np.sum(is_vertex(interaction), -1)
 
 
 def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"], by_power: bool) -> UInt8[np.ndarray, "k 3"]:

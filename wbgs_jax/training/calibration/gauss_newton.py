@@ -125,8 +125,7 @@ def _felt(prepared: PreparedPaths, movers: int, size: int) -> Float[Array, " p"]
     def add(total: Float[Array, " p"], pair: Any) -> tuple[Float[Array, " p"], None]:
         paths, receiver = pair
         number, derivative = _terms(prepared, paths, receiver, movers)
-        alive = jnp.concatenate([paths.specular.alive, paths.diffracted.alive])
-        return total.at[number].add(jnp.where(alive[:, None], derivative**2, 0)), None
+        return total.at[number].add(jnp.where(paths.alive[:, None], derivative**2, 0)), None
 
     return jax.lax.scan(add, jnp.zeros(size), (prepared.paths, prepared.receiver_index))[0]
 
@@ -162,7 +161,7 @@ def _terms(
 ) -> tuple[Int[Array, "k t"], Float[Array, "k t"]]:
     """Returns the indices of the components of a motion (with all receivers) that the lengths of paths to one receiver depend
     on, and the derivatives."""
-    terms = [length_terms(some, prepared.surfaces, movers) for some in (paths.specular, paths.diffracted)]
+    terms = [length_terms(some, prepared.surfaces, movers) for some in paths.sets]
     number, derivative = (jnp.concatenate(parts) for parts in zip(*terms, strict=True))
     return jnp.where(number < 6 * movers, number, number + 3 * receiver), derivative
 
@@ -206,8 +205,8 @@ def normal_equations(
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(queried)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
-        if plan.tuning is not None:
-            voltages = voltages * element_gains(plan.tuning)
+        if plan.array_gains is not None:
+            voltages = voltages * element_gains(plan.array_gains)
         number, derivative = _terms(prepared, paths, queried.receiver_index, movers)
         lengths = jnp.zeros((len(number), q + 1)).at[jnp.arange(len(number))[:, None], place[number]].add(derivative)
         parts = jnp.concatenate([voltages.real, voltages.imag], -1)  # a real product: lengths are real
