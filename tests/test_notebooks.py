@@ -33,6 +33,7 @@ def test_outputs_and_pages_belong_to_the_cells(name, tool):
 
 
 @pytest.mark.heavy
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == QUICKEST else pytest.mark.slow) for n in NOTEBOOKS])
 def test_notebooks_run(name, tool):
     cells = tool.execute(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)).cells  # a cell that fails raises

@@ -60,6 +60,7 @@ def test_every_public_function_is_a_case_or_belongs_to_the_host():
 
 
 @pytest.mark.heavy
+@pytest.mark.long
 @pytest.mark.skipif(not parity.STANDS_IN, reason="the compiler of this jaxlib ends the process at programs for CUDA on a CPU")
 @pytest.mark.parametrize("room", [*RUN, *SLOW])
 def test_the_program_for_cuda_says_on_this_cpu_what_its_own_says(room):

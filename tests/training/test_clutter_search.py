@@ -55,6 +55,7 @@ def told_of(parts, truth, folder, n_tx=N_TX):
 
 
 @pytest.mark.heavy
+@pytest.mark.long
 def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands_and_read_again(tmp_path, rng):
     truth, filled = heard_behind_a_hedge(tmp_path / "true", rng)
     dataset = run_in(PARTS, SETTINGS, tmp_path, PLACES, FREQUENCIES, truth).dataset
