@@ -7,8 +7,8 @@ expected absolute error and a 90 % bound on it, both in decibels.
 The features are selected on the validation part, and the ends of the interval are quantiles of the residuals there (split
 conformal prediction, Lei et al. 2018). The coverage is therefore valid for transmitters drawn from the same distribution as
 those of the validation part, not for others (`domain.Domain` excludes queries outside of the scene and of the band). An SSIM
-below 0 counts as 0, so that all expected scores and ends of intervals lie between 0 and 1. The few mixture weights of a hybrid field were learned on the same transmitters,
-for which its predictions are slightly too good.
+below 0 counts as 0, so that all expected scores and ends of intervals lie between 0 and 1. The few mixture weights of a hybrid
+field were learned on the same transmitters, for which its predictions are slightly too good.
 """
 
 from pathlib import Path
