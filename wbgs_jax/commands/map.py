@@ -103,9 +103,10 @@ def make_maps(command: Command) -> None:
     with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
         answer = evaluate_plane(command.what, field, plane, frequencies_hz, progress.advance)
     outside = np.asarray(field.domain.outside(plane.positions())).reshape(len(plane.ys), len(plane.xs))
-    answer["no_confidence"] = outside | field.domain.out_of_band(frequencies_hz).all()
+    missing = outside | np.asarray(field.domain.out_of_band(frequencies_hz))[:, None, None]
+    answer["no_confidence"] = missing.all(0)
     if answer.keys() & set(INTERVALS):
-        warn_of_intervals(outside | field.domain.out_of_band(frequencies_hz)[:, None, None])
+        warn_of_intervals(missing)
     size = f"{len(plane.xs)} x {len(plane.ys)} positions at {len(frequencies_hz)} frequencies"
     if command.out:
         write_arrays(command.out, answer, field.source | {"what": command.what})

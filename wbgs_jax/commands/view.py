@@ -11,7 +11,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -19,10 +19,11 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies
+from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, parse_receiver
 
 if TYPE_CHECKING:
     from wbgs_jax.viewer.app import Viewer
+    from wbgs_jax.viewer.page import Page
 
 LOCAL = ("localhost", "127.0.0.1", "::1")
 
@@ -62,18 +63,48 @@ def check(command: Command) -> None:
 
 
 def start(command: Command) -> "Viewer":
-    """Returns the running viewer, set up as on the command line."""
-    from wbgs_jax.viewer.app import Viewer
-    from wbgs_jax.viewer.session import Asker
+    """Returns the running viewer, set up as on the command line. Its page shows a line of progress while the run is read.
 
+    Raises:
+        UserError: the run cannot be read, or the field cannot be queried at this receiver or frequency.
+    """
     lowest = None if command.ghz is None else float(parse_frequencies((command.ghz,))[0])
-    field = load_field(command.run, command.rx, lowest)
-    page = command.html or Path(f"{field.dataset.name}.html")
-    viewer = Viewer(Asker(field), command.host, command.port, page, command.up)
+    position = parse_positions((command.tx,))[0] if command.tx else None
+
+    if not (command.run / "config.json").exists():  # before there is a page
+        from wbgs_jax.training.run_folder import read_config
+
+        read_config(command.run)
+    from wbgs_jax.viewer.page import Page
+
+    page = Page(command.host, command.port)
+    try:
+        return _fill(page, command, lowest, position)
+    except BaseException:
+        page.stop()
+        raise
+
+
+def _fill(page: "Page", command: Command, lowest_hz: float | None, position: Any) -> "Viewer":
+    """Returns the viewer on a page."""
+    if not command.html:
+        where = "localhost" if command.host in LOCAL else command.host
+        say(f"viewer: http://{where}:{page.port} (Ctrl-C stops it)")
+    page.progress("reading the run", 10)
+    field = load_field(command.run, "", lowest_hz)
+    page.progress("preparing the receiver", 35)
+
+    from wbgs_jax.viewer.app import Viewer
+    from wbgs_jax.viewer.session import Session
+
+    session = Session(field)
+    if command.rx:
+        session.use_receiver(parse_receiver(command.rx, field.dataset))
+    viewer = Viewer(session, page, command.html or Path(f"{field.dataset.name}.html"), command.up)
     if command.ghz is not None:
         viewer.set_ghz(command.ghz)
-    if command.tx:
-        viewer.move(parse_positions((command.tx,))[0])
+    if position is not None:
+        viewer.move(position)
     return viewer
 
 
@@ -91,8 +122,6 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"page: {viewer.save()}")
         viewer.stop()
         return
-    where = "localhost" if command.host in LOCAL else command.host
-    say(f"viewer: http://{where}:{viewer.port} (Ctrl-C stops it)")
     if command.host not in LOCAL:
         say(
             f"note: everyone who reaches {command.host} has access to the viewer; --host localhost restricts it to this machine"

@@ -1,37 +1,48 @@
 """The viewer application: changes of the controls are queried and the results drawn; outdated requests are skipped."""
 
-import contextlib
-import io
+import dataclasses
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import viser
 from jaxtyping import Float
 
 from wbgs_jax._util.cli import say
 from wbgs_jax._util.files import atomic_write
-from wbgs_jax.inference.radio_map import plane_over
-from wbgs_jax.viewer import drawing, panel, walk
-from wbgs_jax.viewer.session import Answer, Asker
-from wbgs_jax.viewer.surroundings import SceneView
+from wbgs_jax.inference.radio_map import Plane, cut_at, plane_over
+from wbgs_jax.types import Receiver
+from wbgs_jax.viewer import drawing, figures, panel, walk
+from wbgs_jax.viewer.page import Page, as_words
+from wbgs_jax.viewer.session import Answer, Session
+from wbgs_jax.viewer.surroundings import FIELD_OF_VIEW, SceneView
 
 STEPS_A_SECOND = 20
 """Animation steps of a walk, per second."""
-HANDLE_SHARE = 0.06
-"""Size of the transmitter's arrows, relative to that of the room."""
+WIDE = 1.2
+"""Aspect of a picture whose browser is not known."""
+PANEL_PX = 388
+"""Width of the panel, pixels."""
 
 
 class Latest:
     """Runs work in a separate thread for the newest request; older requests that are still waiting are dropped."""
 
-    def __init__(self, work: Callable[[], None]):
-        self._work, self._wanted, self._stopped, self._busy = work, threading.Event(), False, False
+    def __init__(self, work: Callable[[], None], on_error: Callable[[str], None] = say):
+        self._work, self._on_error = work, on_error
+        self._wanted, self._stopped, self._busy = threading.Event(), False, False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is a request that is newer than the current work."""
+        return self._wanted.is_set()
 
     def request(self) -> None:
         """Requests that the work be done (again)."""
@@ -57,38 +68,58 @@ class Latest:
                 return
             try:
                 self._work()
-            except Exception as error:  # the viewer continues, and its terminal shows why nothing changed
-                say(f"viewer: {type(error).__name__}: {error}")
+            except Exception as error:  # the viewer continues, and shows why nothing changed
+                self._on_error(f"{type(error).__name__}: {error}")
             self._busy = False
+
+
+class _OutdatedError(Exception):
+    """A newer request replaces the work."""
+
+
+@dataclass(frozen=True)
+class DrawnMap:
+    """A map of received power."""
+
+    values: Float[np.ndarray, "ny nx"]
+    """dB relative to the transmitted power; NaN where nothing is received."""
+    plane: Plane
+    conditions: tuple[Any, ...]
+    """Frequency, height and so on, for which it was computed (`Viewer.map_conditions`)."""
+    frequency_hz: float
 
 
 class Viewer:
     """A server that shows one trained field."""
 
-    def __init__(self, asker: Asker, host: str = "localhost", port: int = 8080, html: Path = Path("scene.html"), up: str = "z"):
-        self.asker, self.html, self.updates, self._ended = asker, html, 0, False
-        data = asker.dataset
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table; the command prints one line instead
-            self.server = viser.ViserServer(host=host, port=port, label="wbgs-jax", verbose=False)
-        self.view = SceneView(self.server, data, asker.receiver, up)
+    def __init__(self, session: Session, page: Page | None = None, html: Path = Path("scene.html"), up: str = "z"):
+        self.session, self.html, self.updates, self._ended = session, html, 0, False
+        self.page = page or Page()
+        self.server = self.page.server
+        data = session.dataset
         self.start = np.median(data.tx_positions, axis=0)
-        self.start = data.tx_positions[np.argmin(np.linalg.norm(data.tx_positions - self.start, axis=1))]
+        self.start = data.tx_positions[np.argmin(np.linalg.norm(data.tx_positions - self.start, axis=1))].round(2)
+        self.view = SceneView(self.server, data, session.receiver, self.start, up)
         top = float(self.view.box[1, self.view.up])
-        self.controls, self.said = panel.make_panel(self.server, asker, self.start, self.view.heights(), top)
+        self.controls, self.display = panel.make_panel(self.server, session, self.start, self.view.heights(), top)
         self.answer: Answer | None = None
         self.chosen: int | None = None
-        self._way, self._walked, self._syncing, self._trained = walk.stops(data.tx_positions), 0.0, False, asker.trained
-        self._drag = self._transmitter()
+        self.map: DrawnMap | None = None
+        self._clicked: tuple[float, float] | None = None
+        self._receiver = session.receiver
+        self._way, self._walked, self._syncing = walk.stops(data.tx_positions), 0.0, threading.local()
         self._look_in()
-        self._spectrum, self._map = Latest(self._show), Latest(self._draw_map)
+        self._spectrum = Latest(self._show, self._show_error)
+        self._map = Latest(self._draw_map, self._show_error)
         self._connect()
         threading.Thread(target=self._walk, daemon=True).start()
+        self.page.progress("compiling the field", 60)
         self._spectrum.request()
 
     @property
     def port(self) -> int:
         """The port of the server."""
-        return self.server.get_port()
+        return self.page.port
 
     @property
     def position(self) -> Float[np.ndarray, "3"]:
@@ -101,12 +132,14 @@ class Viewer:
         return 1e9 * float(self.controls.ghz.value)
 
     @property
-    def handle_size(self) -> float:
-        """Length of the transmitter's arrows, metres."""
-        return HANDLE_SHARE * self.view.size
+    def map_conditions(self) -> tuple[Any, ...]:
+        """Everything that a map depends on."""
+        m, where = self.controls.map, np.asarray(self.session.receiver.position).tolist()
+        return self.frequency_hz, float(m.height.value), float(m.step.value), *where, self.session.version
 
     def draw_map(self) -> None:
         """Draws the received power over the plane of the controls, and returns when it is drawn."""
+        self._quietly(self.controls.map.shown, True)
         self._map.request()
         self._map.wait()
 
@@ -115,21 +148,24 @@ class Viewer:
         self._ended = True
         self._spectrum.stop()
         self._map.stop()
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+        self.page.stop()
 
     def move(self, position: Float[np.ndarray, "3"], drag: bool = True) -> None:
         """Moves the transmitter to a position (metres); `drag` also moves its arrows."""
         x, y, z = (float(part) for part in position)
         self._quietly(self.controls.position, (x, y, z))
         if drag:
-            self._drag.position = (x, y, z)
+            self.view.transmitter.position = (x, y, z)
+        self._spectrum.request()
+
+    def move_receiver(self, receiver: Receiver) -> None:
+        """Uses another receiver: one of the data or, if the field predicts others, any one."""
+        self._receiver = receiver
         self._spectrum.request()
 
     def set_ghz(self, ghz: float) -> None:
         """Sets the frequency (GHz)."""
         self._quietly(self.controls.ghz, round(ghz, 4))
-        self._quietly(self.controls.octave, round(float(np.log10(ghz)), 3))
         self._spectrum.request()
 
     def wait(self) -> None:
@@ -146,103 +182,199 @@ class Viewer:
             stream.write(self.server.scene.as_html().encode())
         return self.html
 
-    def _transmitter(self) -> viser.TransformControlsHandle:
-        scene = self.server.scene
-        handle = scene.add_transform_controls(
-            "/transmitter", self.handle_size, disable_rotations=True, position=tuple(self.start)
-        )
-        scene.add_icosphere("/transmitter/ball", 0.07, (214, 39, 40))
-        scene.add_label("/transmitter/name", "transmitter", position=(0, 0, 0.15))
-        return handle
-
     def _look_in(self) -> None:
-        low, high = self.view.box
-        middle, size = (low + high) / 2, self.view.size
-        aside = np.roll([-0.08, -0.45, 0.6], self.view.up - 2)
-        self.server.initial_camera.position = tuple(middle + aside * size)
-        self.server.initial_camera.look_at = tuple(middle)
+        """Shows the room to browsers that are, or will be, connected."""
+        initial = self.server.initial_camera
+        initial.position, initial.look_at = (tuple(place) for place in self.view.camera(WIDE))
+        initial.fov = FIELD_OF_VIEW
+        self.server.on_client_connect(self._aim)
+        for client in self.server.get_clients().values():
+            self._aim(client)
+
+    def _aim(self, client: viser.ClientHandle) -> None:
+        """Shows the room to a browser, whose picture loses the width of the panel if it is wide."""
+        width, height = client.camera.image_width, client.camera.image_height
+        aspect = width / height if width < height else max(width - PANEL_PX, height) / height
+        client.camera.position, client.camera.look_at = self.view.camera(aspect)
 
     def _connect(self) -> None:
         """Connects every control with its action."""
-        c = self.controls
-        self._drag.on_update(lambda _: self.move(np.array(self._drag.position), drag=False))
-        c.position.on_update(lambda _: None if self._syncing else self.move(self.position))
-        c.octave.on_update(lambda _: None if self._syncing else self.set_ghz(10 ** float(c.octave.value)))
-        c.ghz.on_update(lambda _: None if self._syncing else self.set_ghz(float(c.ghz.value)))
-        for control in (c.paths, c.by_power, c.gaussians):
+        c, drag = self.controls, self.view.transmitter
+        drag.on_update(lambda _: self.move(np.array(drag.position).round(2), drag=False))
+        self._on(c.position, lambda: self.move(self.position))
+        for control in (c.ghz, c.paths, c.by_power, c.gaussians, c.dbm, c.band):
             if control is not None:
-                control.on_update(lambda _: self._spectrum.request())
-        c.cut.on_update(lambda _: self.view.clip(*map(float, c.cut.value)))
-        c.samples.on_update(lambda _: setattr(self.view.samples, "visible", c.samples.value))
-        c.map.draw.on_click(lambda _: self._map.request())
-        c.map.clear.on_click(lambda _: self._remove_map())
+                self._on(control, self._spectrum.request)
+        self._on(c.receiver, self._choose_receiver)
+        if self.session.movable:
+            arrows = self.view.add_receiver_handle()
+            arrows.on_update(lambda _: self._drag_receiver(np.array(arrows.position)))
+        self._on(c.cut, lambda: self.view.clip(*map(float, c.cut.value)))
+        self._on(c.samples, lambda: setattr(self.view.samples, "visible", c.samples.value))
+        for of_map in (c.map.shown, c.map.height, c.map.step):
+            self._on(of_map, self._map.request)
         c.save.on_click(lambda event: self._offer(event.client))
         if (m := c.material) is not None:
-            m.chosen.on_update(lambda _: self._show_material(m))
+            self._on(m.chosen, lambda: self._show_material(m))
             for slider in (m.permittivity, m.conductivity):
-                slider.on_update(lambda _: None if self._syncing else self._change_material(m))
-            m.thickness.on_update(lambda _: None if self._syncing else self._change_thickness(m))
+                self._on(slider, lambda: self._change_material(m))
+            self._on(m.thickness, lambda: self._change_thickness(m))
             m.reset.on_click(lambda _: self._as_trained(m))
+
+    def _on(self, control: Any, action: Callable[[], None]) -> None:
+        """Connects a control with an action, which `_quietly` does not trigger."""
+        control.on_update(lambda _: None if getattr(self._syncing, "now", False) else action())
 
     def _quietly(self, control: Any, value: Any) -> None:
         """Sets a control without triggering its action."""
-        self._syncing = True
+        self._syncing.now = True
         try:
             control.value = value
         finally:
-            self._syncing = False
+            self._syncing.now = False
+
+    def _choose_receiver(self) -> None:
+        chosen = str(self.controls.receiver.value)
+        if chosen == panel.MOVED:
+            return  # it starts from where it is
+        receiver = self.session.dataset.receiver(int(chosen.split(":")[0]))
+        if self.view.receiver_handle is not None:
+            self.view.receiver_handle.position = tuple(np.asarray(receiver.position, float))
+        self.move_receiver(receiver)
+
+    def _drag_receiver(self, position: Float[np.ndarray, "3"]) -> None:
+        self._quietly(self.controls.receiver, panel.MOVED)
+        self.move_receiver(dataclasses.replace(self._receiver, position=jnp.asarray(position, jnp.float32)))
+
+    def _follow_receiver(self) -> None:
+        """Makes the session use the newest receiver."""
+        wanted = self._receiver
+        if wanted is self.session.receiver:
+            return
+        try:
+            self.session.use_receiver(wanted)
+        except Exception:
+            self._receiver = self.session.receiver
+            raise
+        self.view.show_receiver(wanted)
+        if self.controls.material is not None:
+            self._show_material(self.controls.material)
 
     def _show(self) -> None:
         """Queries the field and draws the prediction."""
-        position, frequency, c, said = self.position, self.frequency_hz, self.controls, self.said
-        answer = self.answer = self.asker.ask(position, frequency)
+        self._follow_receiver()
+        position, frequency, c, d = self.position, self.frequency_hz, self.controls, self.display
+        answer = self.answer = self.session.predict(position, frequency)
         with self.server.atomic():
-            said.spectrum.image = drawing.spectrum_picture(answer.pas)
-            said.summary.content = panel.summary_words(answer, frequency)
+            d.spectrum.content = panel.spectrum_figure(answer.pas)
+            d.summary.content = panel.summary(answer, frequency, c.budget, self.session.has_power)
+            self.view.mark_transmitter(not answer.outside)
             self.view.draw_dome(answer.pas)
             self._draw_paths()
             if c.gaussians is not None:
-                off = c.gaussians.value == "off"
-                self.view.draw_gaussians(None if off else self.asker.splatted(position, frequency), c.gaussians.value)
-        sample = self.asker.nearest_sample(position, frequency)
-        said.truth_words.content = panel.sample_words(sample)
-        said.truth.image = drawing.spectrum_picture(panel.BLACK if sample is None else sample.pas)
+                off = c.gaussians.value == "off" or not self.session.has_gaussians
+                self.view.draw_gaussians(None if off else self.session.gaussians(position, frequency), str(c.gaussians.value))
+        self.page.ready()
         self.updates += 1
+        if not self._spectrum.waiting:
+            self._show_beside(position, frequency)
+
+    def _show_beside(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> None:
+        """Draws what may lag behind while the transmitter moves."""
+        assert self.answer is not None, "the prediction is drawn first"
+        c, d = self.controls, self.display
+        d.channel.content = panel.channel_figures(self.answer.paths, c.budget, float(c.band.value))
+        d.truth.content = panel.truth_figure(self.session.nearest_sample(position, frequency_hz))
+        if self.map is not None:
+            self._show_map()
+            if self.map.conditions != self.map_conditions:
+                self._map.request()
+
+    def _show_error(self, words: str) -> None:
+        say(f"viewer: {words}")
+        self.display.summary.content = as_words(words, "wbgs-warning")
+        self.page.ready()
 
     def _draw_paths(self) -> None:
         c, paths = self.controls, self.answer.paths if self.answer else None
-        self.view.draw_paths(paths, int(c.paths.value), c.by_power.value == "by power", self.chosen, self._choose)
-        if paths is None or not len(paths.power_db):
-            return
-        if self.said.impulse is not None:
-            delay, power = drawing.stems(paths.delay_ns, paths.power_db)
-            self.said.impulse.data = (delay, power)
-        if self.chosen is not None and self.chosen < len(paths.power_db):
-            self.said.path.content = panel.path_words(paths, self.chosen)
+        count, by_power = int(c.paths.value), c.by_power.value == "by power"
+        self.view.draw_paths(paths, count, by_power, self.chosen, self._choose)
+        self.display.paths.content = panel.path_list(paths, count, self.chosen, c.budget, by_power)
 
     def _choose(self, number: int) -> None:
         self.chosen = number
         self._draw_paths()
 
     def _draw_map(self) -> None:
+        """Computes and draws the map, unless it is drawn already."""
         m, (low, high) = self.controls.map, self.view.box
-        plane = plane_over(low[:2], high[:2], float(m.height.value), float(m.step.value))
-        m.progress.value, m.progress.visible = 0.0, True
-        frequency = self.frequency_hz
-        values = self.asker.power_plane(plane, frequency, lambda share: setattr(m.progress, "value", 100 * share))
-        first, last = self.view.draw_map(values, plane)
-        m.progress.visible = False
-        m.legend.content = (
-            f"Received power at {frequency / 1e9:.4g} GHz from transmitters at z = {plane.height:.2f} m: "
-            f"dark {first:.0f} dB to bright {last:.0f} dB relative to the transmitted power."
+        if not m.shown.value:
+            self.map = self._clicked = None
+            self.view.remove_map()
+            m.picture.content = m.caption.content = ""
+            return
+        conditions, frequency = self.map_conditions, self.frequency_hz
+        if self.map is None or self.map.conditions != conditions:
+            plane = plane_over(low[:2], high[:2], float(m.height.value), float(m.step.value))
+            self._show_map(0.0)
+
+            def progress(share: float) -> None:
+                if self._map.waiting or conditions != self.map_conditions:
+                    self._map.request()
+                    raise _OutdatedError
+                self._show_caption(share)
+
+            try:
+                values = self.session.power_plane(plane, frequency, progress)
+            except _OutdatedError:
+                return
+            self.map, self._clicked = DrawnMap(values, plane, conditions, frequency), None
+        self._show_map()
+
+    def _show_map(self, share: float | None = None) -> None:
+        """Draws the map that there is; `share` is the completed fraction of a newer one."""
+        self._show_caption(share)
+        drawn = self.map
+        if drawn is None:
+            return
+        budget, plane, outdated = self.controls.budget, drawn.plane, drawn.conditions != self.map_conditions
+        values = budget.received_dbm(drawn.values)
+        span = drawing.map_range(values)
+        self.view.draw_map(values, plane, span, outdated, self._click_map)
+        steps = [(axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5 for axis in (plane.xs, plane.ys)]
+        x, y = (
+            figures.axis_over(float(axis[0] - step), float(axis[-1] + step), f"{name} [m]")
+            for axis, step, name in zip((plane.xs, plane.ys), steps, "xy", strict=True)
+        )
+        power = figures.axis_over(*span, "received [dBm]")
+        marks = {"T": tuple(self.position[:2]), "R": tuple(np.asarray(self.session.receiver.position[:2], float))}
+        walls = cut_at(self.session.dataset, plane.height)
+        picture = figures.power_map(values, x, y, power, walls, marks, outdated)
+        self.controls.map.picture.content = f'<div class="wbgs-panel">{picture}</div>'
+
+    def _show_caption(self, share: float | None) -> None:
+        m, drawn = self.controls.map, self.map
+        m.caption.content = panel.map_caption(
+            None if drawn is None else (drawn.frequency_hz, drawn.plane.height),
+            drawn is not None and drawn.conditions != self.map_conditions,
+            share,
+            self._map_value(),
         )
 
-    def _remove_map(self) -> None:
-        self.view.draw_map(None, None)
-        self.controls.map.legend.content = ""
+    def _map_value(self) -> tuple[float, float, float] | None:
+        """Returns the place of the last click on the map and the power there, dBm."""
+        if self.map is None or self._clicked is None:
+            return None
+        (x, y), plane = self._clicked, self.map.plane
+        column, row = int(np.abs(plane.xs - x).argmin()), int(np.abs(plane.ys - y).argmin())
+        return x, y, float(self.controls.budget.received_dbm(self.map.values[row, column]))
+
+    def _click_map(self, x: float, y: float) -> None:
+        self._clicked = x, y
+        self._show_caption(None)
 
     def _show_material(self, m: panel.MaterialControls) -> None:
-        found = self.asker.materials()
+        found = self.session.materials()
         assert found is not None, "material controls exist only if there are materials"
         epsilon, sigma = (float(values[m.number]) for values in (found[1].permittivity, found[1].conductivity))
         self._quietly(m.permittivity, round(epsilon, 2))
@@ -250,22 +382,22 @@ class Viewer:
         self._quietly(m.thickness, round(1e3 * float(found[1].thickness[m.number]), 1))
 
     def _change_material(self, m: panel.MaterialControls) -> None:
-        self.asker.change_material(m.number, float(m.permittivity.value), 10 ** float(m.conductivity.value))
+        self.session.change_material(m.number, float(m.permittivity.value), 10 ** float(m.conductivity.value))
         self._spectrum.request()
 
     def _change_thickness(self, m: panel.MaterialControls) -> None:
-        self.asker.change_thickness(m.number, 1e-3 * float(m.thickness.value))
+        self.session.change_thickness(m.number, 1e-3 * float(m.thickness.value))
         self._spectrum.request()
 
     def _as_trained(self, m: panel.MaterialControls) -> None:
-        self.asker.restore(self._trained)
+        self.session.restore()
         self._show_material(m)
         self._spectrum.request()
 
     def _offer(self, client: viser.ClientHandle | None) -> None:
-        """Sends the page to the browser in which the button was pressed."""
+        """Sends the page to the browser in which the button was pressed, which saves it."""
         if client is not None:
-            client.send_file_download(self.html.name, self.server.scene.as_html().encode())
+            client.send_file_download(self.html.name, self.server.scene.as_html().encode(), save_immediately=True)
 
     def _walk(self) -> None:
         while not self._ended:

@@ -8,35 +8,36 @@ from matplotlib import colormaps
 
 from wbgs_jax.propagation.paths import is_vertex
 from wbgs_jax.radio.array import pas_directions
-from wbgs_jax.radio.channel import NO_PATH_DB
 
-ZOOM = 2
-"""Screen pixels per pixel of a spectrum, along both axes."""
+COLORS = "viridis"
+"""Colormap of spectra and maps."""
 DOME_STRIDE = 3
 """Stride of the directions that are drawn at the receiver, along both axes."""
-PATH_RANGE_DB = 50.0
-"""Range of the colours of paths below the strongest one; weaker paths have the last colour."""
+PATH_RANGE_DB = 40.0
+"""Range of the colours of paths below the strongest one; weaker paths fade ..."""
+FADED_DB, FADED = 20.0, 0.85
+"""... over this range to this share of the background."""
+BACKGROUND = np.array([255, 255, 255], np.uint8)
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
+BOUNCE_WORDS = "none", "one", "two", "three"
 MATERIAL_COLORS = "tab20"
 MAP_MARGIN = 0.01
 """Fraction of the values at either end that lie beyond the colours of a map."""
+OPAQUE, DIM = 230, 70
+"""Opacity of a map, and of an outdated one, of 255."""
 
 
-def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = "viridis") -> UInt8[np.ndarray, "*n 3"]:
+def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = COLORS) -> UInt8[np.ndarray, "*n 3"]:
     """Returns the colours of values; values beyond the range have the colours of its ends."""
     share = (np.asarray(values, np.float64) - low) / max(high - low, 1e-12)
-    return (255 * _table(name)[np.clip(share * 255, 0, 255).astype(int)]).astype(np.uint8)
+    return (255 * color_table(name)[np.clip(share * 255, 0, 255).astype(int)]).astype(np.uint8)
 
 
 @functools.cache
-def _table(name: str) -> Float[np.ndarray, "256 3"]:
+def color_table(name: str) -> Float[np.ndarray, "256 3"]:
+    """Returns the colours of a colormap, red, green and blue from 0 to 1."""
     return colormaps[name](np.linspace(0, 1, 256))[:, :3]
-
-
-def spectrum_picture(pas: Float[np.ndarray, "90 360"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a spectrum as an image: zenith at the top, azimuth from -180 to 180 degrees."""
-    return np.repeat(np.repeat(colored(pas, 0.0, 1.0), ZOOM, 0), ZOOM, 1)
 
 
 def dome(
@@ -55,11 +56,15 @@ def bounces(interaction: Int[np.ndarray, "k 5"]) -> Int[np.ndarray, " k"]:
 
 
 def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"], by_power: bool) -> UInt8[np.ndarray, "k 3"]:
-    """Returns a colour per path, by its power or by its number of reflections and diffractions."""
+    """Returns a colour per path, by its power or by its number of reflections and diffractions. Paths that are `PATH_RANGE_DB`
+    weaker than the strongest one fade into the background."""
+    top = float(power_db.max(initial=-300.0))
     if by_power:
-        top = float(power_db.max(initial=-300.0))
-        return colored(power_db, top - PATH_RANGE_DB, top + PATH_RANGE_DB / 5, "plasma")  # its last colours are pale
-    return BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
+        colors = colored(power_db, top - PATH_RANGE_DB, top + PATH_RANGE_DB / 5, "plasma")  # its last colours are pale
+    else:
+        colors = BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
+    faded = FADED * np.clip((top - PATH_RANGE_DB - power_db) / FADED_DB, 0, 1)[:, None]
+    return ((1 - faded) * colors + faded * BACKGROUND).round().astype(np.uint8)
 
 
 def linear(colors: UInt8[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
@@ -81,22 +86,20 @@ def path_handles(points: Float[np.ndarray, "k 5 3"]) -> Float[np.ndarray, "k 3"]
     return np.where(straight[:, None], (points[:, 0] + points[:, 1]) / 2, points[:, 1])
 
 
-def stems(delay_ns: Float[np.ndarray, " k"], power_db: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns delays and powers of a line that shows an impulse response: a floor, with a stem at the delay of every path."""
-    order = np.argsort(delay_ns)
-    delay, power = delay_ns[order], power_db[order]
-    floor = float(power.max(initial=-200.0)) - PATH_RANGE_DB
-    up = np.stack([np.full(len(power), floor), np.maximum(power, floor), np.full(len(power), floor)], -1)
-    return np.repeat(delay, 3), up.reshape(-1)
+def map_range(values: Float[np.ndarray, "ny nx"]) -> tuple[float, float]:
+    """Returns the values of the first and the last colour of a map (NaN where nothing is received)."""
+    known = values[np.isfinite(values)]
+    low, high = np.quantile(known, [MAP_MARGIN, 1 - MAP_MARGIN]) if len(known) else (-100.0, 0.0)
+    return float(low), float(high)
 
 
-def map_picture(values: Float[np.ndarray, "ny nx"]) -> tuple[UInt8[np.ndarray, "ny nx 4"], float, float]:
-    """Returns a map as an image, with the largest y at the top, transparent where nothing is received; and the values of the
-    first and the last colour."""
-    received = values > NO_PATH_DB
-    low, high = np.quantile(values[received], [MAP_MARGIN, 1 - MAP_MARGIN]) if received.any() else (-100.0, 0.0)
-    picture = np.concatenate([colored(values, float(low), float(high)), 230 * received[..., None].astype(np.uint8)], -1)
-    return np.ascontiguousarray(picture[::-1]), float(low), float(high)
+def map_picture(values: Float[np.ndarray, "ny nx"], low: float, high: float, dim: bool = False) -> UInt8[np.ndarray, "ny nx 4"]:
+    """Returns a map as an image, with the largest y at the top, transparent where the values are NaN. `low` and `high` are the
+    values of the first and the last colour; `dim` shows it as an outdated one."""
+    known = np.isfinite(values)
+    opacity = (DIM if dim else OPAQUE) * known[..., None].astype(np.uint8)
+    picture = np.concatenate([colored(np.where(known, values, low), low, high), opacity], -1)
+    return np.ascontiguousarray(picture[::-1])
 
 
 def material_color(number: int) -> tuple[int, int, int]:

@@ -1,39 +1,46 @@
 """The viewer's panel: its controls, and the display of predictions."""
 
+import html
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import viser
 from jaxtyping import Float
-from viser import uplot
 
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.inference.evaluate_quantities import lowest_frequency
 from wbgs_jax.types import MAX_FREQUENCY_HZ
-from wbgs_jax.viewer import drawing
-from wbgs_jax.viewer.session import Answer, Asker, PathList, Sample
+from wbgs_jax.viewer import drawing, figures
+from wbgs_jax.viewer.page import as_words
+from wbgs_jax.viewer.session import Answer, LinkBudget, PathList, Sample, Session
 
-BLACK = np.zeros((90, 360))
 MOST_PATHS = 200
+SHOWN_PATHS = 30
+"""Number of paths that are drawn at first."""
 PERMITTIVITY, LOG_CONDUCTIVITY = (1.01, 12.0), (-6.0, 7.0)
 """Ranges of the sliders; the conductivity as log10 of S/m."""
 THICKNESS_MM = (0.5, 500.0)
-LABEL_ROOM = 0.27
-"""Minimum distance, in decades, of two frequencies that are labelled below the slider."""
+LABEL_ROOM = 0.14
+"""Minimum distance of two marks of the frequency slider that are labelled, relative to its range."""
+TRANSMITTER_DBM, NOISE_DBM = 20.0, -87.0
+"""Initial link budget; the noise is the thermal one of 100 MHz with a noise figure of 7 dB."""
+BAND_MHZ, POINTS = 100.0, 201
+"""Initial bandwidth of the frequency response, and its number of frequencies."""
+DYNAMIC_DB = 40.0
+"""Range of the axes of powers below the strongest value."""
+MOVED = "moved"
 
 
 @dataclass
 class MapControls:
     """Controls of the map."""
 
+    shown: viser.GuiCheckboxHandle
     height: viser.GuiSliderHandle
     step: viser.GuiNumberHandle
-    draw: viser.GuiButtonHandle
-    clear: viser.GuiButtonHandle
-    progress: Any
-    """Progress bar; viser does not export its type."""
-    legend: viser.GuiMarkdownHandle
+    picture: viser.GuiHtmlHandle
+    caption: viser.GuiHtmlHandle
 
 
 @dataclass
@@ -58,171 +65,272 @@ class MaterialControls:
 class Controls:
     """Controls of the panel."""
 
+    receiver: viser.GuiDropdownHandle
     position: viser.GuiVector3Handle
-    octave: viser.GuiSliderHandle
-    """The frequency, as log10 of gigahertz."""
-    ghz: viser.GuiNumberHandle
-    play: viser.GuiCheckboxHandle
-    speed: viser.GuiSliderHandle
-    cut: viser.GuiMultiSliderHandle
+    ghz: viser.GuiSliderHandle
     samples: viser.GuiCheckboxHandle
+    dbm: viser.GuiVector2Handle
+    """Transmitted power and noise floor, dBm."""
+    band: viser.GuiNumberHandle
+    """Bandwidth of the frequency response, MHz."""
     paths: viser.GuiSliderHandle
     by_power: viser.GuiDropdownHandle
-    gaussians: viser.GuiDropdownHandle | None
     map: MapControls
-    material: MaterialControls | None
+    cut: viser.GuiMultiSliderHandle
+    gaussians: viser.GuiDropdownHandle | None
+    play: viser.GuiCheckboxHandle
+    speed: viser.GuiSliderHandle
     save: viser.GuiButtonHandle
+    material: MaterialControls | None
+
+    @property
+    def budget(self) -> LinkBudget:
+        """The link budget that is typed in."""
+        transmitter, noise = self.dbm.value
+        return LinkBudget(float(transmitter), float(noise))
 
 
 @dataclass
-class Said:
+class Display:
     """Elements of the panel that display a prediction."""
 
-    summary: viser.GuiMarkdownHandle
-    spectrum: viser.GuiImageHandle
-    truth: viser.GuiImageHandle
-    truth_words: viser.GuiMarkdownHandle
-    impulse: viser.GuiUplotHandle | None
-    path: viser.GuiMarkdownHandle
+    summary: viser.GuiHtmlHandle
+    spectrum: viser.GuiHtmlHandle
+    truth: viser.GuiHtmlHandle
+    channel: viser.GuiHtmlHandle
+    paths: viser.GuiHtmlHandle
 
 
 def make_panel(
-    server: viser.ViserServer, asker: Asker, start: Float[np.ndarray, "3"], heights: tuple[float, float], top: float
-) -> tuple[Controls, Said]:
+    server: viser.ViserServer, session: Session, start: Float[np.ndarray, "3"], heights: tuple[float, float], top: float
+) -> tuple[Controls, Display]:
     """Creates the panel of a field on a server. `start` is the initial position of the transmitter; `heights` is the initial
     range of drawn heights, and `top` its upper limit (metres)."""
-    gui, known = server.gui, np.unique(asker.dataset.frequencies_hz) / 1e9
-    summary = gui.add_markdown("*compiling the field, which takes a while ...*")
-    spectrum = gui.add_image(drawing.spectrum_picture(BLACK), label="spectrum at the receiver", format="jpeg", jpeg_quality=85)
-    with gui.add_folder("Transmitter"):
-        position = gui.add_vector3("x, y, z [m]", (start[0], start[1], start[2]), step=0.05)
-        low = lowest_frequency(asker.trained.field, asker.dataset)
-        first = float(known[len(known) // 2])
-        ends = float(np.log10(low / 1e9)), float(np.log10(MAX_FREQUENCY_HZ / 1e9))
-        octave = gui.add_slider("frequency", *ends, step=0.001, initial_value=float(np.log10(first)), marks=marks_at(known))
-        ghz = gui.add_number("GHz", first, min=low / 1e9, max=MAX_FREQUENCY_HZ / 1e9, step=0.1)
-        play = gui.add_checkbox("walk through the room", False)
-        speed = gui.add_slider("metres per second", 0.2, 3.0, step=0.1, initial_value=1.0)
+    gui, known = server.gui, np.unique(session.dataset.frequencies_hz) / 1e9
+    summary = gui.add_html(as_words("The first prediction compiles the field, which takes a while ..."))
+    spectrum = gui.add_html("")
+    names = receiver_names(session)
+    receiver = gui.add_dropdown("receiver", names, initial_value=names[0], disabled=len(names) < 2)
+    position = gui.add_vector3("transmitter", (start[0], start[1], start[2]), step=0.01, hint="x, y, z in metres")
+    low, high = lowest_frequency(session.trained.field, session.dataset) / 1e9, MAX_FREQUENCY_HZ / 1e9
+    first = float(known[len(known) // 2])
+    ghz = gui.add_slider("GHz", low, high, step=0.01, initial_value=first, marks=marks_at(known, low, high))
     tabs = gui.add_tab_group()
+    most = MOST_PATHS if session.has_paths else 0
     with tabs.add_tab("Truth"):
-        truth_words = gui.add_markdown("")
-        truth = gui.add_image(drawing.spectrum_picture(BLACK), format="jpeg", jpeg_quality=85)
-        samples = gui.add_checkbox("show all transmitters of the data", False)
+        truth = gui.add_html("")
+        samples = gui.add_checkbox("all transmitters", False, hint="Show the places of all transmitters of the data.")
+    with tabs.add_tab("Channel"):
+        off = not session.has_power
+        dbm = gui.add_vector2(
+            "TX, noise [dBm]",
+            (TRANSMITTER_DBM, NOISE_DBM),
+            step=1.0,
+            disabled=off,
+            hint="Transmitted power, and noise floor of the receiver",
+        )
+        band = gui.add_number("band [MHz]", BAND_MHZ, min=1.0, max=2000.0, step=10.0, disabled=not most)
+        channel = gui.add_html("" if most else as_words("This field does not predict paths."))
     with tabs.add_tab("Paths"):
-        most = MOST_PATHS if asker.knows_paths else 0
-        paths = gui.add_slider("strongest", 0, MOST_PATHS, step=1, initial_value=min(30, most), disabled=not most)
+        paths = gui.add_slider("strongest", 0, MOST_PATHS, step=1, initial_value=min(SHOWN_PATHS, most), disabled=not most)
         by_power = gui.add_dropdown("color", ("by power", "by reflections"), disabled=not most)
-        path = gui.add_markdown("Click on the ball of a path." if most else "This field does not predict paths.")
-    with tabs.add_tab("Room"):
-        cut = gui.add_multi_slider("heights [m]", heights[0], top, step=0.01, initial_value=heights)
-        gaussians = _gaussians(gui, asker)
-        save = gui.add_button("save as HTML")
+        path_table = gui.add_html("" if most else as_words("This field does not predict paths."))
     with tabs.add_tab("Map"):
-        map_controls = _map_controls(gui, asker)
+        map_controls = _map_controls(gui, session)
+    with tabs.add_tab("Room"):
+        cut = gui.add_multi_slider("heights [m]", round(heights[0], 2), round(top, 2), step=0.01, initial_value=heights)
+        gaussians = gui.add_dropdown("Gaussians", ("off", "signal", "attenuation")) if session.has_gaussians else None
+        play = gui.add_checkbox("walk", False, hint="Move the transmitter through the room.")
+        speed = gui.add_slider("speed [m/s]", 0.2, 3.0, step=0.1, initial_value=1.0)
+        save = gui.add_button("save as HTML")
     with tabs.add_tab("Materials"):
-        material = _material_controls(gui, asker)
-    impulse = _impulse_plot(gui) if most else None  # in an initially hidden tab it would have no width
-    chosen = play, speed, cut, samples, paths, by_power, gaussians, map_controls, material, save
-    return Controls(position, octave, ghz, *chosen), Said(summary, spectrum, truth, truth_words, impulse, path)
+        material = _material_controls(gui, session)
+    radio = receiver, position, ghz, samples, dbm, band
+    controls = Controls(*radio, paths, by_power, map_controls, cut, gaussians, play, speed, save, material)
+    return controls, Display(summary, spectrum, truth, channel, path_table)
 
 
-def marks_at(ghz: Float[np.ndarray, " n"]) -> tuple:
-    """Returns the marks of the slider: all frequencies of the data, labelled if there is enough space."""
-    marks, last = [], -np.inf
+def receiver_names(session: Session) -> tuple[str, ...]:
+    """Returns the choices of the receiver: those of the data by index and position and, if it can be moved, `MOVED`."""
+    places = np.atleast_2d(np.asarray(session.dataset.receivers.position, float))
+    names = tuple(f"{number}: {', '.join(f'{x:.2f}' for x in place)} m" for number, place in enumerate(places))
+    return (*names, MOVED) if session.movable else names
+
+
+def marks_at(ghz: Float[np.ndarray, " n"], low: float, high: float) -> tuple:
+    """Returns the marks of the slider from `low` to `high`: all frequencies of the data, labelled if there is enough space."""
+    marks: list[Any] = []
+    last = -np.inf
     for f in ghz:
-        place = float(np.log10(f))
-        marks.append((place, f"{f:g}") if place - last > LABEL_ROOM else place)
-        last = place if isinstance(marks[-1], tuple) else last
+        enough = f - last > LABEL_ROOM * (high - low)
+        marks.append((float(f), f"{f:.4g}") if enough else float(f))
+        last = f if enough else last
     return tuple(marks)
 
 
-def _impulse_plot(gui: viser.GuiApi) -> viser.GuiUplotHandle:
-    return gui.add_uplot(
-        (np.array([0.0, 1.0]), np.array([-100.0, -100.0])),
-        (uplot.Series(label="delay [ns]"), uplot.Series(label="power [dB]", stroke="#0072b2", width=1.5)),
-        scales={"x": uplot.Scale(time=False)},
-        axes=(uplot.Axis(label="delay [ns]"), uplot.Axis(label="power [dB]")),
-        aspect=1.7,
-    )
-
-
-def _gaussians(gui: viser.GuiApi, asker: Asker) -> viser.GuiDropdownHandle | None:
-    """Returns the menu of what the colours of Gaussians show; None if the field has no Gaussians."""
-    if asker.splatted(asker.dataset.tx_positions[0], float(asker.dataset.frequencies_hz[0])) is None:
-        return None
-    return gui.add_dropdown("Gaussians", ("off", "signal", "attenuation"))
-
-
-def _map_controls(gui: viser.GuiApi, asker: Asker) -> MapControls:
+def _map_controls(gui: viser.GuiApi, session: Session) -> MapControls:
     """Returns the controls of a map over a plane of constant z."""
-    off, usual = not asker.knows_power, float(np.median(asker.dataset.tx_positions[:, 2]))
-    floor, top = map(float, DatasetScene(asker.dataset).box[:, 2])
+    off, usual = not session.has_power, float(np.median(session.dataset.tx_positions[:, 2]))
+    floor, top = (round(float(z), 2) for z in DatasetScene(session.dataset).box[:, 2])
     return MapControls(
-        gui.add_slider("z [m]", floor, top, step=0.05, initial_value=usual, disabled=off),
+        gui.add_checkbox("show", False, disabled=off, hint="Received power from transmitters all over a level plane"),
+        gui.add_slider("height [m]", floor, top, step=0.01, initial_value=round(usual, 2), disabled=off),
         gui.add_number("step [m]", 0.25, min=0.05, max=2.0, step=0.05, disabled=off),
-        gui.add_button("draw received power", disabled=off),
-        gui.add_button("remove", disabled=off),
-        gui.add_progress_bar(0.0, visible=False),
-        gui.add_markdown("This field does not predict power." if off else ""),
+        gui.add_html(""),
+        gui.add_html(as_words("This field does not predict power.") if off else ""),
     )
 
 
-def _material_controls(gui: viser.GuiApi, asker: Asker) -> MaterialControls | None:
+def _material_controls(gui: viser.GuiApi, session: Session) -> MaterialControls | None:
     """Returns the controls of a material: a menu, its permittivity, conductivity and thickness, and a button that undoes all
     changes; None if the field has no materials."""
-    found = asker.materials()
+    found = session.materials()
     if found is None:
-        gui.add_markdown("This field has no materials.")
+        gui.add_html(as_words("This field has no materials."))
         return None
     names, properties = found
-    epsilon = float(np.clip(properties.permittivity[0], *PERMITTIVITY))
-    log_sigma = float(np.clip(np.log10(properties.conductivity[0]), *LOG_CONDUCTIVITY))
+    epsilon = round(float(np.clip(properties.permittivity[0], *PERMITTIVITY)), 2)
+    log_sigma = round(float(np.clip(np.log10(properties.conductivity[0]), *LOG_CONDUCTIVITY)), 2)
     millimetres = float(np.clip(1e3 * properties.thickness[0], *THICKNESS_MM))
     return MaterialControls(
         gui.add_dropdown("material", tuple(f"{number}: {name}" for number, name in enumerate(names))),
-        gui.add_slider("relative permittivity", *PERMITTIVITY, step=0.01, initial_value=epsilon),
-        gui.add_slider("log10 S/m at 1 GHz", *LOG_CONDUCTIVITY, step=0.01, initial_value=log_sigma),
+        gui.add_slider("permittivity", *PERMITTIVITY, step=0.01, initial_value=epsilon, hint="Relative, at 1 GHz"),
+        gui.add_slider("log10 S/m", *LOG_CONDUCTIVITY, step=0.01, initial_value=log_sigma, hint="Conductivity at 1 GHz"),
         gui.add_slider("thickness [mm]", *THICKNESS_MM, step=0.5, initial_value=round(2 * millimetres) / 2),
         gui.add_button("as trained"),
     )
 
 
-def summary_words(answer: Answer, frequency_hz: float) -> str:
-    """Returns the text above the spectrum."""
-    lines = [f"**{frequency_hz / 1e9:.4g} GHz**"]
-    if answer.power_db is not None:
-        lines[0] += f" · received {answer.power_db:.1f} dB"
-    if answer.expected is not None and answer.level is not None:
-        ssim, low, high = answer.expected
-        lines.append(f"expected SSIM {ssim:.2f}, {100 * answer.level:.0f} % between {low:.2f} and {min(high, 1):.2f}")
+def figure(title: str, drawn: str) -> str:
+    """Returns a figure with a title as an element of the panel."""
+    return f'<div class="wbgs-panel"><div class="wbgs-title">{html.escape(title)}</div>{drawn}</div>'
+
+
+def summary(answer: Answer, frequency_hz: float, budget: LinkBudget, has_power: bool) -> str:
+    """Returns the figures of a link and its warnings, for the top of the panel."""
+    lines = [[f"<b>{frequency_hz / 1e9:.4g} GHz</b>", *power_words(answer, budget)] if has_power else []]
+    if not has_power:
+        lines = [[f"<b>{frequency_hz / 1e9:.4g} GHz</b>"]]
     if answer.paths is not None and len(answer.paths.power_db):
         lines.append(channel_words(answer.paths))
-    lines += [f"⚠️ **{line}**" for line in answer.doubts]
-    return "  \n".join(lines)
+    if answer.expected is not None and answer.level is not None:
+        ssim, low, high = answer.expected
+        lines.append([f"expected SSIM <b>{ssim:.2f}</b>", f"{100 * answer.level:.0f} % between {low:.2f} and {high:.2f}"])
+    rows = "".join(
+        f'<div class="wbgs-figures">{"".join(f"<span>{item}</span>" for item in line)}</div>' for line in lines if line
+    )
+    sentences = "".join(f'<div class="wbgs-warning">{html.escape(line)}</div>' for line in answer.warnings)
+    return f'<div class="wbgs-panel" style="padding-top: 0.4em">{rows}{sentences}</div>'
 
 
-def channel_words(paths: PathList) -> str:
-    """Returns a line with K-factor, delay spread and number of paths."""
-    spread = f"delay spread {1e9 * paths.delay_spread_s:.1f} ns"
-    return f"K-factor {paths.k_factor_db:.1f} dB · {spread} · {len(paths.power_db)} paths"
+def power_words(answer: Answer, budget: LinkBudget) -> list[str]:
+    """Returns received power and SNR."""
+    if answer.power_db is None:
+        return ["<b>nothing is received</b>"]
+    power = f"received <b>{budget.received_dbm(answer.power_db):.1f} dBm</b>"
+    if answer.within_db is not None and answer.power_level is not None:
+        power += f" ± {answer.within_db:.1f} dB ({100 * answer.power_level:.0f} %)"
+    return [power, f"SNR <b>{budget.snr_db(answer.power_db):.1f} dB</b>"]
 
 
-def sample_words(sample: Sample | None) -> str:
-    """Returns the text above the observed spectrum."""
+def channel_words(paths: PathList) -> list[str]:
+    """Returns K-factor, delay spread and number of paths."""
+    spread = f"delay spread <b>{1e9 * paths.delay_spread_s:.1f} ns</b>"
+    several = len(paths.power_db) > 1
+    return [*([f"K-factor <b>{paths.k_factor_db:.1f} dB</b>"] if several else []), spread, f"{len(paths.power_db)} paths"]
+
+
+def spectrum_figure(pas: Float[np.ndarray, "90 360"]) -> str:
+    """Returns the predicted spectrum."""
+    return figure("Spectrum at the receiver, predicted", figures.spectrum(pas, "predicted"))
+
+
+def truth_figure(sample: Sample | None) -> str:
+    """Returns the observed spectrum of the nearest transmitter, and how well it is predicted."""
     if sample is None:
-        return "The data contain no spectra of this receiver."
-    place = f"{sample.distance_m:.2f} m away, {sample.frequency_hz / 1e9:g} GHz, {sample.part}"
-    return f"Nearest transmitter of the data ({place}). **SSIM of the field there: {sample.ssim:.3f}**"
+        return as_words("The data contain no spectra of this receiver.")
+    place = f"{sample.distance_m:.2f} m away, at {sample.frequency_hz / 1e9:g} GHz, {sample.part}"
+    below = f"Nearest transmitter of the data: {place}. SSIM of the prediction for it: <b>{sample.ssim:.3f}</b>"
+    drawn = figures.spectrum(sample.pas, "observed")
+    return figure("Spectrum at the receiver, observed", drawn + f'<div class="wbgs-words">{below}</div>')
 
 
-def path_words(paths: PathList, number: int) -> str:
-    """Returns a description of one path."""
+def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float) -> str:
+    """Returns the frequency response of the link over a band around the carrier, and its impulse response."""
+    if paths is None:
+        return as_words("This field does not predict paths.")
+    if not len(paths.power_db):
+        return as_words("No path carries power from here to the receiver.")
+    offsets = np.linspace(-band_mhz / 2, band_mhz / 2, POINTS)
+    response = budget.received_dbm(paths.frequency_response_db(1e6 * offsets))
+    x = figures.axis_over(-band_mhz / 2, band_mhz / 2, "offset from the carrier [MHz]")
+    high = float(np.ceil(response.max() / 5) * 5)
+    low = float(np.floor(max(response.min(), high - DYNAMIC_DB) / 5) * 5)
+    y = figures.axis_over(low, high, "power [dBm]", 3)
+    frequency = figure("Frequency response", figures.curve(offsets, response, x, y))
+    power, delay = budget.received_dbm(paths.power_db), paths.delay_ns
+    strong = power > power[0] - DYNAMIC_DB
+    x = figures.axis_over(0.0, float(np.ceil(1.05 * delay[strong].max() / 5) * 5), "delay [ns]")
+    high = float(np.ceil((power[0] + 1) / 5) * 5)
+    y = figures.axis_over(high - DYNAMIC_DB - 5, high, "power [dBm]", 3)
+    described = tuple(word for word, kept in zip(paths.words, strong, strict=True) if kept)
+    return frequency + figure("Impulse response", figures.stems(delay[strong], power[strong], described, x, y))
+
+
+def path_list(paths: PathList | None, count: int, chosen: int | None, budget: LinkBudget, by_power: bool) -> str:
+    """Returns the legend of the drawn paths and their table; `chosen` is the number of the path that is marked."""
+    if paths is None:
+        return as_words("This field does not predict paths.")
+    if not len(paths.power_db):
+        return as_words("No path carries power from here to the receiver.")
+    power = budget.received_dbm(paths.power_db)
+    legend = figures.bounce_legend()
+    if by_power:
+        bar = figures.axis_over(float(power[0]) - drawing.PATH_RANGE_DB, float(power[0]), "power [dBm]")
+        legend = figures.power_legend(bar, drawing.PATH_RANGE_DB)
+    order = list(range(min(count, len(power))))
+    if chosen is not None and chosen in order:
+        order = [chosen, *(number for number in order if number != chosen)]
+    rows = "".join(
+        f'<tr class="{"chosen" if number == chosen else ""}"><td>{power[number]:.1f}</td><td>{paths.delay_ns[number]:.1f}</td>'
+        f"<td>{html.escape(paths.words[number])}</td></tr>"
+        for number in order
+    )
+    head = "<tr><th>dBm</th><th>ns</th><th>interactions</th></tr>"
+    hint = path_words(paths, chosen) if chosen in order else "A click on the ball of a path marks it here."
+    return (
+        f'<div class="wbgs-panel">{legend}<div class="wbgs-words">{hint}</div>'
+        f'<div class="wbgs-table"><table>{head}{rows}</table></div></div>'
+    )
+
+
+def path_words(paths: PathList, number: int | None) -> str:
+    """Returns length and direction of the marked path."""
+    assert number is not None, "a path is marked"
     zenith = np.degrees(np.arccos(np.clip(paths.direction[number, 2], -1, 1)))
     azimuth = np.degrees(np.arctan2(paths.direction[number, 1], paths.direction[number, 0]))
-    return "  \n".join(
-        [
-            f"**{paths.words[number]}**",
-            f"{paths.power_db[number]:.1f} dB · {paths.length[number]:.2f} m · {paths.delay_ns[number]:.2f} ns",
-            f"arrives from zenith {zenith:.1f}°, azimuth {azimuth:.1f}°",
-        ]
-    )
+    return f"marked: {paths.length[number]:.2f} m long, arrives from zenith {zenith:.0f}°, azimuth {azimuth:.0f}°"
+
+
+def map_caption(
+    drawn: tuple[float, float] | None, outdated: bool, share: float | None, clicked: tuple[float, float, float] | None
+) -> str:
+    """Returns the line below a map.
+
+    Args:
+        drawn: frequency (hertz) and height (metres) of the drawn map, if there is one.
+        outdated: whether the controls have changed since then.
+        share: completed fraction of a newer map, if one is being computed.
+        clicked: place (x, y, metres) of a click on the map, and the power there, dBm.
+    """
+    lines = []
+    if drawn is not None:
+        of = f"at {drawn[0] / 1e9:.4g} GHz, transmitters at z = {drawn[1]:.2f} m"
+        lines.append(f"<b>An older map</b>, {of}." if outdated else f"Received power {of}.")
+    if share is not None:
+        lines.append(f"The new map is being computed: {100 * share:.0f} %.")
+    if clicked is not None:
+        x, y, dbm = clicked
+        value = f"{dbm:.1f} dBm" if np.isfinite(dbm) else "nothing is received"
+        lines.append(f"At ({x:.2f}, {y:.2f}) m: <b>{value}</b>.")
+    return f'<div class="wbgs-panel"><div class="wbgs-words">{" ".join(lines)}</div></div>'

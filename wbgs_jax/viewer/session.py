@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,21 +16,21 @@ from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, outputs_of
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.evaluate_quantities import LoadedField
-from wbgs_jax.inference.intervals import Expected, expected_ssim
+from wbgs_jax.inference.intervals import expected_power, expected_ssim
 from wbgs_jax.inference.kriging import SAME_PLACE_M, correct, for_receiver
 from wbgs_jax.inference.path_table import describe_interactions
 from wbgs_jax.inference.predictor import as_observed, check_power
 from wbgs_jax.inference.radio_map import Plane, evaluate_plane, pieces
-from wbgs_jax.inference.trained_field import TrainedField
+from wbgs_jax.inference.trained_field import at_receiver
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.radio.channel import Paths, decibels, delay_spread_s, k_factor_db
-from wbgs_jax.types import Query, make_query
+from wbgs_jax.radio.channel import NO_PATH_DB, Paths, decibels, delay_spread_s, k_factor_db
+from wbgs_jax.types import Query, Receiver, make_query
 
 
 @dataclass(frozen=True)
 class PathList:
-    """Paths of one link, the strongest first."""
+    """Paths of one link that carry power, the strongest first."""
 
     points: Float[np.ndarray, "k 5 3"]
     """Transmitter, points of reflection or diffraction, receiver; the receiver fills the rest. World frame, metres."""
@@ -51,6 +52,12 @@ class PathList:
         """Delays, nanoseconds."""
         return self.length / SPEED_OF_LIGHT * 1e9
 
+    def frequency_response_db(self, offsets_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Returns the response of an element at frequencies relative to the carrier, dB relative to the transmitted power. The
+        amplitudes of the paths at the carrier are used, which are nearly constant over bands of a few percent."""
+        turns = np.exp(-2j * np.pi * offsets_hz[:, None] * (self.length / SPEED_OF_LIGHT))
+        return np.asarray(decibels(jnp.asarray(np.abs(turns @ self.amplitude) ** 2)))
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -58,13 +65,19 @@ class Answer:
 
     pas: Float[np.ndarray, "90 360"]
     power_db: float | None
-    """Received power relative to the transmitted power; None if the field does not predict it."""
+    """Received power relative to the transmitted power; None if the field does not predict it, or if nothing is received."""
+    within_db: float | None
+    """Bound on the error of the power, ..."""
+    power_level: float | None
+    """... and its probability; None without a valid interval, as those that follow."""
     expected: tuple[float, float, float] | None
     """Expected SSIM and the ends of its interval, ..."""
     level: float | None
     """... and the probability of this interval."""
     paths: PathList | None
-    doubts: tuple[str, ...]
+    outside: bool
+    """Whether the transmitter is outside of the scene or inside a closed body."""
+    warnings: tuple[str, ...]
     """Warnings that the prediction is unreliable, one line each."""
 
 
@@ -82,28 +95,78 @@ class Sample:
     """SSIM of the prediction of the field for this link."""
 
 
-class Asker:
-    """A trained field that is queried for single transmitters.
+@dataclass(frozen=True)
+class LinkBudget:
+    """Transmitted power and noise, which make received powers absolute."""
 
-    Material properties and thicknesses can be changed; everything else is as trained.
+    transmitter_dbm: float
+    """Transmitted power, dBm."""
+    noise_dbm: float
+    """Noise in the bandwidth of the receiver, dBm."""
+
+    def received_dbm(self, power_db: Any) -> Any:
+        """Returns received powers in dBm from powers relative to the transmitted one (dB)."""
+        return power_db + self.transmitter_dbm
+
+    def snr_db(self, power_db: float) -> float:
+        """Returns the ratio of signal and noise (dB) of an element."""
+        return power_db + self.transmitter_dbm - self.noise_dbm
+
+
+class Session:
+    """A trained field that is queried for single transmitters at one receiver.
+
+    The receiver, and material properties and thicknesses can be changed; everything else is as trained.
     """
 
     def __init__(self, loaded: LoadedField):
-        self.loaded, self.trained, self.dataset, self.receiver = loaded, loaded.trained, loaded.dataset, loaded.receiver
-        self.plan = loaded.plan
-        self._neighbours, self._confidence = (
-            for_receiver(learned, self.receiver) for learned in (self.trained.correction, self.trained.intervals)
-        )
-        self._spectra = self._links_with_spectra()
+        self.dataset, self._whole = loaded.dataset, loaded.trained
         self._samples: dict[int, Sample] = {}
+        self.version = 0
+        """Number of changes of receiver and materials."""
+        self._use(loaded)
+
+    def _use(self, loaded: LoadedField) -> None:
+        self.loaded, self.trained, self.receiver, self.plan = loaded, loaded.trained, loaded.receiver, loaded.plan
+        learned = self.trained.correction, self.trained.intervals
+        self._neighbours, self._confidence = (for_receiver(one, self.receiver) for one in learned)
+        self._spectra = self._links_with_spectra()
+        self._changed()
+
+    def _changed(self) -> None:
+        self._samples.clear()
+        self.version += 1
+
+    def use_receiver(self, receiver: Receiver) -> None:
+        """Uses a receiver for later queries (`trained_field.at_receiver`), with materials as trained.
+
+        Raises:
+            UserError: the field does not predict this receiver.
+        """
+        trained = at_receiver(self._whole, receiver, self.dataset)
+        self._use(dataclasses.replace(self.loaded, trained=trained, receiver=receiver))
 
     @property
-    def knows_paths(self) -> bool:
+    def movable(self) -> bool:
+        """Whether the field predicts receivers that are not in its data."""
+        try:
+            self._whole.field.receiver_independent(self._whole.params)
+        except UserError:
+            return False
+        return True
+
+    @property
+    def has_paths(self) -> bool:
         """Whether the field predicts paths."""
         return "paths" in outputs_of(self.trained.field)
 
     @property
-    def knows_power(self) -> bool:
+    def has_gaussians(self) -> bool:
+        """Whether the field has Gaussians."""
+        return "gaussians" in self.trained.field.inspect(self.trained.params).sizes
+
+    @property
+    def has_power(self) -> bool:
         """Whether the field predicts received power."""
         try:
             check_power(self.trained.field, self.dataset)
@@ -111,23 +174,31 @@ class Asker:
             return False
         return True
 
-    def ask(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Answer:
+    def predict(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Answer:
         """Returns the prediction for a transmitter (world frame, metres)."""
-        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
-        learned = self._neighbours, self._confidence
-        found = _ask(self.trained.field, self.trained.params, self.plan, query, *learned, self.knows_paths)
-        pas, power, expected, paths = jax.tree.map(np.asarray, found)
-        place = np.asarray(position, np.float64)[None]
-        unreliable = self.loaded.domain.warnings(np.asarray(self.receiver.position), place, np.array([frequency_hz]))
-        expected = None if self.loaded.domain.outside(place)[0] else expected
+        learned = self._neighbours, self._confidence, self.trained.power_intervals
+        query = self._query(position, frequency_hz)
+        found = _predict(self.trained.field, self.trained.params, self.plan, query, self.receiver, *learned, self.has_paths)
+        pas, power, within, expected, paths = jax.tree.map(np.asarray, found)
+        place, hertz, domain = np.asarray(position, np.float64)[None], np.array([frequency_hz]), self.loaded.domain
+        outside = bool(domain.outside(place)[0])
+        valid = not (outside or domain.out_of_band(hertz)[0])
+        received = power is not None and self.has_power and power > NO_PATH_DB
         return Answer(
-            pas,
-            float(power) if power is not None and self.knows_power else None,
-            None if expected is None else tuple(float(value) for value in expected),  # type: ignore[arg-type]
-            None if self._confidence is None or expected is None else float(self._confidence.level),
-            None if paths is None else self._listed(*paths),
-            tuple(unreliable),
+            pas=pas,
+            power_db=float(power) if received else None,
+            within_db=float(within) if received and valid and within is not None else None,
+            power_level=None if learned[2] is None else float(learned[2].level),
+            expected=tuple(float(value) for value in expected) if valid and expected is not None else None,  # type: ignore[arg-type]
+            level=None if learned[1] is None else float(learned[1].level),
+            paths=None if paths is None else self._listed(*paths),
+            outside=outside,
+            warnings=tuple(domain.warnings(np.asarray(self.receiver.position), place, hertz)),
         )
+
+    @staticmethod
+    def _query(position: Float[np.ndarray, "3"], frequency_hz: float) -> Query:
+        return make_query(np.asarray(position)[None], np.array([frequency_hz]))
 
     def nearest_sample(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Sample | None:
         """Returns the observed spectrum nearest to a transmitter and frequency; None if the receiver has no spectra."""
@@ -142,16 +213,17 @@ class Asker:
             self._samples[link] = self._sample(link)
         return dataclasses.replace(self._samples[link], distance_m=float(away.min()))
 
-    def splatted(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> GaussianState | None:
+    def gaussians(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> GaussianState | None:
         """Returns the Gaussians with attenuation and signal (NumPy); None if the field has none."""
-        query = make_query(np.asarray(position)[None], np.array([frequency_hz]))
+        query = self._query(position, frequency_hz)
         found = self.trained.field.inspect(self.trained.params, self.plan, query).gaussians
         return jax.tree.map(np.asarray, found)
 
     def power_plane(
         self, plane: Plane, frequency_hz: float, progress: Callable[[float], None] = lambda share: None
     ) -> Float[np.ndarray, "ny nx"]:
-        """Returns the received power (dB) from transmitters all over a plane; `progress` receives the completed fraction."""
+        """Returns the received power from transmitters all over a plane, dB relative to the transmitted power; NaN where none
+        is received. `progress` receives the completed fraction; what it raises ends the work."""
         frequencies, done = np.array([frequency_hz]), 0
         total = pieces(plane, frequencies)
 
@@ -161,7 +233,8 @@ class Asker:
             progress(done / total)
 
         now = dataclasses.replace(self.loaded, trained=self.trained)
-        return evaluate_plane("power", now, plane, frequencies, advance)["power_db"][0]
+        power = evaluate_plane("power", now, plane, frequencies, advance)["power_db"][0]
+        return np.where(power > NO_PATH_DB, power, np.nan)
 
     def materials(self) -> tuple[tuple[str, ...], MaterialProperties] | None:
         """Returns the names and properties of the materials; None if the field has none."""
@@ -177,7 +250,7 @@ class Asker:
         own = found.field.with_material(found.of(self.trained.params), number, permittivity, conductivity)
         params = found.put(self.trained.params, own)
         self.trained = dataclasses.replace(self.trained, params=params)
-        self._samples.clear()
+        self._changed()
 
     def change_thickness(self, number: int, metres: float) -> None:
         """Changes the thickness of all walls of a material for later queries."""
@@ -185,17 +258,17 @@ class Asker:
         own, planned = found.field.with_thickness(found.of(self.plan), number, metres)
         field, self.plan = found.put(self.trained.field, own), found.put(self.plan, planned)
         self.trained = dataclasses.replace(self.trained, field=field)
-        self._samples.clear()
+        self._changed()
 
     def _calibratable(self) -> Ability[Calibratable]:
         found = self.trained.field.ability(Calibratable)
         assert found is not None, "only called for fields with `materials`"
         return found
 
-    def restore(self, trained: TrainedField) -> None:
-        """Uses `trained` for later queries, without changes of materials."""
-        self.trained, self.plan = trained, self.loaded.plan
-        self._samples.clear()
+    def restore(self) -> None:
+        """Uses the materials as trained for later queries."""
+        self.trained, self.plan = self.loaded.trained, self.loaded.plan
+        self._changed()
 
     def _links_with_spectra(self) -> Int[np.ndarray, " n"]:
         """Returns the indices of the links of this receiver with observed spectra."""
@@ -209,7 +282,7 @@ class Asker:
         data, index = self.dataset, np.array([link])
         position, frequency = data.tx_positions[link], float(data.frequencies_hz[link])
         truth = np.asarray(data.pas(index))
-        predicted = as_observed(self.trained.field, self.trained.params, self.ask(position, frequency).pas[None])
+        predicted = as_observed(self.trained.field, self.trained.params, self.predict(position, frequency).pas[None])
         parts = {"training": data.train, "validation": data.validation, "test": data.test}
         part = next((name for name, links in parts.items() if link in links), "other")
         return Sample(truth[0], position, frequency, 0.0, part, float(ssim(predicted, truth)[0]))
@@ -217,7 +290,7 @@ class Asker:
     def _listed(self, arrived: Paths, k_factor: np.ndarray, spread: np.ndarray) -> PathList:
         power = np.asarray(decibels(jnp.asarray(np.abs(arrived.amplitude) ** 2)))
         order = np.argsort(-power, kind="stable")
-        order = order[np.abs(arrived.amplitude[order]) > 0]
+        order = order[power[order] > NO_PATH_DB]
         kinds, materials = np.asarray(arrived.interaction)[order], np.asarray(arrived.material)[order]
         names = self.loaded.materials
         words = tuple(describe_interactions(*met, names) for met in zip(kinds, materials, strict=True))
@@ -226,20 +299,29 @@ class Asker:
         return PathList(points, amplitude, power[order], length, direction, kinds, words, float(k_factor), float(spread))
 
 
-def _answer(
-    field: Field, params: Any, plan: Any, query: Query, neighbours: Any, confidence: Any, with_paths: bool
-) -> tuple[Any, Any, Any, Any]:
-    """Returns spectrum, power, expected SSIM, and paths with K-factor and delay spread, for a batch of one query, without the
-    batch axis."""
+@partial(jax.jit, static_argnames="with_paths")
+def _predict(
+    field: Field,
+    params: Any,
+    plan: Any,
+    query: Query,
+    receiver: Receiver,
+    neighbours: Any,
+    confidence: Any,
+    of_power: Any,
+    with_paths: bool,
+) -> tuple[Any, ...]:
+    """Returns spectrum, power, the bound on its error, expected SSIM, and paths with K-factor and delay spread, for a batch of
+    one query, without the batch axis."""
     seen = field.render(params, plan, query)
     pas = correct(neighbours, seen.pas, query)
-    expected: Expected | None = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
+    expected = None if confidence is None else expected_ssim(confidence, pas, query, seen.power_db)
+    within = None
+    if of_power is not None and seen.power_db is not None:
+        within = expected_power(of_power, seen.power_db, query, receiver.position).within_db
     paths = None
     if with_paths:
         arrived = seen.paths
         assert arrived is not None, "the field predicts paths"
         paths = arrived, k_factor_db(arrived), delay_spread_s(arrived)
-    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, expected, paths))
-
-
-_ask = jax.jit(_answer, static_argnames="with_paths")
+    return jax.tree.map(lambda leaf: leaf[0], (pas, seen.power_db, within, expected, paths))

@@ -18,14 +18,24 @@ from wbgs_jax.viewer.session import PathList
 
 CEILING_CUT = 0.02
 """Fraction of the room's height that is initially cut off at the top, so that the interior is visible."""
-AXES_AWAY_M = 0.5
-"""Distance of the axes from the room, metres."""
 DOME_RADIUS = 0.4
 """Radius of the spectrum around the receiver, relative to the shortest side of the room."""
 HANDLE_RADIUS = 0.04
 """Radius of the clickable balls on paths, metres."""
 CHOSEN = np.array([[214, 39, 40]], np.uint8)
 """Colour of the chosen path."""
+VALID, INVALID = (31, 97, 180), (214, 39, 40)
+"""Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
+HANDLE_SHARE = 0.06
+"""Size of the arrows of transmitter and receiver, relative to that of the room."""
+BALL_M = 0.1
+ASIDE = (-0.08, -0.45, 0.6)
+"""Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes."""
+FIELD_OF_VIEW = float(np.radians(60))
+"""Vertical, of the camera."""
+WIDE_WINDOW, TALL_WINDOW = (0.0, 0.0, 0.88, 0.88), (0.0, 0.52, 0.9, 0.4)
+"""Parts of the picture in which the room is seen: middle and half size, relative to half of the picture. On a tall screen the
+panel covers the lower half."""
 MOST_GAUSSIANS = 20_000
 SPHERE = 8
 """Number of corners around a ball."""
@@ -34,26 +44,75 @@ SPHERE = 8
 class SceneView:
     """All objects with a position in the room."""
 
-    def __init__(self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver, up: str = "z"):
+    def __init__(
+        self, server: viser.ViserServer, dataset: Dataset, receiver: Receiver, start: Float[np.ndarray, "3"], up: str = "z"
+    ):
         self.scene, self.dataset, self.up = server.scene, dataset, "xyz".index(up)
         self.box = DatasetScene(dataset).box
         self.size = float(np.ptp(self.box, axis=0).max())
-        self.rx = np.asarray(receiver.position, float)
-        self._rotation = np.asarray(rotation_matrix(receiver.orientation), float)
         self.scene.set_up_direction(np.eye(3)[self.up])
         self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
-        self._draw_fixed(receiver)
+        self._draw_fixed()
+        self.receiver_frame = self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012)
+        self.scene.add_label("/receiver/name", "receiver", position=(0, 0, 0.12))
+        self.receiver_handle: viser.TransformControlsHandle | None = None
+        self.show_receiver(receiver)
+        self.transmitter = self.scene.add_transform_controls(
+            "/transmitter", self.handle_size, disable_rotations=True, position=tuple(start)
+        )
+        self._ball = self.scene.add_icosphere("/transmitter/ball", BALL_M, VALID)
+        self.scene.add_label("/transmitter/name", "transmitter", position=(0, 0, 0.15))
         self.clip(*self.heights())
+
+    @property
+    def handle_size(self) -> float:
+        """Length of the arrows of transmitter and receiver, metres."""
+        return HANDLE_SHARE * self.size
+
+    @property
+    def dome_radius(self) -> float:
+        """Largest distance of the drawn spectrum from the receiver, metres."""
+        return DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
+
+    def show_receiver(self, receiver: Receiver) -> None:
+        """Shows the receiver at its place."""
+        self.rx = np.asarray(receiver.position, float)
+        self._rotation = np.asarray(rotation_matrix(receiver.orientation), float)
+        self.receiver_frame.position = tuple(self.rx)
+        self.receiver_frame.wxyz = tuple(np.asarray(receiver.orientation, float))
+
+    def add_receiver_handle(self) -> viser.TransformControlsHandle:
+        """Returns arrows by which the receiver is dragged."""
+        self.receiver_handle = self.scene.add_transform_controls(
+            "/receiver_handle", 1.15 * self.dome_radius, disable_rotations=True, position=tuple(self.rx)
+        )
+        return self.receiver_handle
+
+    def mark_transmitter(self, valid: bool) -> None:
+        """Colours the transmitter by whether its predictions are valid."""
+        color = VALID if valid else INVALID
+        if tuple(self._ball.color) != color:
+            self._ball.color = color
+
+    def camera(self, aspect: float) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Returns position and target of a camera that sees the whole room in a picture of an aspect (width over height)."""
+        if aspect < 1:  # the longest horizontal axis recedes, which uses a tall picture best
+            flat = [axis for axis in range(3) if axis != self.up]
+            turned = int(np.ptp(self.box, axis=0)[flat].argmax()) == 0
+        else:
+            turned = False
+        aside = np.array([ASIDE[1], ASIDE[0], ASIDE[2]] if turned else ASIDE)
+        direction = np.roll(aside, self.up - 2)
+        return camera_of(self.box, direction, np.eye(3)[self.up], aspect, TALL_WINDOW if aspect < 1 else WIDE_WINDOW)
 
     def heights(self) -> tuple[float, float]:
         """Returns the initial range of drawn heights, which excludes the ceiling."""
         low, high = self.box[:, self.up]
         return float(low), float(high - CEILING_CUT * (high - low))
 
-    def _draw_fixed(self, receiver: Receiver) -> None:
+    def _draw_fixed(self) -> None:
         low, high = self.box
-        corner = low + np.array([high[0] - low[0] + AXES_AWAY_M, 0.0, 0.0])
-        self.scene.add_frame("/axes", axes_length=1.0, axes_radius=0.02, position=corner)
+        self.scene.add_frame("/axes", axes_length=1.0, axes_radius=0.02, position=low)
         for axis, name in enumerate("xyz"):
             self.scene.add_label(f"/axes/{name}", f"{name}, 1 m", position=np.eye(3)[axis] * 1.1)
         flat = [axis for axis in range(3) if axis != self.up]
@@ -62,9 +121,6 @@ class SceneView:
         under[self.up] = low[self.up] - 0.01
         plane: Literal["xy", "xz", "yz"] = ("yz", "xz", "xy")[self.up]
         self.scene.add_grid("/grid", float(width), float(height), plane=plane, cell_size=1.0, position=under, fade_strength=0)
-        orientation = np.asarray(receiver.orientation, float)
-        self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012, position=self.rx, wxyz=orientation)
-        self.scene.add_label("/receiver/name", "receiver", position=(0, 0, 0.12))
         places = np.unique(self.dataset.tx_positions, axis=0)
         self.samples = self.scene.add_point_cloud(
             "/samples", places.astype(np.float32), (90, 90, 90), point_size=0.035, point_shape="circle", visible=False
@@ -95,7 +151,7 @@ class SceneView:
 
     def draw_dome(self, pas: Float[np.ndarray, "90 360"]) -> None:
         """Draws the received spectrum around the receiver."""
-        radius = DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
+        radius = self.dome_radius
         points, colors = drawing.dome(pas, self._rotation, radius)
         self.scene.add_point_cloud(
             "/dome",
@@ -169,17 +225,80 @@ class SceneView:
             np.clip(attenuation, 0.05, 1.0)[:, None].astype(np.float32),
         )
 
-    def draw_map(self, values: Float[np.ndarray, "ny nx"] | None, plane: Plane | None) -> tuple[float, float]:
-        """Draws a map on its plane; None removes it. Returns the values of the first and the last colour."""
-        if values is None or plane is None:
-            self.scene.remove_by_name("/map")
-            return 0.0, 0.0
-        picture, low, high = drawing.map_picture(values)
+    def remove_map(self) -> None:
+        """Removes the map."""
+        self.scene.remove_by_name("/map")
+
+    def draw_map(
+        self,
+        values: Float[np.ndarray, "ny nx"],
+        plane: Plane,
+        span: tuple[float, float],
+        dim: bool,
+        on_click: Callable[[float, float], None],
+    ) -> None:
+        """Draws a map on its plane.
+
+        Args:
+            values: powers; NaN where nothing is received.
+            plane: their places.
+            span: values of the first and the last colour.
+            dim: whether the map is shown as an outdated one.
+            on_click: called with the place (x, y) of a click on the map, metres.
+        """
+        picture = drawing.map_picture(values, *span, dim)
         middle = np.array([(plane.xs[0] + plane.xs[-1]) / 2, (plane.ys[0] + plane.ys[-1]) / 2, plane.height])
         width, height = (float(np.ptp(a)) * len(a) / max(len(a) - 1, 1) for a in (plane.xs, plane.ys))
         # The first row of the image is its upper edge; it is rotated about x, so that y decreases along rows and it faces up.
-        self.scene.add_image("/map", picture, width, height, position=middle, wxyz=(0.0, 1.0, 0.0, 0.0), format="png")
-        return low, high
+        turned = (0.0, 1.0, 0.0, 0.0)
+        handle = self.scene.add_image("/map", picture, width, height, position=middle, wxyz=turned, format="png")
+
+        @handle.on_click
+        def _(event: viser.SceneNodePointerEvent) -> None:
+            origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+            if abs(direction[2]) > 1e-6:
+                x, y, _ = origin + (plane.height - origin[2]) / direction[2] * direction
+                on_click(float(x), float(y))
+
+
+def camera_of(
+    box: Float[np.ndarray, "2 3"],
+    direction: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+    aspect: float,
+    window: tuple[float, float, float, float],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Returns position and target of a camera that sees a box inside a part of its picture.
+
+    Args:
+        box: lowest and highest corner, metres.
+        direction: from the box to the camera.
+        up: upward direction, a unit vector.
+        aspect: width over height of the picture.
+        window: middle (right, up) and half size of the part, relative to half of the picture.
+    """
+    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    forward = -direction / np.linalg.norm(direction)
+    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    axes = np.stack([right, np.cross(right, forward), forward])
+    slope = np.tan(FIELD_OF_VIEW / 2)
+    middle, half = np.array(window[:2]), np.array(window[2:])
+    near, far = 1e-3, 20 * float(np.linalg.norm(box[1] - box[0]))
+    position = target = box.mean(0)
+    for _ in range(40):
+        away = (near + far) / 2
+        position = box.mean(0) - away * forward
+        for _ in range(4):  # moves the camera sideways until the box is in the middle of the part
+            seen = (corners - position) @ axes.T
+            ends = seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) / (slope * np.array([aspect, 1.0]))
+            off = (ends.min(0) + ends.max(0)) / 2 - middle
+            position = position + (off * slope * np.array([aspect, 1.0]) * away) @ axes[:2]
+        seen = (corners - position) @ axes.T
+        ends = seen[:, :2] / np.maximum(seen[:, 2:], 1e-6) / (slope * np.array([aspect, 1.0]))
+        fits = (seen[:, 2] > 0.1).all() and (np.abs(ends - middle) <= half + 0.02).all()
+        near, far = (near, away) if fits else (away, far)
+        target = position + away * forward
+    return position, target
 
 
 def _ball(radius: float) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
