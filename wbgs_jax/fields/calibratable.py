@@ -66,6 +66,20 @@ class Calibratable(Field):
         """Returns the field without some rigid bodies, given by their indices (host)."""
 
     @abstractmethod
+    def in_common_shapes(self, prepared: PreparedPaths, elements: int) -> tuple["Calibratable", PreparedPaths]:
+        """Returns a field and paths that render as before, but share programs with those of a similar field: with a few bodies
+        fewer, a material for every body, or array gains (host). Without prepared paths the field cannot be used.
+
+        Args:
+            prepared: paths of the field.
+            elements: number of elements of a receiver.
+        """
+
+    @abstractmethod
+    def params_in_common_shapes(self, params: WaveParams) -> WaveParams:
+        """Returns parameters, whose leaves may have a leading axis, for `in_common_shapes` (host)."""
+
+    @abstractmethod
     def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "Calibratable":
         """Returns the field with the array gains of its receivers multiplied by these complex gains."""
 

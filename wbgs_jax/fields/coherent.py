@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax._util.pytree import pytree, static, to_device
+from wbgs_jax._util.pytree import pytree, replaced, static, to_device
 from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, heard_alone, register
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
@@ -40,7 +40,7 @@ from wbgs_jax.fields.coherent_model import (
 )
 from wbgs_jax.fields.coherent_settings import PRESETS, WaveConfig
 from wbgs_jax.fields.losses import snapshot_losses
-from wbgs_jax.mesh.edges import Edges, edges_of_facets, padded_edges
+from wbgs_jax.mesh.edges import Edges, common_size, edges_of_facets, padded_edges, padded_to
 from wbgs_jax.mesh.facets import Facets, remaining
 from wbgs_jax.mesh.facets import moved as move_facets
 from wbgs_jax.mesh.simplification import facets_that_fit
@@ -230,6 +230,41 @@ class WaveField(Calibratable):
     def _of(self, facets: Facets, motion: Motion) -> "WaveField":
         parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
         return dataclasses.replace(self, **{name: to_device(part) for name, part in parts.items()})
+
+    def in_common_shapes(self, prepared: PreparedPaths, elements: int) -> tuple["WaveField", PreparedPaths]:
+        """Returns the field without what prepared paths do not need, and these paths with padded surfaces (host)."""
+
+        def nothing(part: Any) -> Any:
+            return jax.tree.map(lambda leaf: leaf[:0], part)
+
+        gains: Any = self.tuning
+        materials = common_size(max(len(self.known_thickness), len(self.motion.shift)))
+        if gains is None and len(self.receivers):
+            gains = np.zeros((len(self.receivers), elements, 2), np.float32)
+        slim = replaced(
+            self,
+            facets=nothing(self.facets),
+            edges=nothing(self.edges),
+            first_placement=nothing(self.first_placement),
+            motion=dataclasses.replace(self.motion, shift=nothing(self.motion.shift), turn=nothing(self.motion.turn)),
+            known_thickness=padded_to(materials, self.known_thickness),
+            tuning=gains,
+            first_clutter=None,
+        )
+        surfaces = jax.tree.map(lambda leaf: padded_to(common_size(len(leaf)), leaf), prepared.surfaces)
+        return to_device(slim), dataclasses.replace(prepared, surfaces=to_device(surfaces))
+
+    def params_in_common_shapes(self, params: WaveParams) -> WaveParams:
+        """Returns parameters, whose leaves may have a leading axis, with sizes as in `in_common_shapes` (host)."""
+        bodies = len(self.motion.shift)
+        places, last = params.placement[..., :-1], params.placement[..., -1:]
+        materials = common_size(max(len(self.known_thickness), bodies))
+        return replaced(
+            params,
+            materials=jax.tree.map(lambda leaf: padded_to(materials, leaf, -1), params.materials),
+            facet_correction=padded_to(common_size(params.facet_correction.shape[-2]), params.facet_correction, -2),
+            placement=np.concatenate([padded_to(common_size(bodies), places, -1), last], -1),
+        )
 
     def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field with the array gains of its receivers multiplied by these complex gains."""

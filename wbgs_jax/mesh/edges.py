@@ -141,6 +141,19 @@ def padded_size(count: int) -> int:
     return -(-count // step) * step
 
 
+def common_size(count: int) -> int:
+    """Returns the next larger power of two, or three quarters of it: a size that a few rows more or fewer rarely change."""
+    power = 1 << max(count - 1, 0).bit_length()
+    return power * 3 // 4 if count <= power * 3 // 4 else power
+
+
+def padded_to(size: int, rows: Shaped[AnyArray, "..."], axis: int = 0) -> Shaped[np.ndarray, "..."]:
+    """Returns an array padded to a size along an axis with copies of its last row."""
+    missing = [(0, 0)] * rows.ndim
+    missing[axis] = 0, size - rows.shape[axis]
+    return np.pad(np.asarray(rows), missing, "edge") if rows.shape[axis] else np.asarray(rows)
+
+
 def padded_edges(edges: Edges) -> Edges:
     """Returns edges followed by copies of the first one with zero length, which diffract nothing (host)."""
     count = len(edges.length)

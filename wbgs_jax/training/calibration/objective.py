@@ -63,14 +63,17 @@ def make_scores(
         spectra: indices of the links.
         compared: the compared quantity.
     """
-
     by = _comparable(compared, data)
+
+    @functools.cache
+    def common() -> tuple[Calibratable, PreparedPaths]:
+        return field.in_common_shapes(prepared, data.receivers.element_positions.shape[-2])
 
     @functools.cache
     def block(start: int) -> tuple[PreparedPaths, Batch]:
         """Returns the data of the block of spectra from `start` on; the last block is padded by repeating the last spectrum."""
         own = spectra[np.minimum(np.arange(start, start + AT_ONCE), len(spectra) - 1)]
-        return _looked_at(field, prepared, data, own)
+        return _looked_at(common()[1], data, own)
 
     def score(candidates: Sequence[WaveParams], first: int | None = None) -> Float[np.ndarray, "k n"]:
         if len(candidates) > MOST:
@@ -79,8 +82,9 @@ def make_scores(
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         own = tuple(np.ndim(column[0]) < 2 or any(leaf is not column[0] for leaf in column) for column in columns)
         leaves = tuple(_rows(column) if of_candidate else column[0] for of_candidate, column in zip(own, columns, strict=True))
-        some = np.int32(len(candidates))
-        found = [_score(field, structure, own, leaves, some, *block(start), by) for start in range(0, count, AT_ONCE)]
+        leaves = tuple(jax.tree.leaves(field.params_in_common_shapes(jax.tree.unflatten(structure, leaves))))
+        slim, some = common()[0], np.int32(len(candidates))
+        found = [_score(slim, structure, own, leaves, some, *block(start), by) for start in range(0, count, AT_ONCE)]
         return np.concatenate([np.asarray(part) for part in found], 1)[: len(candidates), :count]
 
     return score
@@ -126,9 +130,7 @@ def _rows(column: Sequence[Array]) -> Float[np.ndarray, "..."]:
 
 
 @jax.jit
-def _looked_at(
-    field: Calibratable, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " m"]
-) -> tuple[PreparedPaths, Batch]:
+def _looked_at(prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " m"]) -> tuple[PreparedPaths, Batch]:
     """Returns the prepared paths of a block of spectra, and their observations: a batch of one link each."""
     links: Links = jax.tree.map(lambda leaf: leaf[spectra], data.links)
     return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
