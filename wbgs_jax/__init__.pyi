@@ -19,6 +19,7 @@ from .applications.reflector import Reflector as Reflector
 from .applications.reflector import place_reflector as place_reflector
 from .applications.reflector import reflector as reflector
 from .applications.reflector import straight_powers as straight_powers
+from .data.antenna_file import read_antenna as read_antenna
 from .data.floor_plan import load_walls as load_walls
 from .data.load import load_dataset as load_dataset
 from .data.room_file import load_room as load_room
@@ -74,6 +75,7 @@ from .interchange.scenes import scene_of_snapshots as scene_of_snapshots
 from .interchange.sionna_arrays import scene_of_sionna as scene_of_sionna
 from .power_map.model import learn_map as learn_map
 from .power_map.model import received_power as received_power
+from .radio.antenna import Antenna as Antenna
 from .radio.array import cbf as cbf
 from .radio.array import pas_directions as pas_directions
 from .radio.array import planar_array as planar_array
@@ -92,6 +94,7 @@ from .types import Mesh as Mesh
 from .types import Query as Query
 from .types import Receiver as Receiver
 from .types import Surface as Surface
+from .types import Transmitter as Transmitter
 from .types import make_query as make_query
 from .types import make_receiver as make_receiver
 from .types import stack_receivers as stack_receivers
