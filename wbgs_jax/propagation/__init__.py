@@ -1,1 +1,2 @@
-"""Ray tracing over a mesh and the received field: facets -> edges -> image_method -> paths -> materials, utd -> transport."""
+"""Ray tracing over a mesh and the received field: facets -> edges -> image_method -> paths -> materials, utd -> transport ->
+mechanisms."""

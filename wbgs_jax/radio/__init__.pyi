@@ -1,3 +1,4 @@
+from .antenna import Antenna as Antenna
 from .array import cbf as cbf
 from .array import pas_directions as pas_directions
 from .array import planar_array as planar_array

@@ -102,10 +102,10 @@ class Antenna:
     def field(self, direction: Float[Array, "*m 3"]) -> Inexact[Array, "*m 3"]:
         """Returns the polarised amplitude gain of one antenna in unit directions: a vector across each direction."""
         own = direction if self.orientation is None else to_local(direction, self.orientation)
+        gain = _parametric_gain(own, self.exponents)
+        rotation = None if self.orientation is None else rotation_matrix(self.orientation)
         field = zenith_vector(own) if self.pattern is None else self.pattern.at(own)
-        if self.orientation is not None:
-            field = jnp.matmul(field, rotation_matrix(self.orientation).T, precision=EXACT)
-        return _parametric_gain(own, self.exponents)[..., None] * field
+        return gain[..., None] * (field if rotation is None else jnp.matmul(field, rotation.T, precision=EXACT))
 
     def parametric_gain(self, direction: Float[Array, "*m 3"]) -> Float[Array, "*m"]:
         """Returns the amplitude gain of the two parametric patterns of one antenna in unit directions."""
