@@ -43,7 +43,7 @@ ON_THE_HOST = frozenset(
 """Public functions that read and write, prepare, or make the functions that a device runs: those of the predictors, the locator
 and `power_at_users` are cases."""
 N, B, FEW = 200, 2, 8
-"""Gaussians and queries, and Gaussians of small cases."""
+"""Gaussians and queries, and Gaussians of the stand-in."""
 TINY_WAVE: dict[str, Any] = {
     "specular_tried": 64,
     "specular_kept": 32,
@@ -105,9 +105,9 @@ def _weighted(leaf: Any) -> Any:
     return jnp.sum(jnp.where(finite, leaf, 0) * weights)
 
 
-def splatting(small: bool = False) -> list[Case]:
-    """Returns the cases of the renderer and its parts; small ones are quick where kernels are interpreted."""
-    scene = _small_scene() if small else random_scene(N, B, SEED)
+def splatting(few: int = 0) -> list[Case]:
+    """Returns the cases of the renderer and its parts; of few Gaussians they are quick where kernels are interpreted."""
+    scene = _small_scene(few) if few else random_scene(N, B, SEED)
     receiver, limits = scene.receiver, scene.limits
     planned = scene.gaussians, scene.attenuation, scene.signal
 
@@ -124,9 +124,9 @@ def splatting(small: bool = False) -> list[Case]:
     ]
 
 
-def _small_scene() -> RandomScene:
-    """Returns few Gaussians, whose tile lists have no room to spare: every job in them is interpreted, empty or not."""
-    scene = random_scene(FEW, B, SEED)
+def _small_scene(n: int) -> RandomScene:
+    """Returns Gaussians whose tile lists have no room to spare: every job in them is interpreted, empty or not."""
+    scene = random_scene(n, B, SEED)
     jobs = wb.splat.geometry_plan(scene.gaussians, scene.receiver, scene.limits).jobs
     exact = {"entries": int(jobs.required_entries), "jobs": int(jobs.required_jobs)}
     return dataclasses.replace(scene, limits=dataclasses.replace(scene.limits, **exact))
@@ -371,5 +371,5 @@ ROOMS: dict[str, Callable[[], list[Case]]] = {
     "placing": placing,
 }
 """Makers of cases."""
-SMALL_ROOMS: dict[str, Callable[[], list[Case]]] = {"splatting": functools.partial(splatting, small=True), "arrays": arrays}
+SMALL_ROOMS: dict[str, Callable[[], list[Case]]] = {"splatting": functools.partial(splatting, FEW), "arrays": arrays}
 """Those of the stand-in."""

@@ -1,5 +1,6 @@
 """What a GPU would be given, without one: every public function lowers for CUDA, and says what the CPU's program says."""
 
+import functools
 import importlib.util
 import inspect
 import re
@@ -11,16 +12,17 @@ import pytest
 import wbgs_jax as wb
 from experiments.gpu_check import cases as cases_module
 from experiments.gpu_check import compiled, parity
-from experiments.gpu_check.cases import AIMS, ON_THE_HOST, ROOMS
+from experiments.gpu_check.cases import AIMS, ON_THE_HOST, ROOMS, splatting
 from experiments.profiles import TINY
 
 FREE = {"wbgs_jax/fields/networks.py"}
 """Files whose matrix products may leave their precision to the device."""
 OF_A_CPU = ("lapack", "blas", "cpu", "ducc", "callback")
 """Parts of the names of code that only a CPU calls."""
-RUN = ("splatting", "statistics", "powers")
-"""Rooms whose programs for CUDA are also run, on this CPU; `make test-slow` runs all."""
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ROOMS if name not in RUN]
+RUN = {"splatting": functools.partial(splatting, 40), "statistics": ROOMS["statistics"], "powers": ROOMS["powers"]}
+"""Rooms whose programs for CUDA are also run, on this CPU, the kernels interpreted for few Gaussians ..."""
+RUN_SLOWLY = [pytest.param(name, make, marks=pytest.mark.slow) for name, make in ROOMS.items() if make not in RUN.values()]
+"""... and by `make test-slow`, with those that have many."""
 
 
 def products_without_precision(jaxpr):
@@ -62,11 +64,11 @@ def test_every_public_function_is_a_case_or_belongs_to_the_host():
 @pytest.mark.heavy
 @pytest.mark.long
 @pytest.mark.skipif(not parity.STANDS_IN, reason="the compiler of this jaxlib ends the process at programs for CUDA on a CPU")
-@pytest.mark.parametrize("room", [*RUN, *SLOW])
-def test_the_program_for_cuda_says_on_this_cpu_what_its_own_says(room):
+@pytest.mark.parametrize(("room", "make"), [*RUN.items(), *RUN_SLOWLY])
+def test_the_program_for_cuda_says_on_this_cpu_what_its_own_says(room, make):
     """The renderer's fused kernels, interpreted, among them."""
     cpu = jax.devices("cpu")[0]
-    for case in ROOMS[room]():
+    for case in make():
         found = parity.compare(case, cpu, cpu)
         assert found["holds"] and (room != "splatting" or found["pinned"]), (case.name, found)
         assert found["values"] < 1e-4 and found["gradients"] < 1e-3, (case.name, found)
