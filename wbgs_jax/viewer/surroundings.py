@@ -28,6 +28,8 @@ VALID, INVALID = (31, 97, 180), (214, 39, 40)
 """Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
 HANDLE_SHARE = 0.06
 """Size of the arrows of transmitter and receiver, relative to that of the room."""
+AMBIENT = 2.0
+"""Intensity of the light from all sides."""
 BALL_M = 0.1
 ASIDE = (-0.08, -0.45, 0.6)
 """Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes."""
@@ -51,6 +53,10 @@ class SceneView:
         self.box = DatasetScene(dataset).box
         self.size = float(np.ptp(self.box, axis=0).max())
         self.scene.set_up_direction(np.eye(3)[self.up])
+        # Shadows and reflections of the surroundings take four fifths of the time of a picture without a graphics card.
+        self.scene.configure_default_lights(cast_shadow=False)
+        self.scene.configure_environment_map(hdri=None)
+        self.scene.add_light_ambient("/light", intensity=AMBIENT)
         self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
         self._draw_fixed()
         self.receiver_frame = self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012)
