@@ -265,9 +265,10 @@ class Viewer:
         self._follow_receiver()
         position, frequency, c, d = self.position, self.frequency_hz, self.controls, self.display
         answer = self.answer = self.session.predict(position, frequency)
+        d.spectrum.content = panel.spectrum_figure(answer.pas)
+        d.summary.content = panel.summary(answer, frequency, c.budget, self.session.has_power)
+        self.server.flush()  # the panel does not wait for the room, which takes longer to draw
         with self.server.atomic():
-            d.spectrum.content = panel.spectrum_figure(answer.pas)
-            d.summary.content = panel.summary(answer, frequency, c.budget, self.session.has_power)
             self.view.mark_transmitter(not answer.outside)
             self.view.draw_dome(answer.pas)
             self._draw_paths()

@@ -11,7 +11,7 @@ from wbgs_jax.radio.array import pas_directions
 
 COLORS = "viridis"
 """Colormap of spectra and maps."""
-DOME_STRIDE = 3
+DOME_STRIDE = 4
 """Stride of the directions that are drawn at the receiver, along both axes."""
 PATH_RANGE_DB = 40.0
 """Range of the colours of paths below the strongest one; weaker paths fade ..."""

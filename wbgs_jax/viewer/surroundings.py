@@ -20,6 +20,8 @@ CEILING_CUT = 0.02
 """Fraction of the room's height that is initially cut off at the top, so that the interior is visible."""
 DOME_RADIUS = 0.4
 """Radius of the spectrum around the receiver, relative to the shortest side of the room."""
+DOME_POINT = 0.045
+"""Size of a point of the spectrum, relative to that radius."""
 HANDLE_RADIUS = 0.04
 """Radius of the clickable balls on paths, metres."""
 CHOSEN = np.array([[214, 39, 40]], np.uint8)
@@ -28,6 +30,8 @@ VALID, INVALID = (31, 97, 180), (214, 39, 40)
 """Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
 HANDLE_SHARE = 0.06
 """Size of the arrows of transmitter and receiver, relative to that of the room."""
+AMBIENT = 2.0
+"""Intensity of the light from all sides."""
 BALL_M = 0.1
 ASIDE = (-0.08, -0.45, 0.6)
 """Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes."""
@@ -51,10 +55,15 @@ class SceneView:
         self.box = DatasetScene(dataset).box
         self.size = float(np.ptp(self.box, axis=0).max())
         self.scene.set_up_direction(np.eye(3)[self.up])
+        # Shadows and reflections of the surroundings take four fifths of the time of a picture without a graphics card.
+        self.scene.configure_default_lights(cast_shadow=False)
+        self.scene.configure_environment_map(hdri=None)
+        self.scene.add_light_ambient("/light", intensity=AMBIENT)
         self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
         self._draw_fixed()
         self.receiver_frame = self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012)
         self.scene.add_label("/receiver/name", "receiver", position=(0, 0, 0.12))
+        self._dome: viser.PointCloudHandle | None = None
         self.receiver_handle: viser.TransformControlsHandle | None = None
         self.show_receiver(receiver)
         self.transmitter = self.scene.add_transform_controls(
@@ -153,13 +162,13 @@ class SceneView:
         """Draws the received spectrum around the receiver."""
         radius = self.dome_radius
         points, colors = drawing.dome(pas, self._rotation, radius)
-        self.scene.add_point_cloud(
-            "/dome",
-            (points + self.rx).astype(np.float32),
-            colors,
-            point_size=0.04 * radius,
-            point_shape="circle",
-        )
+        places = (points + self.rx).astype(np.float32)
+        if self._dome is None:
+            self._dome = self.scene.add_point_cloud(
+                "/dome", places, colors, point_size=DOME_POINT * radius, point_shape="circle"
+            )
+        else:  # changing the points is faster than drawing new ones
+            self._dome.points, self._dome.colors = places, colors
 
     def draw_paths(
         self, paths: PathList | None, count: int, by_power: bool, chosen: int | None, on_click: Callable[[int], None]
