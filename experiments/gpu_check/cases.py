@@ -35,7 +35,7 @@ ON_THE_HOST = frozenset(
     from_deepmimo from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings load_room
     load_scene load_trained load_walls locator make_mesh make_query make_receiver make_surface map_queries measure_limits
     pas_directions place_reflector planar_array power_at_users power_predictor power_when_turned predict_blocks
-    predict_many predict_map predictor pytree rank_beams read_deepmimo read_gaussians register save_paths
+    predict_many predict_map predictor pytree rank_beams read_antenna read_deepmimo read_gaussians register save_paths
     save_scene scene_of_paths scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers
     surface_from_points write_deepmimo write_gaussians
     """.split()  # noqa: SIM905
