@@ -77,7 +77,8 @@ class LoadedField:
 
     def query(self, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Query:
         """Returns queries for every transmitter at every frequency, which varies fastest."""
-        return make_query(*Queries(tx_positions, frequencies_hz).flat())
+        velocity = self.options.tx_velocity if np.any(self.options.tx_velocity) else None
+        return make_query(*Queries(tx_positions, frequencies_hz).flat(), velocity=velocity)
 
     def evaluate(
         self, what: str, tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]
@@ -241,10 +242,9 @@ def _delay_spread(arrivals: Paths, *_: Any) -> Array:
 
 def _paths(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:
     """Returns a table (`path_table`)."""
-    velocities = at.options.tx_velocity, at.options.rx_velocity
     field, params = at.trained.field, at.trained.params
     query = at.query(tx_positions, frequencies_hz)
-    return path_table(field, params, at.plan, query, tx_positions, frequencies_hz, velocities, at.materials)
+    return path_table(field, params, at.plan, query, tx_positions, frequencies_hz, at.options.rx_velocity, at.materials)
 
 
 def _frequency_response(at: LoadedField, tx_positions: np.ndarray, frequencies_hz: np.ndarray) -> Answer:

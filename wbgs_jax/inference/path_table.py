@@ -24,7 +24,7 @@ def path_table(
     queries: Query,
     tx_positions: Float[np.ndarray, "tx 3"],
     frequencies_hz: Float[np.ndarray, " freq"],
-    velocities: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]],
+    rx_velocity: Float[np.ndarray, "3"],
     materials: tuple[str, ...],
 ) -> dict[str, np.ndarray]:
     """Returns a table with one row per path as columns by name: link, interactions, length, delay, angles, amplitudes and
@@ -41,14 +41,14 @@ def path_table(
         queries: of every transmitter at every frequency, which varies fastest.
         tx_positions: world frame, metres.
         frequencies_hz: carrier frequencies.
-        velocities: velocities of transmitter and receiver, metres per second, world frame.
+        rx_velocity: velocity of the receiver, metres per second, world frame.
         materials: names of the materials by index; materials without a name are numbered.
     """
-    moving, tables = [jnp.asarray(velocity, jnp.float32) for velocity in velocities], []
+    moving, tables = jnp.asarray(rx_velocity, jnp.float32), []
     for number, position in enumerate(tx_positions):
         for column, frequency in enumerate(frequencies_hz):
             row = number * len(frequencies_hz) + column
-            found, shift = _link(field, params, plan, jax.tree.map(lambda leaf, i=row: leaf[i : i + 1], queries), *moving)
+            found, shift = _link(field, params, plan, jax.tree.map(lambda leaf, i=row: leaf[i : i + 1], queries), moving)
             link = {"tx": number, "x": position[0], "y": position[1], "z": position[2], "frequency_ghz": frequency / 1e9}
             tables.append(_rows(jax.tree.map(np.asarray, found), np.asarray(shift), link, materials))
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
@@ -56,10 +56,12 @@ def path_table(
 
 @jax.jit
 def _link(
-    field: Field, params: Any, plan: Any, query: Query, tx_velocity: Array, rx_velocity: Array
+    field: Field, params: Any, plan: Any, query: Query, rx_velocity: Float[Array, "3"]
 ) -> tuple[Paths, Float[Array, " k"]]:
     """Returns the paths of one query and their Doppler shifts."""
     found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))
+    velocity = query.transmitter.velocity
+    tx_velocity = jnp.zeros(3) if velocity is None else velocity[0]
     return found, doppler_hz(found, query.frequency_hz[0], tx_velocity, rx_velocity)
 
 

@@ -23,6 +23,7 @@ from experiments.jobs import Job
 from experiments.results import Results
 from wbgs_jax._util.files import read_json, read_yaml
 from wbgs_jax.data import load_dataset, save_scene
+from wbgs_jax.data.antenna_file import read_antenna
 from wbgs_jax.data.floor_plan import load_walls
 from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.data.room_file import Room, load_room, save_room
@@ -243,6 +244,16 @@ def _make_batch(folder: Path) -> None:
     np.savez(folder / "0000.npz", n_paths=np.ones((4, 2), int), snapshots=np.ones((4, 2, 16), np.complex64))
 
 
+def _make_antennas(folder: Path) -> None:
+    """The same pattern as a table, as an archive and as two cuts."""
+    rows = [f"{azimuth},{zenith},3" for zenith in range(0, 181, 45) for azimuth in range(0, 360, 90)]
+    (folder / "a.csv").write_text("\n".join(["azimuth_deg,zenith_deg,gain_dbi", *rows]))
+    zenith, azimuth = np.radians(np.arange(0, 181, 45)), np.radians(np.arange(0, 360, 90))
+    np.savez(folder / "a.npz", e_theta=np.ones((5, 4), complex), e_phi=np.ones((5, 4), complex), zenith=zenith, azimuth=azimuth)
+    cut = [f"{i} {i % 7}" for i in range(360)]
+    (folder / "a.msi").write_text("\n".join(["GAIN 3 dBi", "HORIZONTAL 360", *cut, "VERTICAL 360", *cut]))
+
+
 READABLES: dict[str, Readable] = {
     "scene file": Readable(lambda f: save_scene(f / "scene.npz", tiny_scene()), lambda f: load_dataset(f / "scene.npz")),
     "scene file of powers": Readable(
@@ -292,5 +303,6 @@ READABLES: dict[str, Readable] = {
     "room in GLB": Readable(lambda f: _make_room(f, ".glb"), lambda f: _read_room(f, ".glb"), "room.glb"),
     "room in Mitsuba's XML": Readable(_make_xml, lambda f: _read_room(f, ".xml")),
     "room file": Readable(_make_room_file, lambda f: load_room(f / "room.npz")),
+    "antenna patterns": Readable(_make_antennas, lambda f: [read_antenna(path) for path in sorted(f.glob("a.*"))]),
     "batch of the generator": Readable(_make_batch, lambda f: batches._load(f / "0000.npz")),
 }
