@@ -202,7 +202,7 @@ class WaveField(Calibratable):
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of predictions on a batch."""
         config = self.config
-        loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight)
+        loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight, config.ssim_stride)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss

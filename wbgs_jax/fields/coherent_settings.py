@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS as COMMON
-from wbgs_jax.config import CalibrationConfig, Settings
+from wbgs_jax.config import CalibrationConfig, Settings, check_positive
 
 MAX_FACETS = 100_000
 """Largest number of facets that has been tested; each may reflect waves and obstruct all other paths."""
@@ -52,6 +52,8 @@ class WaveConfig:
     """Add the amplitudes of paths; False adds their powers, as phase-blind models do (an ablation)."""
     ssim_weight: float = 0.2
     """lambda of the paper's equation 5."""
+    ssim_stride: int = 2
+    """Stride of the SSIM windows in the loss, along both axes (paper: 1)."""
     correlation_weight: float = 0.5
     """Weight of one minus the squared correlation of snapshots, if the data contain them."""
     power_weight: float = 0.01
@@ -78,6 +80,7 @@ class WaveConfig:
         """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
         if self.max_facets > MAX_FACETS:
             raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {MAX_FACETS}")
+        check_positive({f"{name}.ssim-stride": self.ssim_stride})
         if self.clutter_cells < 1 or self.clutter_cell <= 0:
             raise UserError(
                 f"--{name}.clutter-cells and -cell must be positive; --calibration.absorption-spectra 0 disables the grid"
