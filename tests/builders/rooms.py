@@ -14,7 +14,7 @@ from wbgs_jax.propagation.materials import Slabs, complex_permittivity
 from wbgs_jax.propagation.mechanisms import MECHANISMS, trace_paths
 from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import arrivals, snapshots_from_paths
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.types import Mesh, Receiver, make_receiver
 
 SPEED_OF_LIGHT = 299_792_458.0
@@ -91,7 +91,7 @@ def slabs_of(search, frequency, permittivity=4.0, conductivity=0.02, thickness=0
 
 
 @jax.jit
-def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Arrivals:
+def arrivals_of(search: ImageTree, traced: TracedPaths, slabs: Slabs, receiver: Receiver, frequency, antennas=()) -> Paths:
     """What arrives over all paths, those without diffraction first, between the antennas of transmitter and elements."""
     found = [
         arrivals(some, search, slabs, frequency, receiver, MECHANISMS[some.mechanism].transport, *antennas)

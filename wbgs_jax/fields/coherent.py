@@ -48,7 +48,7 @@ from wbgs_jax.propagation.absorption import Grid, grid_around
 from wbgs_jax.propagation.displacement import Motion, still
 from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
 from wbgs_jax.radio.array import LagBasis, make_lag_basis
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import turned
 from wbgs_jax.types import Batch, Links, Mesh, Query, Receiver, Scene, check_receiver
 
@@ -382,6 +382,6 @@ def snapshots(params: WaveParams, plan: WavePlan, query: Query) -> Complex[Array
     return path_snapshots(params, plan, plan.paths_of(query), query)
 
 
-def channels(params: WaveParams, plan: WavePlan, query: Query) -> Arrivals:
+def channels(params: WaveParams, plan: WavePlan, query: Query) -> Paths:
     """Returns all paths of B queries, leading axis B, with amplitudes, directions and lengths."""
     return path_arrivals(params, plan, plan.paths_of(query), query)

@@ -29,7 +29,7 @@ from wbgs_jax.propagation.displacement import Motion, length_changes, path_coher
 from wbgs_jax.propagation.image_method import ImageTree, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
 from wbgs_jax.propagation.mechanisms import MECHANISMS, concatenated, sizes_of, trace_paths
-from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, Paths, TracedPaths
+from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, PathGeometry, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
 from wbgs_jax.radio.antenna import Antenna, upright
 from wbgs_jax.radio.array import (
@@ -39,7 +39,7 @@ from wbgs_jax.radio.array import (
     covariance_to_pas,
     wide_covariance_to_pas,
 )
-from wbgs_jax.radio.channel import FAINTEST, Arrivals, added_powers, decibels
+from wbgs_jax.radio.channel import FAINTEST, Paths, added_powers, decibels
 from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
 FAINTEST_SUM = 1e-12
@@ -187,13 +187,13 @@ def path_snapshots(params: WaveParams, plan: WavePlan, paths: TracedPaths, links
 
 
 @jax.jit
-def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Arrivals:
+def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Paths:
     """Returns the arrivals over all paths of B links, leading axis B."""
     found: Any = jax.vmap(lambda paths, link: arrivals_at(params, plan, paths, link))(paths, links)
     return found
 
 
-def _snapshots(plan: WavePlan, arrived: Arrivals, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
+def _snapshots(plan: WavePlan, arrived: Paths, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
     y = jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
     return y if plan.array_gains is None else y * element_gains(plan.array_gains)
 
@@ -221,13 +221,13 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query
 
 @jax.jit
 def path_covariances(
-    params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Arrivals, frequency_hz: Float[Array, " b"]
+    params: WaveParams, plan: WavePlan, paths: TracedPaths, arrived: Paths, frequency_hz: Float[Array, " b"]
 ) -> tuple[Complex[Array, "b elements elements"], Float[Array, " b"]]:
     """Returns the mean products y y^H of the snapshots of B transmitters over the possible positions of surfaces and
     transmitters (`WaveParams.placement`), scaled to a trace of 1, and the mean power received by an element."""
     spread = jnp.exp(params.placement)
 
-    def one(paths: TracedPaths, arrived: Arrivals, f: Float[Array, ""]) -> Any:
+    def one(paths: TracedPaths, arrived: Paths, f: Float[Array, ""]) -> Any:
         strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude)))
         strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # no paths: 1 / FAINTEST^2 would overflow
         arrived = arrived._replace(amplitude=arrived.amplitude / strongest)
@@ -269,7 +269,7 @@ def transmitter_antenna(params: WaveParams, transmitter: Transmitter) -> Antenna
     return antenna if transmitter.orientation is None else antenna.rotated(transmitter.orientation)
 
 
-def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Query) -> Arrivals:
+def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Query) -> Paths:
     """Returns the arrivals over all paths of one link."""
     frequency_hz = link.frequency_hz
     slabs, found = slabs_at(params, plan, frequency_hz), []
@@ -313,7 +313,7 @@ def _density_at(stored_density: Float[Array, "x y z 2"], frequency_hz: Float[Arr
     return (1 - share) * at_low + share * at_high
 
 
-def _corrections(params: WaveParams, paths: Paths) -> Complex[Array, " k"]:
+def _corrections(params: WaveParams, paths: PathGeometry) -> Complex[Array, " k"]:
     """Returns the factors of K paths of one mechanism due to facet corrections and additional losses."""
     kind = paths.interaction_type
     row = min(list(MECHANISMS).index(paths.mechanism), len(params.excess_loss) - 1)
@@ -361,14 +361,14 @@ def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> An
     return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, TRACED_AT_ONCE)
 
 
-def _stacked(some: list[Paths]) -> Paths:
+def _stacked(some: list[PathGeometry]) -> PathGeometry:
     """Returns concatenated paths, padded to the largest number of paths, which differs between receivers."""
     room = max(paths.alive.shape[1] for paths in some)
 
     def filled(leaf: np.ndarray, mode: Any) -> np.ndarray:
         return np.pad(leaf, [(0, 0), (0, room - leaf.shape[1])] + [(0, 0)] * (leaf.ndim - 2), mode)
 
-    together: Paths = jax.tree.map(
+    together: PathGeometry = jax.tree.map(
         lambda *leaves: jnp.asarray(np.concatenate([filled(leaf, "edge") for leaf in leaves])), *some
     )
     alive = np.concatenate([filled(np.asarray(paths.alive), "constant") for paths in some])

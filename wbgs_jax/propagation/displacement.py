@@ -28,7 +28,7 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.mesh.facets import AnyArray, centres
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.mechanisms import MECHANISMS
-from wbgs_jax.propagation.paths import MAX_ORDER, Paths, TracedPaths, is_vertex, on_edge
+from wbgs_jax.propagation.paths import MAX_ORDER, PathGeometry, TracedPaths, is_vertex, on_edge
 from wbgs_jax.propagation.transport import last_segment, segments_of
 from wbgs_jax.radio.array import EXACT
 
@@ -58,7 +58,7 @@ def still(rigid_bodies: int, receivers: int = 1) -> Motion:
 
 
 @jax.jit
-def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Array, " k"]:
+def length_changes(paths: PathGeometry, surfaces: Surfaces, motion: Motion) -> Float[Array, " k"]:
     """Returns the growth (metres) of the K paths from one transmitter to one receiver under a motion of surfaces and of that
     receiver (`Motion.of_receiver`); rotating the receiver changes no length."""
     turn, rigid_body = _direction_changes(paths, surfaces)
@@ -67,7 +67,9 @@ def length_changes(paths: Paths, surfaces: Surfaces, motion: Motion) -> Float[Ar
     return jnp.sum(turn * own, (-2, -1)) + jnp.matmul(_arrival_directions(paths), motion.receiver, precision=EXACT)
 
 
-def length_terms(paths: Paths, surfaces: Surfaces, rigid_bodies: int) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
+def length_terms(
+    paths: PathGeometry, surfaces: Surfaces, rigid_bodies: int
+) -> tuple[Int[Array, "k terms"], Float[Array, "k terms"]]:
     """Returns the indices of the entries of a motion (of one receiver, in the order of `ravel_pytree`) that the lengths of K
     paths depend on, and the derivatives of `length_changes` with respect to them. If an index occurs twice, its derivatives
     add."""
@@ -85,7 +87,7 @@ def length_terms(paths: Paths, surfaces: Surfaces, rigid_bodies: int) -> tuple[I
     return jnp.concatenate([number, receiver], 1), jnp.concatenate([derivative, _arrival_directions(paths)], 1)
 
 
-def length_gradient(paths: Paths, surfaces: Surfaces, rigid_bodies: int) -> Float[Array, "k places 3"]:
+def length_gradient(paths: PathGeometry, surfaces: Surfaces, rigid_bodies: int) -> Float[Array, "k places 3"]:
     """Returns the derivatives of the K path lengths of one transmitter with respect to the shifts of all rigid bodies and,
     last, of the transmitter."""
     turn, rigid_body = _direction_changes(paths, surfaces)
@@ -152,7 +154,7 @@ class _Bends(NamedTuple):
     """Unit vector opposite to the direction in which the wave leaves the transmitter."""
 
 
-def _bends(paths: Paths, surfaces: Surfaces, most: int) -> _Bends:
+def _bends(paths: PathGeometry, surfaces: Surfaces, most: int) -> _Bends:
     """Returns the changes of direction of paths, segment by segment; transmissions change no direction."""
     turn, rigid_body = _direction_changes(paths, surfaces)
     here = jnp.any(turn != 0, -1) & (paths.interaction_segment == jnp.arange(most)[:, None, None])
@@ -187,19 +189,21 @@ def _dot_products_jvp(primals: Any, tangents: Any) -> tuple[Float[Array, "k l"],
     return value, sum(parts, jnp.zeros_like(value))
 
 
-def _lever_arms(paths: Paths, surfaces: Surfaces, rigid_body: Int[Array, "k 5"], rigid_bodies: int) -> Float[Array, "k 5 3"]:
+def _lever_arms(
+    paths: PathGeometry, surfaces: Surfaces, rigid_body: Int[Array, "k 5"], rigid_bodies: int
+) -> Float[Array, "k 5 3"]:
     """Returns the points of interaction relative to the centres of the rigid bodies that they lie on."""
     segment = jnp.minimum(paths.interaction_segment, paths.points.shape[1] - 2)
     point = jnp.take_along_axis(paths.points, segment[..., None] + 1, 1)
     return point - centres(surfaces.facets, rigid_bodies)[rigid_body]
 
 
-def _arrival_directions(paths: Paths) -> Float[Array, "k 3"]:
+def _arrival_directions(paths: PathGeometry) -> Float[Array, "k 3"]:
     """Returns the directions of the last segments."""
     return jnp.take_along_axis(segments_of(paths).direction, last_segment(paths)[:, None, None], 1)[:, 0]
 
 
-def _direction_changes(paths: Paths, surfaces: Surfaces) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:
+def _direction_changes(paths: PathGeometry, surfaces: Surfaces) -> tuple[Float[Array, "k 5 3"], Int[Array, "k 5"]]:
     """Returns the change of direction at every interaction (zero for transmissions), and the index of its rigid body."""
     direction = segments_of(paths).direction
     path, segment = jnp.arange(len(direction))[:, None], jnp.minimum(paths.interaction_segment, direction.shape[1] - 2)

@@ -11,7 +11,7 @@ import jax
 from jaxtyping import Array, Float
 
 from wbgs_jax.propagation.image_method import ImageTree
-from wbgs_jax.propagation.paths import MAX_ORDER, Paths, TracedPaths, diffracted_paths, specular_paths
+from wbgs_jax.propagation.paths import MAX_ORDER, PathGeometry, TracedPaths, diffracted_paths, specular_paths
 from wbgs_jax.propagation.transport import Transport, diffracted_transport, specular_transport
 
 
@@ -19,7 +19,7 @@ class Mechanism(NamedTuple):
     """A mechanism. Its name is stored in the paths; its place in the table is its row in `WaveParams.excess_loss`."""
 
     name: str
-    trace: Callable[[Float[Array, "3"], ImageTree, int, int], Paths]
+    trace: Callable[[Float[Array, "3"], ImageTree, int, int], PathGeometry]
     """(transmitter, image tree of the receiver, candidates tested, paths kept) -> paths of this mechanism."""
     transport: Transport
     vertices: int

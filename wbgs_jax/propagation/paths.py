@@ -78,7 +78,7 @@ def on_edge(interaction_type: Int[AnyArray, "*n"]) -> Bool[AnyArray, "*n"]:
 
 
 @pytree
-class Paths:
+class PathGeometry:
     """K paths of one transmitter; leading axes are batch axes."""
 
     points: Float[Array, "*b k 5 3"]
@@ -99,20 +99,20 @@ class Paths:
 class TracedPaths:
     """All paths of one transmitter; leading axes are batch axes."""
 
-    sets: tuple[Paths, ...]
+    sets: tuple[PathGeometry, ...]
     """Paths of each mechanism, in the order of `mechanisms.MECHANISMS`."""
 
-    def of(self, mechanism: str) -> Paths:
+    def of(self, mechanism: str) -> PathGeometry:
         """Returns the paths of a mechanism by its name."""
         return next(paths for paths in self.sets if paths.mechanism == mechanism)
 
     @property
-    def specular(self) -> Paths:
+    def specular(self) -> PathGeometry:
         """Paths without diffraction, including the line of sight."""
         return self.of("specular")
 
     @property
-    def diffracted(self) -> Paths:
+    def diffracted(self) -> PathGeometry:
         """Paths with one diffraction each."""
         return self.of("diffracted")
 
@@ -132,14 +132,14 @@ class Candidates(NamedTuple):
     """Rough amplitude; 0 for no path."""
 
 
-def specular_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
+def specular_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> PathGeometry:
     """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
     mirrored = (promising(lambda some: _mirrored(tx, tree, some), sequences, tried) for sequences in tree.sequences)
     parts = [_direct(tx, tree.receiver_position), *mirrored]
     return select_paths("specular", parts, tree, tried, kept, MAX_ORDER + 1)
 
 
-def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> Paths:
+def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> PathGeometry:
     """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
     pairs = tree.diffracted
     parts = [
@@ -259,7 +259,9 @@ def _diffracted(source, goal, edge: Int[Array, " c"], edges: Edges):
     return point, jnp.where(valid, strength, 0)
 
 
-def select_paths(mechanism: str, parts: list[Candidates], tree: ImageTree, tried: int, kept: int, segments: int) -> Paths:
+def select_paths(
+    mechanism: str, parts: list[Candidates], tree: ImageTree, tried: int, kept: int, segments: int
+) -> PathGeometry:
     """Returns the best paths of a mechanism among its best candidates, after these have been tested for intersections with all
     facets.
 
@@ -279,7 +281,7 @@ def select_paths(mechanism: str, parts: list[Candidates], tree: ImageTree, tried
     score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
     found = jax.tree.map(lambda leaf: leaf[best], found)
     facet, types, segment = jax.vmap(lambda path, words: _in_order(path, words, tree))(found, cut[best])
-    return Paths(found.points, facet, types, segment, score > 0, mechanism)
+    return PathGeometry(found.points, facet, types, segment, score > 0, mechanism)
 
 
 def promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:

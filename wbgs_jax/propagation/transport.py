@@ -18,11 +18,11 @@ from wbgs_jax._util.complex_math import phasor
 from wbgs_jax.mesh.edges import Edges
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.materials import Slabs, slab_coefficients
-from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, Paths, is_vertex, on_edge
+from wbgs_jax.propagation.paths import MAX_INTERACTIONS, NONE, REFLECTED, PathGeometry, is_vertex, on_edge
 from wbgs_jax.propagation.utd import wedge_coefficients
 from wbgs_jax.radio.antenna import Antenna, upright, zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, steering_vector
-from wbgs_jax.radio.channel import Arrivals
+from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Receiver
 
@@ -66,7 +66,7 @@ class SlabInteractions(NamedTuple):
 
 @partial(jax.jit, static_argnames="transport")
 def arrivals(
-    paths: Paths,
+    paths: PathGeometry,
     surfaces: Surfaces,
     slabs: Slabs,
     frequency_hz: Float[Array, ""],
@@ -74,7 +74,7 @@ def arrivals(
     transport: Transport,
     transmitter: Antenna | None = None,
     element: Antenna | None = None,
-) -> Arrivals:
+) -> Paths:
     """Returns the amplitudes that a transmitter of unit power produces over K paths.
 
     Args:
@@ -107,7 +107,7 @@ def arrivals(
     amplitudes = jnp.where(paths.alive[:, None], scale[:, None] * parts, 0)
     met = paths.interaction_type, _materials(paths, surfaces)
     arrived = amplitudes[:, 0], local, segments.total, segments.direction[:, 0], arrival, amplitudes[:, 1:]
-    return Arrivals(*arrived, *met, points=paths.points)
+    return Paths(*arrived, *met, points=paths.points)
 
 
 def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "k 3"]) -> Inexact[Array, "k 3"]:
@@ -118,7 +118,7 @@ def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "
     return antenna.field(direction) * further.parametric_gain(direction)[..., None]
 
 
-def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
+def _materials(paths: PathGeometry, surfaces: Surfaces) -> Int[Array, "k 5"]:
     """Returns the material index at every interaction; -1 where there is none."""
     kind, number = paths.interaction_type, paths.interaction_facet
     facet = jnp.where(on_edge(kind), 0, number)
@@ -129,7 +129,7 @@ def _materials(paths: Paths, surfaces: Surfaces) -> Int[Array, "k 5"]:
 
 @jax.jit
 def element_voltages(
-    arrived: Arrivals,
+    arrived: Paths,
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     spherical_wave: Float[Array, ""] | float | None = None,
@@ -158,7 +158,7 @@ def element_voltages(
 
 
 def snapshots_from_paths(
-    arrived: Arrivals,
+    arrived: Paths,
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     spherical_wave: Float[Array, ""] | float | None = None,
@@ -169,7 +169,7 @@ def snapshots_from_paths(
 
 
 def mimo_matrix(
-    arrived: Arrivals,
+    arrived: Paths,
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     tx_elements: Float[Array, "m 3"],
@@ -189,7 +189,7 @@ def mimo_matrix(
 
 @jax.jit
 def covariance_from_paths(
-    arrived: Arrivals,
+    arrived: Paths,
     receiver: Receiver,
     frequency_hz: Float[Array, ""],
     coherence: Float[Array, "k k"],
@@ -219,20 +219,20 @@ def _unit(v: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     return v / jnp.sqrt(jnp.maximum(_dot(v, v), 1e-12))[..., None]
 
 
-def segments_of(paths: Paths) -> Segments:
+def segments_of(paths: PathGeometry) -> Segments:
     """Returns the segments of paths."""
     segments = paths.points[:, 1:] - paths.points[:, :-1]
     lengths = jnp.sqrt(jnp.maximum(_dot(segments, segments), SHORTEST**2))
     return Segments(lengths, segments / lengths[..., None], jnp.sum(jnp.where(lengths > SHORTEST, lengths, 0), -1))
 
 
-def last_segment(paths: Paths) -> Int[Array, " k"]:
+def last_segment(paths: PathGeometry) -> Int[Array, " k"]:
     """Returns the index of the segment that ends at the receiver."""
     return jnp.sum(is_vertex(paths.interaction_type), -1)
 
 
 def _slab_interactions(
-    paths: Paths, segments: Segments, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
+    paths: PathGeometry, segments: Segments, surfaces: Surfaces, slabs: Slabs, frequency_hz: Float[Array, ""]
 ) -> SlabInteractions:
     """Returns the slab basis and coefficients at every interaction; meaningless where an interaction is not with a slab."""
     facet = jnp.where(on_edge(paths.interaction_type), 0, paths.interaction_facet)
@@ -276,7 +276,7 @@ def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[
 
 def specular_transport(
     field: Complex[Array, "k 3"],
-    paths: Paths,
+    paths: PathGeometry,
     segments: Segments,
     interactions: SlabInteractions,
     surfaces: Surfaces,
@@ -289,7 +289,7 @@ def specular_transport(
 
 def diffracted_transport(
     field: Complex[Array, "k 3"],
-    paths: Paths,
+    paths: PathGeometry,
     segments: Segments,
     interactions: SlabInteractions,
     surfaces: Surfaces,

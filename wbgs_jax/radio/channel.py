@@ -119,10 +119,6 @@ class Paths(NamedTuple):
         return _with_energy(taps, 1) if normalize else taps
 
 
-Arrivals = Paths
-"""The same class, by the name that `propagation` and the coherent field still use, where `Paths` are traced points."""
-
-
 def _with_energy(values: Complex[Array, "*b n"], energy: int) -> Complex[Array, "*b n"]:
     """Returns values scaled so that their squared magnitudes sum to `energy` along the last axis; zeros stay zeros."""
     strongest = jnp.max(jnp.abs(values), -1, keepdims=True)

@@ -26,7 +26,7 @@ from wbgs_jax.propagation.displacement import Motion, length_terms
 from wbgs_jax.propagation.paths import TracedPaths
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
-from wbgs_jax.radio.channel import FAINTEST, Arrivals
+from wbgs_jax.radio.channel import FAINTEST, Paths
 from wbgs_jax.radio.geometry import rotation_matrix
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Links, Receiver
@@ -201,7 +201,7 @@ def normal_equations(
         plan = field.displaced(field.plan(params, batch.receiver, prepared), motion.of_receiver(queried.receiver_index))
         paths, frequency = prepared.of(queried), queried.frequency_hz
         wavenumber = 2 * jnp.pi * frequency / SPEED_OF_LIGHT
-        arrived: Arrivals = arrivals_at(params, plan, paths, queried)
+        arrived: Paths = arrivals_at(params, plan, paths, queried)
         expected = jnp.exp(-0.5 * wavenumber**2 * variance[prepared.place(queried)])
         arrived = arrived._replace(amplitude=arrived.amplitude * expected)
         voltages = element_voltages(arrived, plan.receiver, frequency)
@@ -227,7 +227,7 @@ def normal_equations(
 
 
 def _turned(
-    voltages: Complex[Array, "k elements"], arrived: Arrivals, receiver: Receiver, frequency_hz: Float[Array, ""]
+    voltages: Complex[Array, "k elements"], arrived: Paths, receiver: Receiver, frequency_hz: Float[Array, ""]
 ) -> Complex[Array, "elements 3"]:
     """Returns the derivatives of the elements' voltages with respect to the rotation vector (world frame) of the receiver."""
     axes = rotation_matrix(receiver.orientation)  # row i: the world's axis i in the receiver's frame
