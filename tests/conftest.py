@@ -104,6 +104,15 @@ def shared_data() -> Callable[[str], Path]:
     return find
 
 
+@pytest.fixture(scope="module")
+def ripple() -> Iterator[None]:
+    """Makes a toy field known that compiles in no time."""
+    from builders.toys import RippleField, registered
+
+    with registered(RippleField):
+        yield
+
+
 @pytest.fixture
 def x64():
     """Double precision for one test."""

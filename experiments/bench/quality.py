@@ -28,7 +28,7 @@ COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 
 @contextmanager
 def compilations(found: list[tuple[str, float]]) -> Iterator[None]:
-    """Note the name and the seconds of everything that XLA compiles within the block."""
+    """Note the name and the seconds of everything that XLA compiles, or its cache of programs reads, within the block."""
 
     def listen(event: str, duration_secs: float, **details: str | int) -> None:
         if event == COMPILE_EVENT:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.monitoring
 
+from experiments.bench.quality import compilations
 from experiments.gpu_check import parity, renderer, training
 from experiments.gpu_check.record import PART, TRAININGS, Record
 from wbgs_jax._util.cli import run_command
@@ -21,8 +21,6 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax.evaluation.report import device_name, environment
 from wbgs_jax.training.progress import Interrupted
 
-COMPILED = "/jax/core/compile/backend_compile_duration"
-"""JAX's name of the time that XLA takes for a program, or the cache of programs."""
 MEASURES: dict[str, Callable[[Record, float, bool], bool]] = {"parity": parity.measure, "renderer": renderer.measure}
 """Of (record, deadline of `time.monotonic`, stand-in): whether all of it is done."""
 
@@ -39,22 +37,17 @@ def device() -> dict[str, Any]:
 
 def run(name: str, record: Record, deadline: float, stand_in: bool, folder: Path) -> bool:
     """Runs a piece until it is done or its time is up, and returns whether it is done."""
-    durations: list[float] = []
-
-    def listen(event: str, duration_secs: float, **_: Any) -> None:
-        if event == COMPILED:
-            durations.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
+    compiled: list[tuple[str, float]] = []
     try:
-        if name in TRAININGS:
-            return training.train_and_score(name, record, stand_in, folder)
-        return MEASURES[name](record, deadline, stand_in)
+        with compilations(compiled):
+            if name in TRAININGS:
+                return training.train_and_score(name, record, stand_in, folder)
+            return MEASURES[name](record, deadline, stand_in)
     except (Interrupted, KeyboardInterrupt):
         return False
     finally:
-        compilations = {"programs": len(durations), "seconds": round(sum(durations), 1)}
-        record.describe_call(compilations=compilations, **renderer.most_memory())
+        taken = {"programs": len(compiled), "seconds": round(sum(seconds for _, seconds in compiled), 1)}
+        record.describe_call(compilations=taken, **renderer.most_memory())
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call, in_a_process
 from builders.synthetic import tiny_dataset, tiny_scene
-from builders.toys import RippleField, registered
 from PIL import Image
 
 import wbgs_jax
@@ -20,6 +19,8 @@ from wbgs_jax.training import curves
 from wbgs_jax.training.checkpoint import checkpoint_steps
 from wbgs_jax.training.loop import Run
 from wbgs_jax.training.run_folder import load_trained
+
+pytestmark = pytest.mark.usefixtures("ripple")
 
 NETWORKS = {"gaussians": 60, "width": 8, "depth": 2, "skip": 1, "radiance-widths": 8}
 SHORT = {
@@ -35,12 +36,6 @@ def words(sections):
 SMOKE = ["--preset", "smoke", *words(SHORT)]
 TINY = [*SMOKE, "--field", "wideband", *words({"wideband": NETWORKS})]
 TOY = [*SMOKE, "--field", "ripple"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toys():
-    with registered(RippleField):
-        yield
 
 
 @pytest.fixture(scope="module")

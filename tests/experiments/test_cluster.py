@@ -9,30 +9,17 @@ import threading
 import time
 
 import cloudpickle
-import numpy as np
 import pytest
-from builders import synthetic
 
 from experiments import runner
 from experiments.jobs import Job
-from experiments.paper import GHZ_10
 from experiments.results import Results
 from wbgs_jax._util import dask_cluster
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.scene_file import save_scene
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import tests
 TIMES = ("wall_seconds", "training_seconds", "evaluation_seconds", "environment")
 """What may differ: times, and the commit, where somebody works in the tree meanwhile."""
-
-
-@pytest.fixture
-def scene(monkeypatch, tmp_path):
-    """A tiny scene 1 with the ten frequencies, which workers find too."""
-    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
-    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(GHZ_10) * 1e9)
-    monkeypatch.setenv("WBGS_DATA", str(tmp_path / "data"))
-    save_scene(tmp_path / "data" / "scene1.npz", dataclasses.replace(synthetic.tiny_scene(), name="scene1"))
 
 
 def untimed(command, job):

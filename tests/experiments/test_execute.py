@@ -9,16 +9,13 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from builders import synthetic
 from builders.synthetic import tiny_dataset
-from builders.toys import RippleField, registered
 
 from experiments import execute, profiles, runner
 from experiments.jobs import Job
 from experiments.paper import GHZ_10
 from experiments.results import Results
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.training.loop import Run
 
 JOB = Job("1", "wideband", profile="smoke")
@@ -28,16 +25,7 @@ def result_of(command, job=JOB):
     return Results(command.profile, command.results).get(job)
 
 
-@pytest.fixture
-def scenes(monkeypatch, tmp_path):
-    """A tiny scene 1 with the ten frequencies; what is compiled stays compiled."""
-    monkeypatch.setattr(runner.jax, "clear_caches", lambda: None)
-    monkeypatch.setattr(synthetic, "FREQUENCIES_HZ", np.array(GHZ_10) * 1e9)
-    monkeypatch.setenv("WBGS_DATA", str(tmp_path / "data"))
-    save_scene(tmp_path / "data" / "scene1.npz", dataclasses.replace(synthetic.tiny_scene(), name="scene1"))
-
-
-@pytest.mark.usefixtures("scenes")
+@pytest.mark.usefixtures("scene")
 def test_a_training_that_ends_as_the_time_does_is_scored_the_next_time(command, models, monkeypatch):
     train = execute.train
 
@@ -55,14 +43,7 @@ def test_a_training_that_ends_as_the_time_does_is_scored_the_next_time(command, 
     assert models == ["all", "all"] and result_of(command) is not None
 
 
-@pytest.fixture
-def toy_field():
-    """A field that compiles in no time."""
-    with registered(RippleField):
-        yield
-
-
-@pytest.mark.usefixtures("scenes", "toy_field")
+@pytest.mark.usefixtures("scene", "ripple")
 @pytest.mark.parametrize("field", ["ripple", pytest.param("wideband", marks=pytest.mark.slow)])
 def test_a_cut_training_goes_on_to_the_same_result(field, command, monkeypatch, tmp_path):
     job, size = dataclasses.replace(JOB, field=field), profiles.PROFILES["smoke"]
@@ -106,7 +87,7 @@ def models(monkeypatch):
     return trained
 
 
-@pytest.mark.usefixtures("scenes")
+@pytest.mark.usefixtures("scene")
 def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
     job, stop = Job("1", "wrfgs", profile="smoke"), mock.patch.object(execute, "score", side_effect=[KeyboardInterrupt])
     with stop, contextlib.suppress(KeyboardInterrupt):
@@ -131,7 +112,7 @@ def test_models_of_single_frequencies_are_one_job_that_goes_on(command, models):
     assert found.values["models"] == 10 and found.values["steps"] == 4990 and found.values["training_seconds"] == 15
 
 
-@pytest.mark.usefixtures("scenes")
+@pytest.mark.usefixtures("scene")
 def test_a_result_says_where_it_comes_from(command, models):
     runner.run([JOB], command)
     found = result_of(command).values
@@ -144,7 +125,7 @@ def test_a_result_says_where_it_comes_from(command, models):
     assert pictures.shape == (8, 90, 360) and pictures.max() > 200
 
 
-@pytest.mark.usefixtures("scenes")
+@pytest.mark.usefixtures("scene")
 def test_baselines_are_a_job_of_their_own(command):
     job = Job("1", "baselines", "C4", all_tx=True, profile="smoke")
     runner.run([job], command)
@@ -153,7 +134,7 @@ def test_baselines_are_a_job_of_their_own(command):
     assert list(found["nearest_tx"]) == ["2.4", "5", "10", "24.25", "37", "47", "60", "77"]
 
 
-@pytest.mark.usefixtures("scenes")
+@pytest.mark.usefixtures("scene")
 def test_a_change_is_trained_by_the_same_runner(command, models, monkeypatch):
     seen, train = [], execute.train
 

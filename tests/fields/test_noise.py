@@ -1,15 +1,28 @@
 """Noise of snapshots: what it does to spectra, against draws of it; and how much there is, from what fields say."""
 
+from unittest import mock
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from wbgs_jax.fields import mixture
 from wbgs_jax.fields.mixture import Opinions, at_least_floor, floor_of, observed_opinions, with_floor, without_floor
-from wbgs_jax.radio.array import pas_directions, planar_array, snapshot_to_pas, steering_vector
+from wbgs_jax.radio.array import PAS_SHAPE, pas_directions, planar_array, steering_vector
 
 ARRAY = planar_array(4, 4, 0.5)
 COUNT = len(ARRAY)
+STEERING = np.asarray(steering_vector(ARRAY, jnp.asarray(pas_directions(), jnp.float32))).reshape(-1, COUNT)
+OPTIMISED = {"xla_backend_optimization_level": 1}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def optimised():
+    """Thousands of images are compared: what is quick to compile (conftest.py) would take longer to run."""
+    faster = {name: jax.jit(getattr(mixture, name), compiler_options=OPTIMISED) for name in ("_added", "_raised")}
+    with mock.patch.multiple(mixture, **faster):
+        yield
 
 
 def waves(rng, n, paths=3):
@@ -30,20 +43,20 @@ def noise(rng, snapshots, share, draws=1):
 
 def peak(snapshots):
     """max |a^H h|^2 / N of snapshots of unit power."""
-    steering = np.asarray(steering_vector(ARRAY, jnp.asarray(pas_directions(), jnp.float32))).reshape(-1, COUNT)
     unit = snapshots / np.sqrt(np.mean(np.abs(snapshots) ** 2, -1, keepdims=True))
-    return (np.abs(unit @ steering.conj().T) ** 2).max(-1) / COUNT
+    return (np.abs(unit @ STEERING.conj().T) ** 2).max(-1) / COUNT
 
 
 def spectra(snapshots):
-    return np.asarray(snapshot_to_pas(jnp.asarray(snapshots), ARRAY))
+    """By NumPy: there are thousands of them."""
+    pas = np.abs(snapshots.astype(np.complex64) @ STEERING.conj().T)
+    return (pas / pas.max(-1, keepdims=True)).reshape(-1, *PAS_SHAPE)
 
 
 def test_the_floor_is_what_noise_adds_in_the_mean_of_the_squares(rng):
     clean, share = waves(rng, 1), rng.uniform(0.05, 0.2)
     heard = (clean + noise(rng, clean, share, draws=600))[:, 0]
-    steering = np.asarray(steering_vector(ARRAY, jnp.asarray(pas_directions(), jnp.float32)))
-    squares = np.mean(np.abs(np.tensordot(heard, steering.conj(), (-1, -1))) ** 2, 0)
+    squares = np.mean(np.abs(heard @ STEERING.conj().T) ** 2, 0).reshape(PAS_SHAPE)
     expected = np.sqrt(squares / squares.max())
     pas = spectra(clean)
     got = np.asarray(with_floor(jnp.asarray(pas), share / (1 - share) / peak(clean)[0]))[0]

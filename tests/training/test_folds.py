@@ -5,17 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset
-from builders.toys import RippleField, registered, toy_settings
+from builders.toys import toy_settings
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.training import cross_validation
 from wbgs_jax.training.cross_validation import FOLDS, blocks, held_out_blocks, shortened
 
-
-@pytest.fixture(autouse=True, scope="module")
-def toys():
-    with registered(RippleField):
-        yield
+pytestmark = pytest.mark.usefixtures("ripple")
 
 
 def test_blocks_lie_together(rng):

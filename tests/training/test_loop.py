@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset, tiny_settings
-from builders.toys import GROWING, RippleField, metrics_of, registered, toy_settings
+from builders.toys import GROWING, metrics_of, toy_settings
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.scene import DatasetScene
@@ -23,16 +23,12 @@ from wbgs_jax.training.batches import check_data
 from wbgs_jax.training.loop import Interrupted, Run, train
 from wbgs_jax.training.step import run_epoch as epoch_programs
 
+pytestmark = pytest.mark.usefixtures("ripple")
+
 STEPS = 8
 PLAIN = ("ripple", toy_settings())
 CROWDED = ("wideband", GROWING)
 """What is trained: a toy without hooks, or Gaussians that density control adds to, into more slots."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def toys():
-    with registered(RippleField):
-        yield
 
 
 @pytest.fixture(scope="module")

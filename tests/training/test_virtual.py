@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_dataset, tiny_settings
-from builders.toys import RippleField, registered, toy_settings
+from builders.toys import toy_settings
 
 from wbgs_jax.config import limit_steps
 from wbgs_jax.data.scene import DatasetScene
@@ -25,11 +25,7 @@ from wbgs_jax.training.batches import (
 )
 from wbgs_jax.training.loop import Run, train
 
-
-@pytest.fixture(autouse=True, scope="module")
-def toys():
-    with registered(RippleField):
-        yield
+pytestmark = pytest.mark.usefixtures("ripple")
 
 
 def test_kriging_weights_follow_from_the_equations(rng):
