@@ -273,8 +273,7 @@ class Viewer:
             self.view.draw_dome(answer.pas)
             self._draw_paths()
             if c.gaussians is not None:
-                off = c.gaussians.value == "off" or not self.session.has_gaussians
-                self.view.draw_gaussians(None if off else self.session.gaussians(position, frequency), str(c.gaussians.value))
+                self._draw_gaussians(str(c.gaussians.value))
         self.page.ready()
         self.updates += 1
         if not self._spectrum.waiting:
@@ -301,6 +300,11 @@ class Viewer:
         count, by_power = int(c.paths.value), c.by_power.value == "by power"
         self.view.draw_paths(paths, count, by_power, self.chosen, self._choose)
         self.display.paths.content = panel.path_list(paths, count, self.chosen, c.budget, by_power)
+
+    def _draw_gaussians(self, by: str) -> None:
+        shown = by != "off" and self.session.has_gaussians
+        top = self.view.draw_gaussians(self.session.gaussians(self.position, self.frequency_hz) if shown else None, by)
+        self.display.gaussians.content = panel.gaussian_legend(top, by) if shown else ""
 
     def _choose(self, number: int) -> None:
         self.chosen = number
