@@ -1,9 +1,10 @@
 """The viewer application: changes of the controls are queried and the results drawn; outdated requests are skipped."""
 
+import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ STEPS_A_SECOND = 20
 """Animation steps of a walk, per second."""
 WIDE = 1.2
 """Aspect of a picture whose browser is not known."""
+SLOW_S = 0.7
+"""Seconds after which a prediction counts as slow."""
 PANEL_PX = 388
 """Width of the panel, pixels."""
 
@@ -262,9 +265,10 @@ class Viewer:
 
     def _show(self) -> None:
         """Queries the field and draws the prediction."""
-        self._follow_receiver()
         position, frequency, c, d = self.position, self.frequency_hz, self.controls, self.display
-        answer = self.answer = self.session.predict(position, frequency)
+        with self._notice():
+            self._follow_receiver()
+            answer = self.answer = self.session.predict(position, frequency)
         d.spectrum.content = panel.spectrum_figure(answer.pas)
         d.summary.content = panel.summary(answer, frequency, c.budget, self.session.has_power)
         self.server.flush()  # the panel does not wait for the room, which takes longer to draw
@@ -278,6 +282,18 @@ class Viewer:
         self.updates += 1
         if not self._spectrum.waiting:
             self._show_beside(position, frequency)
+
+    @contextlib.contextmanager
+    def _notice(self) -> Iterator[None]:
+        """Shows a line if a prediction takes long, since the field is compiled for it."""
+        line = as_words("The field is being compiled for this query ...")
+        timer = threading.Timer(SLOW_S, lambda: setattr(self.display.summary, "content", line))
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            timer.join()
 
     def _show_beside(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> None:
         """Draws what may lag behind while the transmitter moves."""
