@@ -241,15 +241,25 @@ def test_blocks_say_what_single_answers_do(rng):
 
 
 def test_expected_scores_lie_between_nothing_and_everything(rng):
-    """A transmitter at the receiver or far away has features that no validation transmitter had."""
+    """A transmitter near the receiver or far away has features that no validation transmitter had."""
     pas, f = jnp.asarray(rng.uniform(0, 1, (3, 90, 360)), jnp.float32), jnp.full(3, 1e10)
-    query = Query(jnp.asarray([[0.0, 0, 0], [1e-3, 0, 0], [90.0, 0, 0]]), f)
+    query = Query(jnp.asarray([[0.2, 0, 0], [0.11, 0, 0], [90.0, 0, 0]]), f)
     for weight in (-3.0, 3.0):
         steep = dataclasses.replace(confidence(), weights=confidence().weights.at[0].set(weight))
         found = expected_ssim(steep, pas, query, jnp.asarray([40.0, 0, -300]))
         for values in found:
             assert ((values >= 0) & (values <= 1)).all()
         assert (found.ssim == 0).any() or (found.ssim > 0.9).any()
+
+
+def test_a_transmitter_at_the_receiver_has_no_interval(rng):
+    pas, tx = jnp.asarray(rng.uniform(0, 1, (3, 90, 360)), jnp.float32), jnp.asarray([[0.0, 0, 0], [0.05, 0, 0], [1.0, 0, 0]])
+    query = Query(tx, jnp.full(3, 1e10))
+    for values in expected_ssim(confidence(), pas, query):
+        np.testing.assert_array_equal(np.isnan(values), [True, True, False])
+    learned = power_confidence(np.array([0.0, 0, 0, 0, 1]))
+    for values in expected_power(learned, jnp.full(3, -60.0), query, jnp.zeros(3)):
+        np.testing.assert_array_equal(np.isnan(values), [True, True, False])
 
 
 def test_power_counts_beyond_that_of_free_space(rng):

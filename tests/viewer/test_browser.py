@@ -8,7 +8,11 @@ from builders.untrained import make_coherent_run
 
 from experiments.studies.viewer_pictures import PHONE, TABS, chromium, drag, on_screen, window
 from wbgs_jax.commands import view
+from wbgs_jax.inference.evaluate_quantities import LoadedField
+from wbgs_jax.training.run_folder import load_trained
+from wbgs_jax.viewer.app import Viewer
 from wbgs_jax.viewer.page import STOPPED, Page
+from wbgs_jax.viewer.session import Session
 
 pytestmark = [
     pytest.mark.heavy,
@@ -159,6 +163,22 @@ def test_the_room_is_saved(viewer, opened, tmp_path):
         opened.page.get_by_role("button", name="save as HTML").click()
     download.value.save_as(tmp_path / "room.html")
     assert "__VISER_EMBED_DATA__" in (tmp_path / "room.html").read_text()
+
+
+def test_a_page_that_is_opened_early_becomes_the_viewer(tmp_path):
+    trained = load_trained(make_coherent_run(tmp_path / "box"))
+    page, dataset = Page(port=0), trained.dataset()
+    with window(page, ready="starting") as opened:
+        viewer = Viewer(Session(LoadedField(trained, dataset, dataset.receiver())), page)
+        opened.page.get_by_text("Spectrum at the receiver, predicted").wait_for(timeout=PATIENT_MS)
+        viewer.wait()
+        opened.page.wait_for_timeout(1000)
+        assert not opened.page.get_by_text("compiling the field").is_visible()
+        for place in (viewer.position, np.asarray(viewer.session.receiver.position, float)):
+            x, y = on_screen(viewer, place)
+            assert 0 < x < 900 and 0 < y < 800
+        assert opened.errors == []
+    viewer.stop()
 
 
 def test_a_page_shows_progress_and_then_that_its_server_has_stopped():

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.blocks import map_blocks
@@ -33,6 +33,8 @@ LEVEL = 0.9
 """Nominal coverage of the intervals."""
 AT_ONCE = 16
 """Number of predictions evaluated at a time."""
+AT_RECEIVER_M = 0.1
+"""Distance up to which a transmitter counts as being at the receiver, where none can be measured and intervals do not hold."""
 POWER_MARGIN_DB = 0.1
 """Keeps the logarithm of a zero error finite."""
 FILE, POWER_FILE = "confidence.npz", "power_confidence.npz"
@@ -148,7 +150,7 @@ def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array
 def expected_ssim(
     confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
 ) -> Expected:
-    """Returns the expected SSIM of predicted spectra, with intervals.
+    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver (`AT_RECEIVER_M`).
 
     Args:
         confidence: the regression, for the queried receiver.
@@ -165,13 +167,15 @@ def expected_ssim(
     error = _log_error(confidence, known)
     low, high = confidence.quantiles
     factors = confidence.surplus, jnp.exp(high), jnp.exp(low)
-    return Expected(*(jnp.clip(1 + MARGIN - jnp.exp(error) * factor, 0, 1) for factor in factors))
+    apart = _apart(query, confidence.rx_position)
+    return Expected(*(jnp.where(apart, jnp.clip(1 + MARGIN - jnp.exp(error) * one, 0, 1), jnp.nan) for one in factors))
 
 
 def expected_power(
     confidence: PowerConfidence, power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]
 ) -> ExpectedPower:
-    """Returns the expected errors of received powers (dB) that a field predicts for B queries.
+    """Returns the expected errors of received powers (dB) that a field predicts for B queries; NaN for a transmitter at the
+    receiver (`AT_RECEIVER_M`).
 
     Args:
         confidence: the regression.
@@ -184,7 +188,13 @@ def expected_power(
     """
     error = _log_error(confidence, power_features(power_db, query, rx_position, confidence.tx_position))
     bounds = (jnp.exp(error) * factor for factor in (confidence.surplus, jnp.exp(confidence.highest)))
-    return ExpectedPower(*(jnp.maximum(decibels - POWER_MARGIN_DB, 0) for decibels in bounds))
+    apart = _apart(query, rx_position)
+    return ExpectedPower(*(jnp.where(apart, jnp.maximum(decibels - POWER_MARGIN_DB, 0), jnp.nan) for decibels in bounds))
+
+
+def _apart(query: Query, rx_position: Float[Array, "*#b 3"]) -> Bool[Array, " b"]:
+    """Returns which transmitters are not at the receiver."""
+    return jnp.sum((query.tx_position - rx_position) ** 2, -1) > AT_RECEIVER_M**2
 
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:

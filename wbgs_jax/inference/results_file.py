@@ -232,7 +232,9 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
                 yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
 
 
-NO_CONFIDENCE = "no prediction interval (outside of the scene or of the trained band, or where no antenna can be placed)"
+NO_CONFIDENCE = (
+    "no prediction interval (outside of the scene or of the trained band, at the receiver, or where no antenna can be placed)"
+)
 
 
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:

@@ -1,9 +1,10 @@
 """The viewer application: changes of the controls are queried and the results drawn; outdated requests are skipped."""
 
+import contextlib
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ STEPS_A_SECOND = 20
 """Animation steps of a walk, per second."""
 WIDE = 1.2
 """Aspect of a picture whose browser is not known."""
+SLOW_S = 0.7
+"""Seconds after which a prediction counts as slow."""
 PANEL_PX = 388
 """Width of the panel, pixels."""
 
@@ -262,9 +265,10 @@ class Viewer:
 
     def _show(self) -> None:
         """Queries the field and draws the prediction."""
-        self._follow_receiver()
         position, frequency, c, d = self.position, self.frequency_hz, self.controls, self.display
-        answer = self.answer = self.session.predict(position, frequency)
+        with self._notice():
+            self._follow_receiver()
+            answer = self.answer = self.session.predict(position, frequency)
         d.spectrum.content = panel.spectrum_figure(answer.pas)
         d.summary.content = panel.summary(answer, frequency, c.budget, self.session.has_power)
         self.server.flush()  # the panel does not wait for the room, which takes longer to draw
@@ -273,12 +277,23 @@ class Viewer:
             self.view.draw_dome(answer.pas)
             self._draw_paths()
             if c.gaussians is not None:
-                off = c.gaussians.value == "off" or not self.session.has_gaussians
-                self.view.draw_gaussians(None if off else self.session.gaussians(position, frequency), str(c.gaussians.value))
+                self._draw_gaussians(str(c.gaussians.value))
         self.page.ready()
         self.updates += 1
         if not self._spectrum.waiting:
             self._show_beside(position, frequency)
+
+    @contextlib.contextmanager
+    def _notice(self) -> Iterator[None]:
+        """Shows a line if a prediction takes long, since the field is compiled for it."""
+        line = as_words("The field is being compiled for this query ...")
+        timer = threading.Timer(SLOW_S, lambda: setattr(self.display.summary, "content", line))
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            timer.join()
 
     def _show_beside(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> None:
         """Draws what may lag behind while the transmitter moves."""
@@ -301,6 +316,11 @@ class Viewer:
         count, by_power = int(c.paths.value), c.by_power.value == "by power"
         self.view.draw_paths(paths, count, by_power, self.chosen, self._choose)
         self.display.paths.content = panel.path_list(paths, count, self.chosen, c.budget, by_power)
+
+    def _draw_gaussians(self, by: str) -> None:
+        shown = by != "off" and self.session.has_gaussians
+        top = self.view.draw_gaussians(self.session.gaussians(self.position, self.frequency_hz) if shown else None, by)
+        self.display.gaussians.content = panel.gaussian_legend(top, by) if shown else ""
 
     def _choose(self, number: int) -> None:
         self.chosen = number

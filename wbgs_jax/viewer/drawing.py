@@ -9,8 +9,8 @@ from matplotlib import colormaps
 from wbgs_jax.propagation.paths import is_vertex
 from wbgs_jax.radio.array import pas_directions
 
-COLORS = "viridis"
-"""Colormap of spectra and maps."""
+COLORS, GAUSSIAN_COLORS = "viridis", "inferno"
+"""Colormaps of spectra and maps, and of Gaussians."""
 DOME_STRIDE = 4
 """Stride of the directions that are drawn at the receiver, along both axes."""
 PATH_RANGE_DB = 40.0

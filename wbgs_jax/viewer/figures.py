@@ -152,16 +152,19 @@ def stems(
 
 def power_legend(power: Axis, fade_db: float) -> str:
     """Returns a horizontal colour bar of the powers of paths; paths fade `fade_db` below the strongest one."""
-    box = LEFT, 4.0, WIDTH - 2 * LEFT, 9.0
-    steps = np.linspace(0, 1, KNOTS)
-    stops = _stops("plasma", steps, (0.0, 5 / 6))
-    ticks = _x_ticks(box, power)
     label = f"{power.label}; paths {fade_db:.0f} dB below the strongest fade"
+    return legend(Axis(power.low, power.high, label, power.ticks), "plasma", (0.0, 5 / 6))
+
+
+def legend(axis: Axis, colors: str, part: tuple[float, float] = (0.0, 1.0)) -> str:
+    """Returns a horizontal colour bar of a part of a colour map."""
+    box = LEFT, 4.0, WIDTH - 2 * LEFT, 9.0
+    stops = _stops(colors, np.linspace(0, 1, KNOTS), part)
     parts = [
-        f'<defs><linearGradient id="legend-bar">{stops}</linearGradient></defs>',
-        f'<rect x="{box[0]}" y="{box[1]}" width="{box[2]}" height="{box[3]}" fill="url(#legend-bar)"/>',
-        ticks,
-        _text(WIDTH / 2, 36.0, label),
+        f'<defs><linearGradient id="{colors}-bar">{stops}</linearGradient></defs>',
+        f'<rect x="{box[0]}" y="{box[1]}" width="{box[2]}" height="{box[3]}" fill="url(#{colors}-bar)"/>',
+        _x_ticks(box, axis),
+        _text(WIDTH / 2, 36.0, axis.label),
     ]
     return _svg(parts, 41.0, {})
 

@@ -99,6 +99,7 @@ class Display:
     truth: viser.GuiHtmlHandle
     channel: viser.GuiHtmlHandle
     paths: viser.GuiHtmlHandle
+    gaussians: viser.GuiHtmlHandle
 
 
 def make_panel(
@@ -140,6 +141,7 @@ def make_panel(
     with tabs.add_tab("Room"):
         cut = gui.add_multi_slider("heights [m]", round(heights[0], 2), round(top, 2), step=0.01, initial_value=heights)
         gaussians = gui.add_dropdown("Gaussians", ("off", "signal", "attenuation")) if session.has_gaussians else None
+        gaussian_scale = gui.add_html("")
         play = gui.add_checkbox("walk", False, hint="Move the transmitter through the room.")
         speed = gui.add_slider("speed [m/s]", 0.2, 3.0, step=0.1, initial_value=1.0)
         save = gui.add_button("save as HTML")
@@ -147,7 +149,7 @@ def make_panel(
         material = _material_controls(gui, session)
     radio = receiver, position, ghz, samples, dbm, band
     controls = Controls(*radio, paths, by_power, map_controls, cut, gaussians, play, speed, save, material)
-    return controls, Display(summary, spectrum, truth, channel, path_table)
+    return controls, Display(summary, spectrum, truth, channel, path_table, gaussian_scale)
 
 
 def receiver_names(session: Session) -> tuple[str, ...]:
@@ -275,6 +277,13 @@ def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float)
     y = figures.axis_over(high - DYNAMIC_DB - 5, high, "power [dBm]", 3)
     described = tuple(word for word, kept in zip(paths.words, strong, strict=True) if kept)
     return frequency + figure("Impulse response", figures.stems(delay[strong], power[strong], described, x, y))
+
+
+def gaussian_legend(top: float, by: str) -> str:
+    """Returns the colour bar of the Gaussians, which are coloured by "signal" or "attenuation" from 0 to `top`."""
+    label = "signal towards the receiver, amplitude" if by == "signal" else "share of a wave that is attenuated"
+    bar = figures.legend(figures.axis_over(0.0, top, label), drawing.GAUSSIAN_COLORS)
+    return f'<div class="wbgs-panel">{bar}</div>'
 
 
 def path_list(paths: PathList | None, count: int, chosen: int | None, budget: LinkBudget, by_power: bool) -> str:

@@ -215,11 +215,12 @@ class SceneView:
             if event.instance_index is not None:
                 on_click(int(event.instance_index))
 
-    def draw_gaussians(self, splatted: GaussianState | None, by: str) -> None:
-        """Draws the Gaussians, coloured by "signal" or "attenuation"; None removes them."""
+    def draw_gaussians(self, splatted: GaussianState | None, by: str) -> float:
+        """Draws the Gaussians, coloured by "signal" or "attenuation"; None removes them. Returns the value of the last
+        colour."""
         if splatted is None:
             self.scene.remove_by_name("/gaussians")
-            return
+            return 0.0
         gaussians = splatted.gaussians
         alive = np.flatnonzero(np.asarray(gaussians.alive))[:MOST_GAUSSIANS]
         attenuation, signal = (np.asarray(values)[alive, 0] for values in (splatted.attenuation, splatted.signal))
@@ -230,9 +231,10 @@ class SceneView:
             "/gaussians",
             np.asarray(gaussians.means)[alive].astype(np.float32),
             (factor @ factor.swapaxes(-1, -2)).astype(np.float32),
-            (drawing.colored(shown, 0.0, top, "inferno") / 255).astype(np.float32),
+            (drawing.colored(shown, 0.0, top, drawing.GAUSSIAN_COLORS) / 255).astype(np.float32),
             np.clip(attenuation, 0.05, 1.0)[:, None].astype(np.float32),
         )
+        return top
 
     def remove_map(self) -> None:
         """Removes the map."""
