@@ -61,6 +61,9 @@ from wbgs_jax.types import (
 
 FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM = 500, 16
 """The initial number of Gaussians is at most 16 per training spectrum, but this limit is never below 500."""
+SPARE = 16
+"""One slot in so many is free at first: most scenes need few Gaussians more than they begin with, and another number of slots is
+another program to compile."""
 INITIAL_ATTENUATION = 0.3
 """Initial attenuation of every Gaussian."""
 TILE_SLACK = 1.4
@@ -242,7 +245,7 @@ def _init(field: WidebandField, key: Key[Array, ""], given: bool) -> WidebandPar
 def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
     points = surface.points
     n = points.shape[0]
-    slots = slots_for(n)
+    slots = slots_for(n + n // SPARE)
     pad = slots - n
     log_scales = jnp.broadcast_to(jnp.log(jnp.maximum(surface.spacing, 1e-3))[:, None], (n, 3))
     logit = jnp.log(INITIAL_ATTENUATION / (MAX_ATTENUATION - INITIAL_ATTENUATION))

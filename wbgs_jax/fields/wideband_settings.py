@@ -109,7 +109,7 @@ CONFIGS = {
     "gpu": WidebandConfig(gaussians=0, width=128, depth=8, skip=4, fusion=0, radiance_widths=(128, 64)),
 }
 DENSITY = {
-    "smoke": DensityConfig(every=100, start=50, max_gaussians=640),
+    "smoke": DensityConfig(every=100, start=50, max_gaussians=600),
     "cpu": DensityConfig(every=200, start=200),
     "gpu": DensityConfig(max_gaussians=100_000, reset_every=3000),
 }

@@ -30,7 +30,7 @@ SPLIT_SHRINK = 1.6
 """Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting)."""
 CLONE_STEP = 0.5
 """Displacement of a clone, relative to its smallest standard deviation."""
-NEARLY_FULL = 0.7
+NEARLY_FULL = 0.9
 """Fraction of used slots from which on the program for the next size is compiled."""
 
 
