@@ -7,7 +7,6 @@ from . import splat as splat
 from ._util.pytree import pytree as pytree
 from ._util.pytree import static as static
 from .commands.train import train_field as train_field
-from .data.antenna_file import read_antenna as read_antenna
 from .data.load import load_dataset as load_dataset
 from .data.room_file import load_room as load_room
 from .data.scene import make_mesh as make_mesh
@@ -44,7 +43,6 @@ from .types import Mesh as Mesh
 from .types import Query as Query
 from .types import Receiver as Receiver
 from .types import Surface as Surface
-from .types import Transmitter as Transmitter
 from .types import make_query as make_query
 from .types import make_receiver as make_receiver
 from .types import stack_receivers as stack_receivers

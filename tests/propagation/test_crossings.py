@@ -83,7 +83,7 @@ def crossings_compared(rng) -> int:
     tx, rx = rng.uniform(0.2, (5.5, 3.5, 2.4), (2, 3))
     facets = facets_of(*parts)
     met = 0
-    for paths in jax.tree.leaves(trace(search_of(parts, rx), tx), is_leaf=lambda leaf: hasattr(leaf, "alive")):
+    for paths in trace(search_of(parts, rx), tx).sets:
         paths = jax.tree.map(np.asarray, paths)
         for k in np.flatnonzero(paths.alive):
             crossings, clear = [], True

@@ -85,7 +85,7 @@ def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
 
 @pytest.mark.parametrize("values", [{"clutter_cells": 0}, {"clutter_cell": 0.0}])
 def test_grids_without_cells_are_refused(values):
-    with pytest.raises(UserError, match="clutter-spectra 0 disables the grid"):
+    with pytest.raises(UserError, match="absorption-spectra 0 disables the grid"):
         WaveConfig(**values).check("wave")
 
 

@@ -46,6 +46,9 @@ def read_antenna(path: Path) -> Antenna:
               attenuations (dB) are added in every direction. Its azimuths are clockwise, its elevations positive downwards.
             * NumPy archive: complex `e_theta` and `e_phi` (zenith, azimuth), and the angles `zenith` and `azimuth` in radians.
 
+    Returns:
+        A tabulated antenna, unrotated: its gain is interpolated between the directions of the file.
+
     Raises:
         UserError: the file cannot be read, or does not describe the whole sphere.
     """

@@ -62,8 +62,8 @@ from wbgs_jax.types import (
 FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM = 500, 16
 """The initial number of Gaussians is at most 16 per training spectrum, but this limit is never below 500."""
 SPARE = 16
-"""One slot in so many is free at first: most scenes need few Gaussians more than they begin with, and another number of slots is
-another program to compile."""
+"""One slot in so many is free at first: most scenes need few Gaussians more than they begin with, and another number of slots
+is another program to compile."""
 INITIAL_ATTENUATION = 0.3
 """Initial attenuation of every Gaussian."""
 TILE_SLACK = 1.4

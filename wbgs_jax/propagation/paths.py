@@ -37,7 +37,7 @@ THROUGH = 0.5
 
 
 class InteractionType(IntEnum):
-    """What happens to a wave at a facet or an edge."""
+    """Type of the interaction of a wave with a facet or an edge."""
 
     word: str
     """Preposition of a description: through a wall, off a floor, around the edge of a cabinet."""

@@ -1,3 +1,5 @@
+from ..data.antenna_file import read_antenna as read_antenna
+from ..types import Transmitter as Transmitter
 from .antenna import Antenna as Antenna
 from .array import cbf as cbf
 from .array import pas_directions as pas_directions
