@@ -60,6 +60,13 @@ def test_a_stride_leaves_out_windows(images, stride):
         assert abs(expected - windows.mean()) > 1e-9
 
 
+def test_ssim_of_mixtures_is_that_of_each_mixture(images, rng):
+    truth, shares = jnp.asarray(rng.random(images[0].shape)), np.array([0.0, 0.3, 1.0])
+    found = jax.jit(losses.ssim_of_mixtures)(*images, truth, jnp.asarray(shares))
+    expected = [ssim(share * images[0] + (1 - share) * images[1], truth) for share in shares]
+    np.testing.assert_allclose(found.T, expected, rtol=1e-9)
+
+
 def test_identical_images_give_one(images):
     np.testing.assert_allclose(ssim(images[0], images[0]), 1, rtol=1e-12)
 

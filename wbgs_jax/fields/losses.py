@@ -57,12 +57,35 @@ def ssim(a: Float[Array, "*n h w"], b: Float[Array, "*n h w"], stride: int = 1) 
     Returns:
         The mean SSIM of every pair, at most 1.
     """
-    mean_a, mean_b = _blur(a, stride), _blur(b, stride)
-    squared_means, product = mean_a**2 + mean_b**2, mean_a * mean_b
-    variances = _blur(a * a + b * b, stride) - squared_means
-    covariance = _blur(a * b, stride) - product
-    luminance = (2 * product + _C1) / (squared_means + _C1)
-    structure = (2 * covariance + _C2) / (variances + _C2)
+    return _structural_similarity(*(_blur(image, stride) for image in (a, b, a * a + b * b, a * b)))
+
+
+def ssim_of_mixtures(
+    a: Float[Array, "*n h w"], b: Float[Array, "*n h w"], truth: Float[Array, "*n h w"], shares: Float[Array, " shares"]
+) -> Float[Array, "*n shares"]:
+    """Returns `ssim(share * a + (1 - share) * b, truth)` for all shares. Local moments of a mixture follow from those of its
+    parts, so that nine images are filtered for any number of shares."""
+    products = (a * a, a * b, b * b, a * truth, b * truth, truth * truth)
+    mean_a, mean_b, mean, aa, ab, bb, at, bt, tt = (_blur(image, 1) for image in (a, b, truth, *products))
+
+    def of(share: Float[Array, ""]) -> Array:
+        rest = 1 - share
+        squares = share**2 * aa + 2 * share * rest * ab + rest**2 * bb
+        return _structural_similarity(share * mean_a + rest * mean_b, mean, squares + tt, share * at + rest * bt)
+
+    return jnp.moveaxis(jax.lax.map(of, shares), 0, -1)
+
+
+def _structural_similarity(
+    mean_a: Float[Array, "*n y x"],
+    mean_b: Float[Array, "*n y x"],
+    squares: Float[Array, "*n y x"],
+    product: Float[Array, "*n y x"],
+) -> Float[Array, "*n"]:
+    """Returns the mean SSIM from local means of two images, of the sum of their squares, and of their product."""
+    squared_means, product_of_means = mean_a**2 + mean_b**2, mean_a * mean_b
+    luminance = (2 * product_of_means + _C1) / (squared_means + _C1)
+    structure = (2 * (product - product_of_means) + _C2) / (squares - squared_means + _C2)
     return jnp.mean(luminance * structure, axis=(-2, -1))
 
 

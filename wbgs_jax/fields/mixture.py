@@ -38,7 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.base import Observation, Params
-from wbgs_jax.fields.losses import ssim
+from wbgs_jax.fields.losses import ssim, ssim_of_mixtures
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import NO_PATH_DB, beyond_free_space_db
 from wbgs_jax.types import Query
@@ -204,7 +204,7 @@ def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360
 
 @jax.jit
 def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> Float[Array, "b shares"]:
-    return jax.lax.map(lambda share: ssim(share * one + (1 - share) * other, truth), jnp.asarray(SHARES, jnp.float32)).T
+    return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32))
 
 
 def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:

@@ -75,8 +75,9 @@ HOOKS: dict[str, Callable[[Any], Hook]] = {
     "expert_weights": lambda _: ExpertWeights(),
 }
 """Constructors of hooks from their section of the settings, by their names in fields and settings."""
-VALIDATION_LINKS, BLOCK = 720, 16
-"""Maximum number of validation links for hooks, and their number per batch."""
+VALIDATION_LINKS, BLOCK, FEW_BLOCKS = 720, 16, 8
+"""Maximum number of validation links for hooks, and their number per batch. Of more batches than the third number, a shorter
+last one is left out: it would need a program of its own."""
 
 
 def make_hook(name: str, settings: Settings) -> Hook | None:
@@ -346,7 +347,7 @@ class Run:
             own[i : i + BLOCK]
             for number in np.unique(receiver)
             for own in [chosen[receiver == number]]
-            for i in range(0, len(own), BLOCK)
+            for i in range(0, len(own) if len(own) < FEW_BLOCKS * BLOCK else len(own) // BLOCK * BLOCK, BLOCK)
         ]
         return [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
 
