@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import shlex
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -237,6 +238,7 @@ def _train(command: Command, settings: Settings) -> None:
     config = dataclasses.replace(config, convention=dataset.convention)
     check_data(dataset, get_field(config.field))
     folder = command.out or default_folder(dataset, config)
+    begin = time.monotonic()
     by_first(lambda: prepare_folder(folder, config, command.resume))
     counts = f"{len(dataset.train)} spectra, {len(dataset.validation)} for validation, {len(dataset.test)} for the test"
     tell = say if is_first() else _nothing
@@ -255,7 +257,7 @@ def _train(command: Command, settings: Settings) -> None:
         except KeyboardInterrupt:  # in the last epoch, after it, or for the second time
             raise Interrupted("stopped; run the same command with --resume to continue") from None
         by_first(lambda: write_manifest(folder, load_trained(folder)))
-    tell(summary(result, folder))
+    tell(summary(result, folder, time.monotonic() - begin))
     tell(f"next: wbgs-jax eval --run {shlex.quote(str(folder))}   (scores on held-out transmitters, and figures)")
 
 
@@ -285,6 +287,7 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
         of_spectra, of_powers = learn_confidence(*trained, None)
         write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
         return
+    say("validation: correction by measured spectra nearby, prediction intervals")
     learned = learn_neighbours(*trained) if config.neighbours else Learned()
     write_neighbours(folder, learned.neighbours)
     if learned.line:
@@ -292,10 +295,10 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
     write_confidence(folder, *learn_confidence(*trained, learned.of_training))
 
 
-def summary(result: TrainResult, folder: Path) -> str:
-    """Returns the last line of a training."""
+def summary(result: TrainResult, folder: Path, seconds: float) -> str:
+    """Returns the last line of a training that took `seconds` of wall time since it was started or continued."""
     sizes = ", ".join(f"{count} {name}" for name, count in result.sizes.items())
-    return f"trained {result.steps} steps in {result.seconds:.0f} s, {sizes}, {result.compilations} compilations: {folder}"
+    return f"trained {result.steps} steps, {sizes}, {seconds:.0f} s in all: {folder}"
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ class ExpertWeights(Hook):
             return same
         if not (batches := context.validation()):
             return same
+        context.say("validation: weights of the coherent and the splatting half")
         raw = mixing.put(params, mixing.field.with_shares(mixing.of(params)))
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
         plans = {number: field.plan(raw, receiver, context.prepared) for number, receiver in receivers.items()}

@@ -492,7 +492,7 @@ def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[s
     stopping = any_process(interrupt["set"])
     figures = run.epoch(go_on=not (stopping or run.due(after)))
     interrupted = any_process(interrupt["set"]) and not run.launched
-    run.run_hooks()
+    run.run_hooks(progress.stage)
     entry: dict[str, Any] = {"step": after} | {name: None if np.isnan(v) else v for name, v in figures.items()}
     entry |= run.sizes | {"seconds": run.seconds}
     if len(run.watched) and (crosses(before, after, loop.evaluate_every) or after == total):

@@ -30,8 +30,14 @@ from wbgs_jax.fields import Field
 
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
 """Metrics that are evaluated at intervals, and displayed until the next evaluation."""
-LABELS = {"batch_ssim": "SSIM", "held_out_ssim": "held-out SSIM", "held_out_power_error_db": "held-out power error dB"}
-UNSHOWN = ("step", "seconds")
+LABELS = {
+    "batch_ssim": "SSIM of the batch",
+    "batch_ssim_wave": "of its coherent half",
+    "held_out_ssim": "SSIM on validation",
+    "held_out_power_error_db": "power error on validation (dB)",
+}
+UNSHOWN = ("step", "seconds", "materials", "facets", "edges")
+"""Entries that are not displayed: most of these numbers do not change."""
 
 
 class TrainingProgress:

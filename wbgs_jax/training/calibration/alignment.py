@@ -126,7 +126,7 @@ class _Heard:
             compared: "covariances" accounts for the uncertainty of positions, "snapshots" takes them as exact.
             sized: whether unknown thicknesses are estimated as well.
         """
-        self.say("calibration: materials, with uncertain positions")
+        self.say("calibration: materials of the surfaces, with uncertain positions")
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
         once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
         if sized:
@@ -184,7 +184,7 @@ def learn_geometry(
     if data.snapshots is not None:
         free = _followed(start, heard, links, FREE_RECEIVER, named=True)
         if _went_far(free.field.motion, 3.0):  # further than by chance
-            say("calibration: displacement of the receiver")
+            say("calibration: position of the receiver")
             sure = _surely_better(free, held, heard, links)
             found = [(free, FREE_RECEIVER)] if sure else [*found, (free, FREE_RECEIVER)]
     begun = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
@@ -256,7 +256,7 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
     variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)
     covariance = np.diag(variances[numbers])
     for highest in frequencies_apart(frequency):
-        heard.say(f"calibration: alignment up to {highest / 1e9:.4g} GHz")
+        heard.say(f"calibration: positions of surfaces, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _retraced(dataclasses.replace(now, field=now.field.moved(motion)), now.params, links, data), none
             now = heard.named(now, 1) if named else now

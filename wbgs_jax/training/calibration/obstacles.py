@@ -83,7 +83,7 @@ def search_absent(
     before = now = _explained(params, judged, config)
     once = dataclasses.replace(config, rounds=1)
     for _ in range(ROUNDS):
-        say("calibration: spurious bodies")
+        say("calibration: objects of the mesh that the room lacks")
         movers = absent_movers(params, told, config)
         if not len(movers):
             break

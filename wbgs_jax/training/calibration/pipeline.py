@@ -93,7 +93,7 @@ class Calibration(Hook):
         report: dict[str, Any] = {}
         told = Told(field, prepared, data, spectra)
         if not data.has_spectra:  # one number per link distinguishes materials, but contains neither phases nor directions
-            say("calibration: gain and materials")
+            say("calibration: gain and materials of the surfaces")
             params, gain = search_gain(params, told.scores(config.spectra))
             if config.rounds:
                 params, named = search_materials(params, told, config.spectra, config, usual=True)
@@ -104,10 +104,10 @@ class Calibration(Hook):
             few = told.scores(1, compared)
             context.ahead(("scores", compared), functools.partial(few, [params]))
         if config.antenna_rounds:
-            say("calibration: antennas")
+            say("calibration: antenna patterns")
             params, _ = self._antennas(params, told, report)
         if config.rounds:
-            say("calibration: materials")
+            say("calibration: materials of the surfaces")
             params, named, _ = search_slabs(params, told, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             if config.spurious_spectra and data.snapshots is not None:
@@ -117,14 +117,14 @@ class Calibration(Hook):
                     field, prepared = told.field, told.prepared
                     params, named, _ = search_slabs(params, told, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
-            say("calibration: propagation options")
+            say("calibration: delay by walls, curvature of waves")
             for _ in range(SWEEPS):
                 params = self._idealisations(params, told, report)
                 params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
                 params, _ = search_materials(params, told, config.propagation_spectra, config)
-            say("calibration: position uncertainty")
+            say("calibration: accuracy of the mesh")
             _, guessed = search_placement(params, told.scores(config.position_std_spectra, "covariances"))
             report["doubt"] = dataclasses.asdict(guessed)
             field = self._tuning(params, told, report)
@@ -173,7 +173,7 @@ class Calibration(Hook):
         """Returns parameters and field with an absorption grid, if it fits better."""
         if not self.config.absorption_spectra:
             return params, told.field
-        say("calibration: absorption grid")
+        say("calibration: obstacles that the mesh lacks")
         params, told, found = search_clutter(params, told, self.config, rng)
         if found:
             report["clutter"] = dataclasses.asdict(found)
