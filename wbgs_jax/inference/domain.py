@@ -60,11 +60,12 @@ class Domain(NamedTuple):
 
     def without_intervals(
         self,
-        answer: dict[str, np.ndarray],
-        positions: Float[np.ndarray, "tx 3"],
-        frequencies_hz: Float[np.ndarray, " tx_or_freq"],
+        answer: dict[str, Any],
+        positions: Float[AnyArray, "tx 3"],
+        frequencies_hz: Float[AnyArray, " tx_or_freq"],
         paired: bool = True,
-    ) -> dict[str, np.ndarray]:
+        xp: Any = np,
+    ) -> dict[str, Any]:
         """Returns predictions with NaN in place of invalid intervals.
 
         Args:
@@ -72,19 +73,18 @@ class Domain(NamedTuple):
             positions: of the transmitters, metres.
             frequencies_hz: one for each transmitter, or those at which each is queried if not paired.
             paired: whether the i-th transmitter is queried at the i-th frequency only.
+            xp: module of the arrays, as in `outside`.
         """
         if not set(INTERVALS) & set(answer):
             return answer
-        outside, beyond = self.outside(positions), self.out_of_band(frequencies_hz)
+        outside, beyond = self.outside(positions, xp), self.out_of_band(frequencies_hz)
         nowhere = outside | beyond if paired else outside[:, None] | beyond
-        return {
-            name: np.where(nowhere.reshape(*nowhere.shape, *[1] * (values.ndim - nowhere.ndim)), np.nan, values).astype(
-                values.dtype
-            )
-            if name in INTERVALS
-            else values
-            for name, values in answer.items()
-        }
+
+        def masked(values: Any) -> Any:
+            beside = nowhere.reshape(*nowhere.shape, *[1] * (values.ndim - nowhere.ndim))
+            return xp.where(beside, xp.nan, values).astype(values.dtype)
+
+        return {name: masked(values) if name in INTERVALS else values for name, values in answer.items()}
 
     def warnings(
         self, rx: Float[np.ndarray, "3"], tx_positions: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]

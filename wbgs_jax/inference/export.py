@@ -38,7 +38,7 @@ from wbgs_jax.inference.evaluate_quantities import domain_of, known_quantities
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
 from wbgs_jax.inference.predictor import OnAnyShape, Predictor, trained_band
-from wbgs_jax.inference.quantities import COMPILED, INTERVALS, QUANTITIES
+from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.types import Query, Receiver, Transmitter
 
@@ -157,12 +157,8 @@ def _serialize(trained: TrainedField, dataset: Dataset, platforms: Sequence[str]
     frozen, domain = frozen._replace(plan=portable(frozen.plan)), domain_of(dataset)
 
     def answer(tx_position: Float[Array, "n 3"], frequency_hz: Float[Array, " n"]) -> dict[str, Array]:
-        nowhere = domain.outside(tx_position, jnp) | domain.out_of_band(frequency_hz)
         answers = answer_all(frozen, Query(Transmitter(tx_position), frequency_hz), names)
-        return {
-            name: jnp.where(nowhere.reshape(-1, *[1] * (values.ndim - 1)), jnp.nan, values) if name in INTERVALS else values
-            for name, values in answers.items()
-        }
+        return domain.without_intervals(answers, tx_position, frequency_hz, xp=jnp)
 
     (n,) = jax.export.symbolic_shape("n")
     shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
