@@ -238,7 +238,6 @@ class WaveField(Calibratable):
             return jax.tree.map(lambda leaf: leaf[:0], part)
 
         gains: Any = self.tuning
-        materials = common_size(max(len(self.known_thickness), len(self.motion.shift)))
         if gains is None and len(self.receivers):
             gains = np.zeros((len(self.receivers), elements, 2), np.float32)
         slim = replaced(
@@ -247,7 +246,7 @@ class WaveField(Calibratable):
             edges=nothing(self.edges),
             first_placement=nothing(self.first_placement),
             motion=dataclasses.replace(self.motion, shift=nothing(self.motion.shift), turn=nothing(self.motion.turn)),
-            known_thickness=padded_to(materials, self.known_thickness),
+            known_thickness=padded_to(self._common_materials, self.known_thickness),
             tuning=gains,
             first_clutter=None,
         )
@@ -256,15 +255,18 @@ class WaveField(Calibratable):
 
     def params_in_common_shapes(self, params: WaveParams) -> WaveParams:
         """Returns parameters, whose leaves may have a leading axis, with sizes as in `in_common_shapes` (host)."""
-        bodies = len(self.motion.shift)
         places, last = params.placement[..., :-1], params.placement[..., -1:]
-        materials = common_size(max(len(self.known_thickness), bodies))
         return replaced(
             params,
-            materials=jax.tree.map(lambda leaf: padded_to(materials, leaf, -1), params.materials),
+            materials=jax.tree.map(lambda leaf: padded_to(self._common_materials, leaf, -1), params.materials),
             facet_correction=padded_to(common_size(params.facet_correction.shape[-2]), params.facet_correction, -2),
-            placement=np.concatenate([padded_to(common_size(bodies), places, -1), last], -1),
+            placement=np.concatenate([padded_to(common_size(places.shape[-1]), places, -1), last], -1),
         )
+
+    @property
+    def _common_materials(self) -> int:
+        """Number of materials in common shapes, which is enough for one of each rigid body."""
+        return common_size(max(len(self.known_thickness), len(self.motion.shift)))
 
     def with_gains(self, gains: Complex[np.ndarray, "r elements"]) -> "WaveField":
         """Returns the field with the array gains of its receivers multiplied by these complex gains."""

@@ -274,8 +274,8 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
     frequency_hz = link.frequency_hz
     slabs, found = slabs_at(params, plan, frequency_hz), []
     density = None if params.clutter is None else _density_at(params.clutter, frequency_hz)
+    antennas = transmitter_antenna(params, link.transmitter), params.element
     for some in paths.sets:
-        antennas = transmitter_antenna(params, link.transmitter), params.element
         transport = MECHANISMS[some.mechanism].transport
         one = arrivals(some, plan.surfaces, slabs, frequency_hz, plan.receiver, transport, *antennas)
         gain = jnp.exp(params.log_gain) * _corrections(params, some)

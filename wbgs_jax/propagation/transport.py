@@ -43,11 +43,6 @@ class Segments(NamedTuple):
     """Length of the whole path, metres."""
 
 
-Transport = Callable[..., tuple[Complex[Array, "k 3"], Float[Array, " k"]]]
-"""(field at the transmitter (k, 3), paths, segments, slabs along them, surfaces, materials, frequency_hz) -> the field at the
-receiver without spreading (k, 3), and the spreading factors (k,), per metre."""
-
-
 class SlabInteractions(NamedTuple):
     """Slabs along K paths: the basis in which they split the field, and their coefficients."""
 
@@ -62,6 +57,23 @@ class SlabInteractions(NamedTuple):
     """Unit vectors in that plane, perpendicular to the outgoing ray (TM)."""
     te: Complex[Array, "k 5"]
     tm: Complex[Array, "k 5"]
+
+
+class Passage(NamedTuple):
+    """K paths of one mechanism, and all that the field along them depends on."""
+
+    paths: PathGeometry
+    segments: Segments
+    interactions: SlabInteractions
+    surfaces: Surfaces
+    slabs: Slabs
+    """Materials of the facets at the frequency."""
+    frequency_hz: Float[Array, ""]
+
+
+Transport = Callable[[Complex[Array, "k 3"], Passage], tuple[Complex[Array, "k 3"], Float[Array, " k"]]]
+"""(field at the transmitter (k, 3), passage) -> the field at the receiver without spreading (k, 3), and the spreading factors
+(k,), per metre."""
 
 
 @partial(jax.jit, static_argnames="transport")
@@ -96,7 +108,7 @@ def arrivals(
     segments = segments_of(paths)
     field = transmitter.field(segments.direction[:, 0]).astype(slabs.permittivity.dtype)
     interactions = _slab_interactions(paths, segments, surfaces, slabs, frequency_hz)
-    field, spreading = transport(field, paths, segments, interactions, surfaces, slabs, frequency_hz)
+    field, spreading = transport(field, Passage(paths, segments, interactions, surfaces, slabs, frequency_hz))
     last = last_segment(paths)
     arrival = segments.direction[jnp.arange(len(last)), last]
     local, here = to_local(-arrival, receiver.orientation), to_local(field, receiver.orientation)
@@ -274,29 +286,14 @@ def _across(along: Float[Array, "*n 3"], normal: Float[Array, "*n 3"]) -> Float[
     return _unit(jnp.where(_dot(s, s)[..., None] < 1e-8, jnp.cross(along, other), s))
 
 
-def specular_transport(
-    field: Complex[Array, "k 3"],
-    paths: PathGeometry,
-    segments: Segments,
-    interactions: SlabInteractions,
-    surfaces: Surfaces,
-    slabs: Slabs,
-    frequency_hz: Float[Array, ""],
-) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
+def specular_transport(field: Complex[Array, "k 3"], passage: Passage) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
     """Returns the field behind all slabs, and the spreading factor."""
-    return through_slabs(field, interactions, interactions.active), 1 / segments.total
+    return through_slabs(field, passage.interactions, passage.interactions.active), 1 / passage.segments.total
 
 
-def diffracted_transport(
-    field: Complex[Array, "k 3"],
-    paths: PathGeometry,
-    segments: Segments,
-    interactions: SlabInteractions,
-    surfaces: Surfaces,
-    slabs: Slabs,
-    frequency_hz: Float[Array, ""],
-) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
+def diffracted_transport(field: Complex[Array, "k 3"], passage: Passage) -> tuple[Complex[Array, "k 3"], Float[Array, " k"]]:
     """Returns the field after the slabs before an edge, the edge, and the slabs behind it; and the spreading factor."""
+    paths, segments, interactions, surfaces, slabs, frequency_hz = passage
     k, place = jnp.arange(len(field)), jnp.arange(MAX_INTERACTIONS)
     slot, active = jnp.argmax(on_edge(paths.interaction_type), -1), interactions.active
     segment, edge = paths.interaction_segment[k, slot], paths.interaction_facet[k, slot]
