@@ -178,12 +178,12 @@ def checksum(dataset: Dataset) -> str:
 
 
 def check_checksum(actual: str, expected: str, where: str) -> None:
-    """Checks that the data of a run are those it was trained on; an empty expectation is met by any.
+    """Checks that the data of a run are those it was trained on.
 
     Raises:
         UserError: the checksums differ.
     """
-    if expected and actual != expected:
+    if actual != expected:
         raise UserError(f"the data of {where} have changed since it was trained; restore them, or train again")
 
 

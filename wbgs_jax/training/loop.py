@@ -63,6 +63,13 @@ class Precompilation:
         """Waits for a call, and returns whether its programs are ready."""
         return key in self._calls and self._calls[key].exception() is None
 
+    def __enter__(self) -> "Precompilation":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Drops calls that have not begun: the process would make them before it ends."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
     def _run(self, call: Callable[[], object]) -> None:
         begin = time.perf_counter()
         call()
@@ -343,12 +350,12 @@ class Run:
         """Returns batches of validation links, each of one receiver."""
         chosen = np.random.default_rng([self.seed, 4]).permutation(self.dataset.validation)[:VALIDATION_LINKS]
         receiver = self.dataset.receiver_index[chosen]
-        blocks = [
-            own[i : i + BLOCK]
-            for number in np.unique(receiver)
-            for own in [chosen[receiver == number]]
-            for i in range(0, len(own) if len(own) < FEW_BLOCKS * BLOCK else len(own) // BLOCK * BLOCK, BLOCK)
-        ]
+        blocks = list[Int[np.ndarray, " b"]]()
+        for number in np.unique(receiver):
+            own = chosen[receiver == number]
+            if len(own) >= FEW_BLOCKS * BLOCK:
+                own = own[: len(own) // BLOCK * BLOCK]
+            blocks += np.split(own, range(BLOCK, len(own), BLOCK))
         return [self.data.batch(jnp.asarray(block, jnp.int32), self.key) for block in blocks]
 
     def evaluate(self) -> dict[str, float]:
@@ -381,7 +388,7 @@ class Run:
         if not steps:
             return False
         saved = checkpoint.read(self.checkpoints, steps[-1])
-        check_checksum(self.checksum, saved.metadata.get("data", ""), str(self.folder))
+        check_checksum(self.checksum, saved.metadata.get("data", self.checksum), str(self.folder))
         self.field = field_from_arrays(type(self.field), jax.tree.map(jnp.asarray, saved.field), self.settings.field)
         params = checkpoint.fill(saved, self.field.init, self.key, prefix=".params")
         like = jax.eval_shape(lambda params: init_state(params, self.optimizer, self.hooks), params)
@@ -463,7 +470,8 @@ def train(
     resumed = resume and run.restore()
     check_alike((run.state, run.field), "the initial state of training")
     total = settings.optim.steps
-    with deferred_interrupt() as interrupt, TrainingProgress(total, run.step, shown and is_first()) as progress:
+    progress = TrainingProgress(total, run.step, shown and is_first())
+    with deferred_interrupt() as interrupt, run.precompilation, progress:
         if not resumed:
             _begin(run, progress, interrupt)
         while run.step < total:

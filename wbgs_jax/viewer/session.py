@@ -25,7 +25,7 @@ from wbgs_jax.inference.trained_field import at_receiver
 from wbgs_jax.metrics import ssim
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import NO_PATH_DB, Paths, decibels, delay_spread_s, k_factor_db
-from wbgs_jax.types import Query, Receiver, make_query
+from wbgs_jax.types import Query, Receiver
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ class PathList:
     def frequency_response_db(self, offsets_hz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Returns the response of an element at frequencies relative to the carrier, dB relative to the transmitted power. The
         amplitudes of the paths at the carrier are used, which are nearly constant over bands of a few percent."""
+        # `Paths.cfr` on the host: the number of paths differs between queries, and JAX would compile anew for each.
         turns = np.exp(-2j * np.pi * offsets_hz[:, None] * (self.length / SPEED_OF_LIGHT))
         return np.asarray(decibels(jnp.asarray(np.abs(turns @ self.amplitude) ** 2)))
 
@@ -197,9 +198,8 @@ class Session:
             warnings=tuple(domain.warnings(np.asarray(self.receiver.position), place, hertz)),
         )
 
-    @staticmethod
-    def _query(position: Float[np.ndarray, "3"], frequency_hz: float) -> Query:
-        return make_query(np.asarray(position)[None], np.array([frequency_hz]))
+    def _query(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Query:
+        return self.loaded.query(np.asarray(position)[None], np.array([frequency_hz]))
 
     def nearest_sample(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> Sample | None:
         """Returns the observed spectrum nearest to a transmitter and frequency; None if the receiver has no spectra."""

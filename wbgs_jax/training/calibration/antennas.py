@@ -84,7 +84,6 @@ def search_antennas(
     ends = ENDS[:1] if known_elements else ENDS
     for turn in range(config.antenna_rounds * len(ends)):
         end, candidates = ends[turn % len(ends)], antenna_candidates()  # new arrays, since training donates each of them once
-        # The current antenna is scored together with the others; alone it would need a separate program.
         tried = [params, *(replaced(params, **{end: antenna}) for antenna in candidates.values())]
         scores = score(tried)
         best = 1 + int(np.argmin(scores[1:].mean(1)))

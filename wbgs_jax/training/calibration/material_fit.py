@@ -147,9 +147,10 @@ def with_properties(
 
 
 def _with(leaf: Float[Array, " m"], index: int, value: float | None) -> Float[Array, " m"]:
-    """Returns `leaf.at[index].set(value)`, computed in an eighth of the time, since there are thousands of candidates. Without
-    a value it returns a copy, so that all kinds of candidates differ in the same leaves and share a program (objective.py)."""
+    """Returns `leaf.at[index].set(value)`, computed in an eighth of the time, since there are thousands of candidates; the leaf
+    itself without a value."""
+    if value is None:
+        return leaf
     copy = np.array(leaf)
-    if value is not None:
-        copy[index] = value
+    copy[index] = value
     return jnp.asarray(copy)

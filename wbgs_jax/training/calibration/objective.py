@@ -63,7 +63,7 @@ def make_scores(
         spectra: indices of the links.
         compared: the compared quantity.
     """
-    by = _comparable(compared, data)
+    by = comparable(compared, data)
 
     @functools.cache
     def common() -> tuple[Calibratable, PreparedPaths]:
@@ -114,7 +114,7 @@ class Told:
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
 
 
-def _comparable(compared: Compared, data: TrainingData) -> Compared:
+def comparable(compared: Compared, data: TrainingData) -> Compared:
     """Returns what is compared instead if data do not contain it, so that equal comparisons share a program."""
     elements = 0 if data.snapshots is None else data.snapshots.shape[-1]
     if elements == 1 or not data.has_spectra:  # the snapshot of a single element contains its power only

@@ -118,7 +118,6 @@ def absent_movers(params: WaveParams, told: Told, config: CalibrationConfig) -> 
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
-    # The modified parameters first: scoring the current ones then needs no separate program (objective.py).
     without_one = score([_of_air(params, one) for one in tried], config.spurious_glance)
     gains = score([params], config.spurious_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]

@@ -26,7 +26,7 @@ from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas
 from wbgs_jax.training.calibration.array_gains import search_tuning
 from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
-from wbgs_jax.training.calibration.objective import Scores, Told
+from wbgs_jax.training.calibration.objective import Scores, Told, comparable
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
@@ -100,9 +100,10 @@ class Calibration(Hook):
                 params, gain = search_gain(params, told.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
-        for compared in ("covariances", "spectra"):
-            few = told.scores(1, compared)
-            context.ahead(("scores", compared), functools.partial(few, [params]))
+        if config.rounds:
+            later = {comparable("covariances", data), comparable("spectra", data)} - {comparable("snapshots", data)}
+            for compared in sorted(later):
+                context.ahead(("scores", compared), functools.partial(told.scores(1, compared), [params]))
         if config.antenna_rounds:
             say("calibration: antenna patterns")
             params, _ = self._antennas(params, told, report)
