@@ -21,9 +21,10 @@ from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.export import load_exported
-from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
+from wbgs_jax.inference.intervals import Confidence, PowerConfidence, write_confidence
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.training import checkpoint
+from wbgs_jax.training.fit_intervals import SETS
 from wbgs_jax.training.run_folder import write_config
 
 INSIDE = ["1,0.5,1.5", "-1,1,1.2"]
@@ -185,12 +186,18 @@ def test_what_a_field_gives_is_what_can_be_asked_for(tmp_path):
         assert not (tmp_path / "k.npz").exists() and not (tmp_path / "none.npz").exists()
 
 
+def intervals():
+    """Of spectra and of powers: the same for every query."""
+    k, numbers = SETS[-1], (jnp.log(4.0), jnp.asarray(2.0), jnp.asarray(0.9))
+    of_spectra = (np.zeros(3), np.eye(3), np.zeros(k), np.ones(k), np.full(k + 1, -0.1), (-1, 1), 1.2, 0.9)
+    of_powers = jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5)
+    return Confidence(*(jnp.asarray(part, jnp.float32) for part in of_spectra)), PowerConfidence(*of_powers, *numbers)
+
+
 def test_powers_come_with_how_sure_they_are(tmp_path):
-    numbers = jnp.log(4.0), jnp.asarray(2.0), jnp.asarray(0.9)
-    sure = PowerConfidence(jnp.zeros((1, 3)), jnp.zeros(4), jnp.ones(4), jnp.zeros(5), *numbers)
     with registered(HearingField):
         run = make_toy_run(tmp_path / "hearing", HearingField(RippleConfig()))
-        write_confidence(run, None, sure)
+        write_confidence(run, None, intervals()[1])
         ask = ["--run", run, "--tx", "1,2,1", "-1,0,2", "--ghz", 2, 5, "--what", "power"]
         result = predict(*ask, "--out", tmp_path / "power.npz")
     assert result.code == 0, result.err
@@ -318,8 +325,9 @@ def test_a_picture_alone_asks_for_no_more_than_it_shows(hearing, tmp_path, monke
 
 @pytest.mark.parametrize(("what", "name"), [("spectra", "pas"), ("power", "power_db")])
 def test_a_field_that_was_left_ready_says_the_same(tmp_path, monkeypatch, what, name):
-    """Without reading the run again, unless it has changed."""
+    """Without reading the run again, unless it has changed. Arrays are in the same order: pictures draw the first."""
     run = make_run(tmp_path / "box")
+    write_confidence(run, *intervals())
     ask = ["--run", run, "--tx", *INSIDE, "--ghz", 28, 2, "--what", what, "--out"]
     monkeypatch.setenv("WBGS_CACHE", "")
     assert predict(*ask, tmp_path / "plain.npz").code == 0
@@ -330,10 +338,12 @@ def test_a_field_that_was_left_ready_says_the_same(tmp_path, monkeypatch, what, 
     monkeypatch.setattr(predict_command, "load_field", lambda run, *more: loaded.append(run) or real(run, *more))
     again = predict(*ask, tmp_path / "second.npz")
     assert (again.code, loaded) == (0, [])
+    assert predict(*ask[:-1], "--picture", tmp_path / "second.png").code == 0 and (tmp_path / "second.png").stat().st_size
+    assert not loaded
     with np.load(tmp_path / "plain.npz") as plain:
         for one in ("first", "second"):
             with np.load(tmp_path / f"{one}.npz") as answer:
-                assert {*answer} == {*plain}
+                assert [*answer] == [*plain]
                 np.testing.assert_allclose(answer[name], plain[name], atol=2e-5)
                 assert str(answer["meta"]) == str(plain["meta"])
     assert predict(*ask[:-1], "--rx", 1, "--out", tmp_path / "none.npz").code == 2

@@ -60,12 +60,9 @@ class CachedField:
         """Returns the same as `LoadedField.answer`, for at most `MOST` queries."""
         _, positions, frequencies = flatten(block)
 
-        def wanted(query: tuple[np.ndarray, np.ndarray]) -> dict[str, Any]:
-            found = self.program(*self.arrays, *query)
-            return {name: found[name] for name in QUANTITIES[what].outputs if name in found}
-
         query = np.asarray(positions, np.float32), np.asarray(frequencies, np.float32)
-        answers = map_blocks(wanted, query, size_for(len(positions)), full=True)
+        found = map_blocks(lambda block: self.program(*self.arrays, *block), query, size_for(len(positions)), full=True)
+        answers = {name: found[name] for name in QUANTITIES[what].outputs if name in found}  # in order: JAX sorts the names
         return self.domain.without_intervals(answers, positions, frequencies)
 
 
