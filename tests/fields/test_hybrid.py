@@ -14,7 +14,7 @@ from wbgs_jax.fields import get_field
 from wbgs_jax.fields import mixture as noise
 from wbgs_jax.fields.base import outputs_of, paths_of
 from wbgs_jax.fields.hybrid import HybridField, Trust, _informed
-from wbgs_jax.fields.mixture import FEATURES, Opinions, Shares, constant, reported, with_floor, without_floor
+from wbgs_jax.fields.mixture import FEATURES, ExpertPredictions, Shares, constant, reported, with_floor, without_floor
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.radio.array import snapshot_to_pas
@@ -53,7 +53,7 @@ def weighted(run, params, batches):
     return edit.params, edit.report
 
 
-def opinions(run, params, index):
+def expert_predictions(run, params, index):
     """What the coherent field says, the splatting one by itself, and the splatting one that sees the coherent one."""
     field, dataset = run.field, run.dataset
     wave = observe_links(field.wave, params.wave, dataset, index)
@@ -71,7 +71,7 @@ def mixture(shares, one, other, third):
 def test_it_says_a_mixture_of_what_its_fields_say(run, shares):
     params, index = trusting(run.state.params, *shares), run.dataset.validation
     seen = observe_links(run.field, params, run.dataset, index)
-    said = opinions(run, params, index)
+    said = expert_predictions(run, params, index)
     # Roots of small powers, in single precision.
     np.testing.assert_allclose(seen.pas, mixture(shares[0], *(one.pas for one in said)), atol=3e-4)
     np.testing.assert_allclose(seen.power_db, mixture(shares[1], *(one.power_db for one in said)), atol=1e-2)
@@ -87,7 +87,7 @@ def test_the_shares_are_what_explains_other_links_best(run, share):
     """Of truths that are mixtures of the coherent and the own opinion, and of these and the informed one."""
     params, index = run.state.params, run.dataset.validation
     batch = run.data.batch(jnp.asarray(index), run.key)
-    wave, own, informed = opinions(run, params, index)
+    wave, own, informed = expert_predictions(run, params, index)
     truth = share * wave.pas + (1 - share) * own.pas
     power = share * wave.power_db + (1 - share) * informed.power_db
     batch = batch.with_observations(pas=jnp.asarray(truth), power_db=jnp.asarray(power))
@@ -120,7 +120,13 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
 
     own = jnp.mean(jnp.stack([drawn() for _ in range(10)]), 0)
     own = own / own.max((1, 2), keepdims=True)
-    said = Seen(Opinions(seen.pas, own, own), Opinions(*3 * (seen.power_db,)), jnp.zeros((len(index), FEATURES)), drawn(), None)
+    said = Seen(
+        ExpertPredictions(seen.pas, own, own),
+        ExpertPredictions(*3 * (seen.power_db,)),
+        jnp.zeros((len(index), FEATURES)),
+        drawn(),
+        None,
+    )
 
     def opinions_without_floor(field, given, *_):
         assert float(given.trust.floor) == 0  # or it would be found in what is left of it
@@ -149,7 +155,7 @@ def test_its_answers_are_without_the_floor(run):
     """Of the splatting field's opinions; what arrives along paths has none."""
     params, index = trusting(run.state.params, (0.3, 0.6), (0.8, 1.0)), run.dataset.validation
     noisy = dataclasses.replace(params, trust=dataclasses.replace(params.trust, floor=jnp.asarray(0.02)))
-    wave, *learned = opinions(run, params, index)
+    wave, *learned = expert_predictions(run, params, index)
     said = jnp.asarray(observe_links(run.field, noisy, run.dataset, index).pas)
     np.testing.assert_allclose(
         said, mixture((0.3, 0.6), wave.pas, *(without_floor(one.pas, 0.02) for one in learned)), atol=2e-3

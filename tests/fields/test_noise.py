@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wbgs_jax.fields import mixture
-from wbgs_jax.fields.mixture import Opinions, at_least_floor, floor_of, observed_opinions, with_floor, without_floor
+from wbgs_jax.fields.mixture import ExpertPredictions, at_least_floor, floor_of, observed_predictions, with_floor, without_floor
 from wbgs_jax.radio.array import PAS_SHAPE, pas_directions, planar_array, steering_vector
 
 ARRAY = planar_array(4, 4, 0.5)
@@ -84,7 +84,7 @@ def known(rng, share, n_tx=20, per_tx=2):
 
 
 def found(unaware, learned, observed, tx):
-    return floor_of(Opinions(unaware, np.zeros_like(unaware), learned), observed, tx)
+    return floor_of(ExpertPredictions(unaware, np.zeros_like(unaware), learned), observed, tx)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.1])
@@ -118,10 +118,10 @@ def test_where_no_path_arrives_both_have_learned_the_floor(rng):
     """The coherent field takes over what the splatting one says there."""
     (clean, learned, observed, tx), _ = known(rng, 0.1)
     unmet = rng.permutation(len(tx)) < 10
-    said = Opinions(np.where(unmet[:, None, None], learned, clean), learned, learned)
-    met = Opinions(*(spectra[~unmet] for spectra in said))
+    said = ExpertPredictions(np.where(unmet[:, None, None], learned, clean), learned, learned)
+    met = ExpertPredictions(*(spectra[~unmet] for spectra in said))
     assert floor_of(said, observed, tx) == pytest.approx(floor_of(met, observed[~unmet], tx[~unmet]), rel=0.6)
-    seen = observed_opinions(said, 0.02)
+    seen = observed_predictions(said, 0.02)
     np.testing.assert_array_equal(seen.coherent[unmet], seen.own[unmet])
     np.testing.assert_allclose(seen.coherent[~unmet], with_floor(jnp.asarray(clean[~unmet]), 0.02), rtol=1e-6)
     np.testing.assert_array_equal(seen.informed, at_least_floor(jnp.asarray(learned, jnp.float32), 0.02))

@@ -8,7 +8,7 @@ from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.mixture import (
     FEATURES,
     SHARES,
-    Opinions,
+    ExpertPredictions,
     Scored,
     Shares,
     at_first,
@@ -82,7 +82,7 @@ def test_three_opinions_come_to_the_mixture_that_is_nearest(rng):
     told = rng.normal(size=(600, FEATURES)).astype(np.float32)
     truth, shadow = rng.normal(-90, 10, 600), told[:, 3] > 0
     coherent, own = truth + rng.normal(0, np.where(shadow, 20, 2), 600), truth + rng.normal(0, np.where(shadow, 20, 2), 600)
-    said = Opinions(coherent, own, truth + rng.normal(0, np.where(shadow, 1, 20), 600))
+    said = ExpertPredictions(coherent, own, truth + rng.normal(0, np.where(shadow, 1, 20), 600))
     shares = learn_shares(told, np.repeat(np.arange(60), 10), said, lambda one, other: nearness(truth, one, other))
     error = np.abs(np.asarray(mixed(shares, jnp.asarray(told), said)) - truth)
     for one in said:
@@ -92,7 +92,7 @@ def test_three_opinions_come_to_the_mixture_that_is_nearest(rng):
 
 
 def test_both_fields_count_alike_at_first_and_one_opinion_can_count_alone(rng):
-    said, told = Opinions(*rng.normal(size=(3, 4, 90, 360))), jnp.asarray(rng.normal(size=(4, FEATURES)), jnp.float32)
+    said, told = ExpertPredictions(*rng.normal(size=(3, 4, 90, 360))), jnp.asarray(rng.normal(size=(4, FEATURES)), jnp.float32)
     expected = said.coherent / 2 + (said.own + said.informed) / 4
     np.testing.assert_allclose(mixed(at_first(), told, said), expected, atol=1e-5)
     np.testing.assert_allclose(mixed(coherent_alone(), told, said), said.coherent, atol=2e-2)

@@ -11,7 +11,7 @@ from builders.rooms import box
 from builders.synthetic import tiny_settings
 from builders.wave_runs import PARTS, heard_in, of_concrete, places, run_in
 
-from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.calibration.obstacles import absent_movers, search_absent
 
 N_TX, FREQUENCIES = 60, np.array([1e9, 4e9, 16e9])
@@ -40,7 +40,7 @@ def truth(tmp_path_factory):
 
 def told_of(parts, truth, folder):
     run = run_in(parts, SETTINGS, folder, PLACES, FREQUENCIES, truth)
-    return run, Told(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+    return run, CalibrationProblem(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
 
 
 def anything(rng):
@@ -80,17 +80,17 @@ def test_a_field_without_a_mover_is_that_of_the_mesh_without_it(truth, tmp_path,
 def test_what_is_there_stays(truth, tmp_path, rng):
     """Though all of it stands two centimetres off, and walls are then often worse than none at the lowest frequency."""
     wrong = [part.copy().apply_translation(rng.normal(0, 0.02, 3)) for part in PARTS]
-    run, told = told_of(wrong, truth, tmp_path)
-    _, same, report = search_absent(of_concrete(run), told, SETTINGS.calibration)
-    assert same is told and not report.centres and report.after == report.before
+    run, problem = told_of(wrong, truth, tmp_path)
+    _, same, report = search_absent(of_concrete(run), problem, SETTINGS.calibration)
+    assert same is problem and not report.centres and report.after == report.before
 
 
 @pytest.mark.heavy
 def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
     """At high frequencies alone, where places are not believed; and bodies without facets change nothing."""
-    run, told = told_of([*PARTS, anything(rng)], truth, tmp_path)
+    run, problem = told_of([*PARTS, anything(rng)], truth, tmp_path)
     params = of_concrete(run)
-    high = dataclasses.replace(told, spectra=told.spectra[told.frequency_hz() > 2e9])
+    high = dataclasses.replace(problem, spectra=problem.spectra[problem.frequency_hz() > 2e9])
     assert not len(absent_movers(params, high, SETTINGS.calibration))
     ghosts = [jnp.concatenate([leaf, jnp.zeros((2, 3))]) for leaf in (run.field.motion.shift, run.field.motion.turn)]
     motion = dataclasses.replace(run.field.motion, shift=ghosts[0], turn=ghosts[1])
@@ -98,9 +98,9 @@ def test_nothing_is_left_out_of_what_cannot_be_told(truth, tmp_path, rng):
     facets = dataclasses.replace(run.field.facets, mover=mover)
     surfaces = dataclasses.replace(run.prepared.surfaces, facets=dataclasses.replace(run.prepared.surfaces.facets, mover=mover))
     field = dataclasses.replace(run.field, facets=facets, motion=motion)
-    large = dataclasses.replace(told, field=field, prepared=dataclasses.replace(run.prepared, surfaces=surfaces))
+    large = dataclasses.replace(problem, field=field, prepared=dataclasses.replace(run.prepared, surfaces=surfaces))
     np.testing.assert_array_equal(
-        absent_movers(params, large, SETTINGS.calibration), absent_movers(params, told, SETTINGS.calibration) + 2
+        absent_movers(params, large, SETTINGS.calibration), absent_movers(params, problem, SETTINGS.calibration) + 2
     )
 
 

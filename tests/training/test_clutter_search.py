@@ -12,7 +12,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields.base import paths_of
 from wbgs_jax.fields.coherent import WaveConfig
 from wbgs_jax.fields.coherent_model import densities, stored
-from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.calibration.obstacles import search_clutter
 from wbgs_jax.training.curves import read
 from wbgs_jax.training.loop import train
@@ -51,7 +51,9 @@ def heard_behind_a_hedge(folder, rng):
 
 def told_of(parts, truth, folder, n_tx=N_TX):
     run = run_in(parts, SETTINGS, folder, PLACES[:n_tx], FREQUENCIES, truth[:n_tx])
-    return of_concrete(run), Told(run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train))
+    return of_concrete(run), CalibrationProblem(
+        run.field, run.prepared, run.data, np.random.default_rng(0).permutation(run.dataset.train)
+    )
 
 
 @pytest.mark.heavy
@@ -75,11 +77,11 @@ def test_a_hedge_that_the_mesh_lacks_is_found_where_it_stands_and_read_again(tmp
 @pytest.mark.heavy
 def test_nothing_is_found_in_a_room_as_the_mesh_has_it(tmp_path, rng):
     run = run_in(PARTS, SETTINGS, tmp_path / "true", PLACES, FREQUENCIES)
-    params, told = told_of(PARTS, heard_in(run, of_concrete(run), PLACES, FREQUENCIES), tmp_path / "same")
-    same, still, report = search_clutter(params, told, SETTINGS.calibration, rng)
+    params, problem = told_of(PARTS, heard_in(run, of_concrete(run), PLACES, FREQUENCIES), tmp_path / "same")
+    same, still, report = search_clutter(params, problem, SETTINGS.calibration, rng)
     assert not report.taken
     assert same is params
-    assert still is told
+    assert still is problem
     assert same.clutter is None
 
 
@@ -91,8 +93,8 @@ def test_grids_without_cells_are_refused(values):
 
 def test_few_transmitters_prove_nothing(tmp_path, rng):
     nothing = np.ones((12, 1, len(FREQUENCIES), 16), np.complex64)
-    params, told = told_of(PARTS, nothing, tmp_path, n_tx=12)
-    assert search_clutter(params, told, SETTINGS.calibration, rng) == (params, told, None)
+    params, problem = told_of(PARTS, nothing, tmp_path, n_tx=12)
+    assert search_clutter(params, problem, SETTINGS.calibration, rng) == (params, problem, None)
 
 
 @pytest.mark.heavy

@@ -15,7 +15,7 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.radio.channel import received_power_db
 from wbgs_jax.training.calibration import pipeline as search_module
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, search_materials, with_entry
-from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.loop import Run
 
 FREQUENCIES = np.array([1e9, 94e9])
@@ -113,8 +113,8 @@ def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_
     monkeypatch.setattr("wbgs_jax.training.calibration.objective.make_scores", scores)
     materials = with_entry(run.state.params.materials, 0, "concrete")
     params = dataclasses.replace(run.state.params, materials=materials)
-    told = Told(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
-    found, _ = search_materials(params, told, 48, dataclasses.replace(SETTINGS.calibration, rounds=1))
+    problem = CalibrationProblem(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
+    found, _ = search_materials(params, problem, 48, dataclasses.replace(SETTINGS.calibration, rounds=1))
     np.testing.assert_allclose(found.materials.log_susceptibility[0], np.log(ITU_MATERIALS[expected][0] - 1), rtol=1e-5)
 
 

@@ -121,9 +121,9 @@ def test_what_was_ruled_out_stays_so_when_paths_are_traced_again(truth, tmp_path
     monkeypatch.setattr(alignment, "adjust", lambda field, params, prepared, motion, covariance, *_: (motion, covariance))
     prepared = run.prepared  # which is done when it is first asked for
     monkeypatch.setattr(type(run.field), "prepare", lambda *_: traced.append(1) or prepared)
-    heard = alignment._Heard(run.data, np.asarray(run.dataset.train), SETTINGS.calibration, np.random.default_rng(0), silent)
+    heard = alignment._Observed(run.data, np.asarray(run.dataset.train), SETTINGS.calibration, np.random.default_rng(0), silent)
     now = Place(run.field, run.state.params, run.prepared, likely=likely)
-    assert alignment._followed(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
+    assert alignment._aligned(now, heard, run.data.links, (1e-3, 2e-3), named=False).likely is likely and traced
 
 
 @pytest.mark.heavy

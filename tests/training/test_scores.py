@@ -13,7 +13,7 @@ from wbgs_jax.data import scene_dataset
 from wbgs_jax.mesh.edges import common_size
 from wbgs_jax.training.calibration import objective
 from wbgs_jax.training.calibration.material_fit import with_entry
-from wbgs_jax.training.calibration.objective import Told, make_scores, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, make_scores, surely_better
 from wbgs_jax.training.calibration.obstacles import _carried, _each_by_itself
 from wbgs_jax.training.loop import Run
 
@@ -137,16 +137,16 @@ def test_more_errors_than_random_flips_can_tell_are_counted(rng):
 @pytest.mark.heavy
 def test_similar_fields_share_a_program_and_score_alike(run):
     """A material for every body and ideal array gains change no shape, and a few bodies fewer usually none."""
-    told = Told(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
-    scores = told.scores()([run.state.params])
+    problem = CalibrationProblem(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
+    scores = problem.scores()([run.state.params])
     programs = objective._score._cache_size()
-    by_body, params = _each_by_itself(run.state.params, told)
+    by_body, params = _each_by_itself(run.state.params, problem)
     np.testing.assert_allclose(by_body.scores()([params]), scores, atol=1e-4)
     ideal = run.field.with_gains(np.ones(run.data.receivers.element_positions.shape[:2], complex))
-    np.testing.assert_allclose(dataclasses.replace(told, field=ideal).scores()([run.state.params]), scores, atol=1e-4)
+    np.testing.assert_allclose(dataclasses.replace(problem, field=ideal).scores()([run.state.params]), scores, atol=1e-4)
     assert objective._score._cache_size() == programs
     fewer = run.field.without(np.array([0]))  # here a large part of the mesh
-    left = dataclasses.replace(told, field=fewer, prepared=fewer.prepare(run.data.links, run.data.receivers))
+    left = dataclasses.replace(problem, field=fewer, prepared=fewer.prepare(run.data.links, run.data.receivers))
     assert np.abs(left.scores()([_carried(run.state.params, fewer)]) - scores).max() > 1e-3
     sizes = (311, 54, 900), (300, 50, 880)  # facets, bodies and edges of scene 1, and a few of them fewer
     assert len({tuple(map(common_size, of_mesh)) for of_mesh in sizes}) == 1

@@ -10,7 +10,7 @@ from builders.synthetic import tiny_settings
 from builders.wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, USUAL_M, SearchReport, search_materials
-from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.calibration.thickness import ONCE_MORE, Slab, _all_slabs, _best, frequencies_to_look_at, search_slabs
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 2.4e9, 5e9, 12e9, 28e9])
@@ -47,10 +47,10 @@ def of(params, names, metres):
     return dataclasses.replace(params, materials=materials)
 
 
-def told(room, truth, field=None):
+def problem(room, truth, field=None):
     plan = room.field.plan(truth, room.dataset.receiver(), prepared=room.prepared)
     data = room.data.with_observations(snapshots=snapshots(truth, plan, room.prepared, room.data.links))
-    return Told(field or room.field, room.prepared, data, np.asarray(room.dataset.train))
+    return CalibrationProblem(field or room.field, room.prepared, data, np.asarray(room.dataset.train))
 
 
 @pytest.mark.heavy
@@ -69,7 +69,7 @@ def off_in_a_room(room, rng):
     names = rng.choice(["concrete", "brick", "plasterboard", "wood", "glass"], len(PARTS))
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     start = room.field.init(jax.random.key(0))
-    heard = told(room, of(start, names, metres))
+    heard = problem(room, of(start, names, metres))
     found, report, likely = search_slabs(start, heard, SETTINGS.calibration, 60)
     alone, _ = search_materials(start, heard, 60, SETTINGS.calibration)
     left, without = heard.scores()([found, alone]).mean(1)
@@ -89,7 +89,7 @@ def test_what_fits_stays(room, rng):
     """Walls as thick as is usual, which is where the search begins."""
     names = rng.choice(["concrete", "brick", "plasterboard", "wood"], len(PARTS))
     start = room.field.init(jax.random.key(0))
-    heard = told(room, of(start, names, [USUAL_M[name] for name in names]))
+    heard = problem(room, of(start, names, [USUAL_M[name] for name in names]))
     found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     usual = np.log([USUAL_M[name] for name in names])
     assert not report.thickness_mm or np.abs(np.asarray(found.materials.log_thickness) - usual).max() < 0.02
@@ -101,7 +101,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
     start = room.field.init(jax.random.key(0))
     metres = rng.uniform(0.01, 0.3, len(PARTS))
     known = dataclasses.replace(room.field, known_thickness=jnp.full(len(PARTS), 0.1))
-    heard = told(room, of(start, ["wood"] * len(PARTS), metres), known)
+    heard = problem(room, of(start, ["wood"] * len(PARTS), metres), known)
     found, report, _ = search_slabs(start, heard, SETTINGS.calibration, 60)
     assert not report.thickness_mm
     np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
@@ -109,7 +109,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
 
 def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     start = room.field.init(jax.random.key(0))
-    heard = told(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
+    heard = problem(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))
     heard = dataclasses.replace(heard, data=heard.data.with_observations())
     nothing = SearchReport(0.0, 0.0, {})
     monkeypatch.setattr("wbgs_jax.training.calibration.thickness.search_materials", lambda params, *_, **__: (params, nothing))

@@ -11,7 +11,7 @@ from builders.wave_runs import PARTS, places, run_in
 
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning
-from wbgs_jax.training.calibration.objective import Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.types import make_query
 
 N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
@@ -54,8 +54,8 @@ def heard_by(run, field, params):
 
 def searched(run, heard, folder, rng):
     own = run_in(PARTS, SETTINGS, folder, PLACES, FREQUENCIES, heard)
-    told = Told(own.field, own.prepared, own.data, rng.permutation(own.dataset.train))
-    return own.field, *search_tuning(run.state.params, told, 200)
+    problem = CalibrationProblem(own.field, own.prepared, own.data, rng.permutation(own.dataset.train))
+    return own.field, *search_tuning(run.state.params, problem, 200)
 
 
 @pytest.mark.heavy

@@ -25,7 +25,7 @@ from wbgs_jax.fields.base import Aux, Field, Group, Inspection, Observation, reg
 from wbgs_jax.fields.coherent import WaveConfig, WaveField
 from wbgs_jax.fields.coherent_model import PreparedPaths
 from wbgs_jax.fields.mixture import (
-    Opinions,
+    ExpertPredictions,
     Shares,
     at_first,
     features,
@@ -140,9 +140,9 @@ class HybridField(Field):
         spectra, power = mixed(params.trust.spectra, inputs, pas), mixed(params.trust.power, inputs, power_db)
         return coherent._replace(pas=spectra, power_db=power, covariance=None)  # the covariance is of the coherent field only
 
-    def opinions(
+    def expert_predictions(
         self, params: HybridParams, plan: HybridPlan, links: Query
-    ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+    ) -> tuple[ExpertPredictions, ExpertPredictions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on; the
         scene must have a mesh."""
         return self._said(params, plan, links, self.wave.render(params.wave, plan.wave, links))
@@ -156,7 +156,7 @@ class HybridField(Field):
 
     def _said(
         self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
-    ) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+    ) -> tuple[ExpertPredictions, ExpertPredictions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B queries, and the features that their weights depend on."""
         assert coherent.pas is not None and coherent.power_db is not None, "the coherent field predicts both"
         nothing = jnp.zeros_like(coherent.pas)
@@ -166,10 +166,10 @@ class HybridField(Field):
         inputs = features(query, plan.wave.receiver.position, coherent, own)
         assert own.power_db is not None, "the splatting field predicts received power"
         met = coherent.power_db > NO_PATH_DB  # without any path the coherent field predicts nothing
-        powers = Opinions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
+        powers = ExpertPredictions(jnp.where(met, coherent.power_db, own.power_db), own.power_db, informed.power_db)
         floor = jax.lax.stop_gradient(params.trust.floor)  # estimated, not trained
         clean, clean_informed = (without_floor(seen.pas, floor) for seen in (own, informed))
-        spectra = Opinions(jnp.where(met[:, None, None], coherent.pas, clean), clean, clean_informed)
+        spectra = ExpertPredictions(jnp.where(met[:, None, None], coherent.pas, clean), clean, clean_informed)
         return spectra, powers, inputs
 
     def as_observed(self, params: HybridParams, pas: Float[Array, "b 90 360"]) -> Float[Array, "b 90 360"]:

@@ -81,7 +81,7 @@ class Shares:
     """Weight of these two together; the remainder is that of the conditioned splatting field."""
 
 
-class Opinions(NamedTuple):
+class ExpertPredictions(NamedTuple):
     """Predictions of three experts for B links: spectra, or received powers in decibels."""
 
     coherent: Any
@@ -93,7 +93,9 @@ class Opinions(NamedTuple):
 class Mixing(Protocol):
     """A field that mixes three experts with weights that are fitted after its training."""
 
-    def opinions(self, params: Params, plan: Any, links: Query) -> tuple[Opinions, Opinions, Float[Array, "b features"]]:
+    def expert_predictions(
+        self, params: Params, plan: Any, links: Query
+    ) -> tuple[ExpertPredictions, ExpertPredictions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on."""
         ...
 
@@ -144,10 +146,10 @@ def share_of(share: Share, features: Float[Array, "b features"]) -> Float[Array,
     return jax.nn.sigmoid(share.bias + jnp.matmul(scaled, share.weights, precision=EXACT))
 
 
-def mixed(shares: Shares, features: Float[Array, "b features"], said: Opinions) -> Any:
+def mixed(shares: Shares, features: Float[Array, "b features"], predicted: ExpertPredictions) -> Any:
     """Returns the mixture of three experts for B queries."""
-    first = _mix(share_of(shares.coherent, features), said.coherent, said.own)
-    return _mix(share_of(shares.uninformed, features), first, said.informed)
+    first = _mix(share_of(shares.coherent, features), predicted.coherent, predicted.own)
+    return _mix(share_of(shares.uninformed, features), first, predicted.informed)
 
 
 def _mix(share: Float[Array, " b"], one: Any, other: Any) -> Any:
@@ -180,14 +182,25 @@ def features(
 
 
 def learn_shares(
-    told: Float[np.ndarray, "n features"], tx_index: Int[np.ndarray, " n"], said: Opinions, worth: Callable[[Any, Any], Any]
+    features: Float[np.ndarray, "n features"],
+    tx_index: Int[np.ndarray, " n"],
+    predicted: ExpertPredictions,
+    worth: Callable[[Any, Any], Any],
 ) -> Shares:
-    """Returns the weights that fit N links best (host), fitted one after the other. `told` are the features of the links, and
-    `said` the predictions of the experts; `worth(one, other)` returns the scores (n, shares) of the mixtures of two experts on
-    each link, for all weights (`SHARES`) of the first."""
-    coherent = learn_share(Scored(told, worth(said.coherent, said.own), tx_index))
-    first = np.asarray(_mix(share_of(coherent, jnp.asarray(told)), jnp.asarray(said.coherent), jnp.asarray(said.own)))
-    return Shares(coherent, learn_share(Scored(told, worth(first, said.informed), tx_index)))
+    """Returns the weights that fit N links best (host), fitted one after the other.
+
+    Args:
+        features: features of the links.
+        tx_index: transmitters of the links.
+        predicted: predictions of the experts.
+        worth: returns the scores (n, shares) of the mixtures of two experts on each link, for all weights (`SHARES`) of the
+            first.
+    """
+    coherent = learn_share(Scored(features, worth(predicted.coherent, predicted.own), tx_index))
+    first = np.asarray(
+        _mix(share_of(coherent, jnp.asarray(features)), jnp.asarray(predicted.coherent), jnp.asarray(predicted.own))
+    )
+    return Shares(coherent, learn_share(Scored(features, worth(first, predicted.informed), tx_index)))
 
 
 def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
@@ -207,11 +220,11 @@ def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> 
     return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32))
 
 
-def nearness(heard_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
+def nearness(measured_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
     """Returns the negative absolute error (dB) of the mixtures of two received powers with all weights of `SHARES`; 0 for links
     on which nothing was received."""
     mixtures = SHARES * one[:, None] + (1 - SHARES) * other[:, None]
-    return np.where((heard_db > NO_PATH_DB)[:, None], -np.abs(mixtures - heard_db[:, None]), 0)
+    return np.where((measured_db > NO_PATH_DB)[:, None], -np.abs(mixtures - measured_db[:, None]), 0)
 
 
 def learn_share(known: Scored) -> Share:
@@ -316,7 +329,7 @@ def at_least_floor(pas: Float[Array, "b 90 360"], floor: Float[Array, ""] | floa
     return jnp.maximum(pas, jnp.sqrt(floor / (1 + floor)))
 
 
-def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: Int[np.ndarray, " n"]) -> float:
+def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360"], tx_index: Int[np.ndarray, " n"]) -> float:
     """Returns the noise floor of N observed spectra (host): the lowest of three estimates; 0 unless the spectra of the coherent
     field, which are free of noise, are significantly more similar to the observed ones with it.
 
@@ -325,8 +338,13 @@ def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: 
         observed: observed spectra.
         tx_index: their transmitters, which are the independent samples.
     """
-    looked = np.random.default_rng(0).permutation(np.flatnonzero(_met(said)))[:COMPARED]
-    unaware, learned, observed, tx_index = said.coherent[looked], said.informed[looked], observed[looked], tx_index[looked]
+    looked = np.random.default_rng(0).permutation(np.flatnonzero(_met(predicted)))[:COMPARED]
+    unaware, learned, observed, tx_index = (
+        predicted.coherent[looked],
+        predicted.informed[looked],
+        observed[looked],
+        tx_index[looked],
+    )
     if len(np.unique(tx_index)) < FEWEST_TX:
         return 0.0
     added = in_blocks(_added, unaware, observed)
@@ -340,24 +358,24 @@ def floor_of(said: Opinions, observed: Float[np.ndarray, "n 90 360"], tx_index: 
     return float(min(LEVELS[best], harmless, np.quantile(learned**2, DARKEST)))
 
 
-def observed_opinions(said: Opinions, floor: float) -> Opinions:
+def observed_predictions(predicted: ExpertPredictions, floor: float) -> ExpertPredictions:
     """Returns spectra of the experts as they would be observed if the floor were first removed from those that have learned it
     and then added to all (host)."""
-    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in said[1:])
-    coherent = jnp.where(_met(said)[:, None, None], with_floor(jnp.asarray(said.coherent), floor), own)
-    return Opinions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
+    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in predicted[1:])
+    coherent = jnp.where(_met(predicted)[:, None, None], with_floor(jnp.asarray(predicted.coherent), floor), own)
+    return ExpertPredictions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
 
 
-def _met(said: Opinions) -> Bool[np.ndarray, " n"]:
+def _met(predicted: ExpertPredictions) -> Bool[np.ndarray, " n"]:
     """Returns the links for which the coherent field has a prediction of its own."""
-    return np.asarray((said.coherent != said.own).any((-2, -1)))
+    return np.asarray((predicted.coherent != predicted.own).any((-2, -1)))
 
 
 def _alike(
-    change: Callable[..., Array], said: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
+    change: Callable[..., Array], predicted: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
 ) -> Float[Array, "b levels"]:
     """Returns the similarity (SSIM) to the observed spectra of others that are changed by each floor of `LEVELS`."""
-    return jax.lax.map(lambda floor: ssim(change(said, floor), observed), jnp.asarray(LEVELS, said.dtype)).T
+    return jax.lax.map(lambda floor: ssim(change(predicted, floor), observed), jnp.asarray(LEVELS, predicted.dtype)).T
 
 
 _added, _raised = (jax.jit(partial(_alike, change)) for change in (with_floor, at_least_floor))

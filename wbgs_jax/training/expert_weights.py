@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, components_of
 from wbgs_jax.fields.mixture import (
+    ExpertPredictions,
     Mixing,
-    Opinions,
     coherent_alone,
     floor_of,
     learn_shares,
     nearness,
-    observed_opinions,
+    observed_predictions,
     reported,
     similarity,
 )
@@ -29,9 +29,9 @@ from wbgs_jax.types import Batch
 class Seen(NamedTuple):
     """Predictions of the experts for B links, with observations."""
 
-    spectra: Opinions
-    power: Opinions
-    told: Float[Array, "b features"]
+    spectra: ExpertPredictions
+    power: ExpertPredictions
+    features: Float[Array, "b features"]
     """Features that the mixture weights depend on."""
     pas: Float[Array, "b 90 360"] | None
     power_db: Float[Array, " b"] | None
@@ -63,17 +63,17 @@ class ExpertWeights(Hook):
         receivers = {_receiver_of(batch): batch.receiver for batch in batches}
         plans = {number: field.plan(raw, receiver, context.prepared) for number, receiver in receivers.items()}
         own = {number: mixing.of(plan) for number, plan in plans.items()}
-        found = (opinions_on(mixing.field, mixing.of(raw), own[_receiver_of(batch)], batch) for batch in batches)
+        found = (expert_predictions_of(mixing.field, mixing.of(raw), own[_receiver_of(batch)], batch) for batch in batches)
         seen = [jax.tree.map(np.asarray, one) for one in found]
-        said, powers, told, pas, heard_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
+        predicted, powers, features, pas, measured_db = jax.tree.map(lambda *parts: np.concatenate(parts), *seen)
         tx_index = np.concatenate([np.asarray(batch.links.tx_index) for batch in batches])
         floor, spectra = 0.0, coherent_alone()
         if pas is not None:
-            floor = floor_of(said, pas, tx_index)
-            spectra = learn_shares(told, tx_index, observed_opinions(said, floor), partial(similarity, pas))
-        known = heard_db is not None and np.any(heard_db > NO_PATH_DB)
-        power = coherent_alone() if not known else learn_shares(told, tx_index, powers, partial(nearness, heard_db))
-        report = {name: reported(shares, told) for name, shares in (("spectra", spectra), ("power", power))}
+            floor = floor_of(predicted, pas, tx_index)
+            spectra = learn_shares(features, tx_index, observed_predictions(predicted, floor), partial(similarity, pas))
+        known = measured_db is not None and np.any(measured_db > NO_PATH_DB)
+        power = coherent_alone() if not known else learn_shares(features, tx_index, powers, partial(nearness, measured_db))
+        report = {name: reported(shares, features) for name, shares in (("spectra", spectra), ("power", power))}
         weighted = mixing.field.with_shares(mixing.of(params), spectra, power, floor)
         return same._replace(params=mixing.put(params, weighted), report={"shares": report, "noise_floor": floor})
 
@@ -83,7 +83,7 @@ def _receiver_of(batch: Batch) -> int:
 
 
 @jax.jit
-def opinions_on(field: Mixing, params: Params, plan: Any, batch: Batch) -> Seen:
+def expert_predictions_of(field: Mixing, params: Params, plan: Any, batch: Batch) -> Seen:
     """Returns the experts' spectra and received powers of links, the features of their weights, and the observations."""
-    spectra, power, told = field.opinions(params, plan, batch.links)
-    return Seen(spectra, power, told, batch.pas, batch.received_db)
+    spectra, power, features = field.expert_predictions(params, plan, batch.links)
+    return Seen(spectra, power, features, batch.pas, batch.received_db)

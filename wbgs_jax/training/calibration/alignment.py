@@ -1,7 +1,7 @@
 """Alignment of the surfaces of a mesh that is inaccurate by millimetres to centimetres with training spectra (host).
 
 A path length error of a tenth of a wavelength has little effect, and an error of a whole wavelength looks the same as none.
-Alignment therefore begins at low frequencies, and each frequency reduces the ambiguity of the next: every rigid body, and the
+Alignment therefore starts at low frequencies, and each frequency reduces the ambiguity of the next: every rigid body, and the
 receiver, is given a small rigid motion whose effect on phases is computed to first order (propagation/displacement.py). The
 motions are estimated by least squares (`gauss_newton.py`) or, without snapshots, by gradient descent (`gradient.py`); at
 intervals the surfaces are displaced and paths are traced again. Materials are chosen in view of the current uncertainty of
@@ -33,7 +33,7 @@ from wbgs_jax.training.calibration.antennas import ENDS
 from wbgs_jax.training.calibration.gauss_newton import adjust, adjusted_numbers
 from wbgs_jax.training.calibration.gradient import descend
 from wbgs_jax.training.calibration.material_fit import search_materials
-from wbgs_jax.training.calibration.objective import Compared, Told, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared, surely_better
 from wbgs_jax.training.calibration.thickness import Likely, search_slabs
 from wbgs_jax.training.calibration.uncertainty import search_placement
 from wbgs_jax.training.hooks import Say, silent
@@ -104,7 +104,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class _Heard:
+class _Observed:
     """Training spectra with which candidates are scored."""
 
     data: TrainingData
@@ -113,11 +113,11 @@ class _Heard:
     rng: np.random.Generator
     say: Say
 
-    def told(self, now: Place) -> Told:
+    def problem(self, now: Place) -> CalibrationProblem:
         """Returns these spectra, in a new random order, for scoring a candidate."""
-        return Told(now.field, now.prepared, self.data, self.rng.permutation(self.spectra))
+        return CalibrationProblem(now.field, now.prepared, self.data, self.rng.permutation(self.spectra))
 
-    def named(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
+    def with_materials(self, now: Place, rounds: int, compared: Compared = "covariances", sized: bool = False) -> Place:
         """Returns a candidate with newly chosen materials.
 
         Args:
@@ -128,30 +128,33 @@ class _Heard:
         """
         self.say("calibration: materials of the surfaces, with uncertain positions")
         count = self.config.geometry_spectra if compared == "covariances" else self.config.spectra
-        once, told = dataclasses.replace(self.config, rounds=rounds), self.told(now)
+        once, problem = dataclasses.replace(self.config, rounds=rounds), self.problem(now)
         if sized:
-            params, _, likely = search_slabs(now.params, told, once, count, compared, now.likely)
+            params, _, likely = search_slabs(now.params, problem, once, count, compared, now.likely)
             return dataclasses.replace(now, params=params, likely=likely)
-        params, _ = search_materials(now.params, told, count, once, compared)
+        params, _ = search_materials(now.params, problem, count, once, compared)
         return dataclasses.replace(now, params=params)
 
-    def guessed(self, now: Place, compared: Compared = "covariances") -> Place:
+    def with_uncertainty(self, now: Place, compared: Compared = "covariances") -> Place:
         """Returns a candidate with the position uncertainty that fits spectra best."""
-        params, _ = search_placement(now.params, self.told(now).scores(self.config.position_std_spectra, compared))
+        params, _ = search_placement(now.params, self.problem(now).scores(self.config.position_std_spectra, compared))
         return dataclasses.replace(now, params=params)
 
-    def surprised(self, now: Place) -> float:
+    def unlikelihood(self, now: Place) -> float:
         """Returns the mean negative log-likelihood of some spectra, always the same ones, given the position uncertainty."""
-        told = Told(now.field, now.prepared, self.data, np.random.default_rng(0).permutation(self.spectra))
-        return float(told.scores(self.config.spectra, "covariances")([now.params])[0].mean())
+        problem = CalibrationProblem(now.field, now.prepared, self.data, np.random.default_rng(0).permutation(self.spectra))
+        return float(problem.scores(self.config.spectra, "covariances")([now.params])[0].mean())
 
     def compared(self, places: list[Place]) -> tuple[list[Place], list[np.ndarray], np.ndarray]:
         """Returns candidates, each with the position uncertainty that fits best, their scores on some spectra, and the
         transmitters of these."""
         spectra = self.rng.choice(self.spectra, min(self.config.spectra, len(self.spectra)), replace=False)
-        doubted = [self.guessed(one, "spectra") for one in places]
-        scores = [Told(p.field, p.prepared, self.data, spectra).scores(compared="spectra")([p.params])[0] for p in doubted]
-        return doubted, scores, np.asarray(self.data.links.tx_index)[spectra]
+        uncertain = [self.with_uncertainty(one, "spectra") for one in places]
+        scores = [
+            CalibrationProblem(p.field, p.prepared, self.data, spectra).scores(compared="spectra")([p.params])[0]
+            for p in uncertain
+        ]
+        return uncertain, scores, np.asarray(self.data.links.tx_index)[spectra]
 
 
 def learn_geometry(
@@ -177,34 +180,35 @@ def learn_geometry(
     some_tx = rng.permutation(np.unique(tx[train]))[: config.geometry_tx]
     own = train[np.isin(tx[train], some_tx)]
     links = jax.tree.map(lambda leaf: leaf[own], data.links)
-    heard, all_heard = _Heard(data, own, config, rng, say), _Heard(data, train, config, rng, say)
-    start = _begun(place, heard, links)
-    held = _followed(start, heard, links, HELD_RECEIVER, named=True)
+    observed, all_observed = _Observed(data, own, config, rng, say), _Observed(data, train, config, rng, say)
+    start = _started(place, observed, links)
+    held = _aligned(start, observed, links, HELD_RECEIVER, named=True)
     found = [(held, HELD_RECEIVER)]
     if data.snapshots is not None:
-        free = _followed(start, heard, links, FREE_RECEIVER, named=True)
+        free = _aligned(start, observed, links, FREE_RECEIVER, named=True)
         if _went_far(free.field.motion, 3.0):  # further than by chance
             say("calibration: position of the receiver")
-            sure = _surely_better(free, held, heard, links)
+            sure = _surely_better(free, held, observed, links)
             found = [(free, FREE_RECEIVER)] if sure else [*found, (free, FREE_RECEIVER)]
-    begun = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
-    return _judged(place, [one for now, width in begun for one in _refined(now, width, all_heard)], all_heard)
+    started = [(_retraced(now, _fresh(now.params, place.params), data.links, data), width) for now, width in found]
+    return _accepted(place, [one for now, width in started for one in _refined(now, width, all_observed)], all_observed)
 
 
-def _refined(now: Place, receiver: tuple[float, float], heard: _Heard) -> list[Place]:
+def _refined(now: Place, receiver: tuple[float, float], observed: _Observed) -> list[Place]:
     """Returns candidates that are aligned with all transmitters, with successively better materials; the last one is not always
     the best."""
-    data, config = heard.data, heard.config
-    now = dataclasses.replace(heard.named(heard.guessed(now), 1), likely=None)  # slabs of earlier positions rule nothing out
-    moved = [now, heard.named(now, config.rounds, "snapshots", sized=True)]
+    data, config = observed.data, observed.config
+    now = observed.with_materials(observed.with_uncertainty(now), 1)
+    now = dataclasses.replace(now, likely=None)  # slabs of earlier positions rule nothing out
+    moved = [now, observed.with_materials(now, config.rounds, "snapshots", sized=True)]
     unknown = bool(np.any(np.asarray(now.field.known_thickness) == 0))
     least = 0 if data.snapshots is None else MORE if unknown else 1
     most = MOST if least and receiver == FREE_RECEIVER else least
     for times in range(1, most + 1):
         before = moved[-1].field.motion
-        now = _followed(moved[-1], heard, data.links, receiver, named=False)
+        now = _aligned(moved[-1], observed, data.links, receiver, named=False)
         now = _retraced(now, now.params, data.links, data)
-        moved.append(heard.named(now, 1, "snapshots", sized=True))
+        moved.append(observed.with_materials(now, 1, "snapshots", sized=True))
         if times >= least and not _went_far(jax.tree.map(np.subtract, now.field.motion, before), 1.0):
             break
     return moved
@@ -216,33 +220,35 @@ def _went_far(motion: Motion, deviations: float) -> bool:
     return any(bool(np.any(one > deviations * width)) for one, width in zip(far, HELD_RECEIVER, strict=True))
 
 
-def _begun(place: Place, heard: _Heard, links: Links) -> Place:
+def _started(place: Place, observed: _Observed, links: Links) -> Place:
     """Returns the initial candidate, with the prior uncertainty of surfaces and newly chosen materials.
 
     If phases are inaccurate, a wrong antenna may fit best, with materials that compensate for it. Antennas that were found by
     calibration must therefore fit better than the initial ones at either end, each with materials of its own.
     """
-    new, seed = place.field.init(jax.random.key(0)), int(heard.rng.integers(2**32))
+    new, seed = place.field.init(jax.random.key(0)), int(observed.rng.integers(2**32))
     alike = dataclasses.replace(place.params, materials=new.materials)
-    first = _doubted(_retraced(place, alike, links, heard.data), heard.config.geometry_width)
+    first = _uncertain(_retraced(place, alike, links, observed.data), observed.config.geometry_width)
     ends = [(getattr(place.params, end), getattr(new, end)) for end in ENDS]
-    begins = []
+    starts = []
     for antennas in itertools.product(*([found] if same(found, before) else [found, before] for found, before in ends)):
         params = dataclasses.replace(first.params, **dict(zip(ENDS, antennas, strict=True)))
-        alike_heard = dataclasses.replace(heard, rng=np.random.default_rng(seed))  # the same spectra for all combinations
-        begins.append(alike_heard.named(dataclasses.replace(first, params=params), heard.config.rounds, sized=True))
-    return min(begins, key=heard.surprised)
+        observed_alike = dataclasses.replace(observed, rng=np.random.default_rng(seed))  # the same spectra for all combinations
+        starts.append(
+            observed_alike.with_materials(dataclasses.replace(first, params=params), observed.config.rounds, sized=True)
+        )
+    return min(starts, key=observed.unlikelihood)
 
 
-def _surely_better(place: Place, other: Place, heard: _Heard, links: Links) -> bool:
+def _surely_better(place: Place, other: Place, observed: _Observed, links: Links) -> bool:
     """Returns whether spectra fit significantly better with one candidate than with another."""
-    _, (ours, others), tx = heard.compared([_retraced(one, one.params, links, heard.data) for one in (place, other)])
+    _, (ours, others), tx = observed.compared([_retraced(one, one.params, links, observed.data) for one in (place, other)])
     return surely_better(others - ours, tx, SURE)
 
 
-def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, float], named: bool) -> Place:
-    """Returns the candidate aligned with the spectra `heard`, from low to high frequencies. Paths are traced again in between,
-    but those of the result precede the last displacement.
+def _aligned(now: Place, observed: _Observed, links: Links, receiver: tuple[float, float], named: bool) -> Place:
+    """Returns the candidate aligned with the spectra `observed`, from low to high frequencies. Paths are traced again in
+    between, but those of the result precede the last displacement.
 
     Args:
         now: candidate with the paths of the transmitters of `links`.
@@ -250,25 +256,25 @@ def _followed(now: Place, heard: _Heard, links: Links, receiver: tuple[float, fl
         receiver: prior standard deviations of the displacement (metres) and rotation (radians) of the receiver.
         named: whether materials are chosen again whenever paths are traced.
     """
-    data, config, frequency = heard.data, heard.config, np.asarray(heard.data.links.frequency_hz)[heard.spectra]
+    data, config, frequency = observed.data, observed.config, np.asarray(observed.data.links.frequency_hz)[observed.spectra]
     traced_at, none = float(frequency.min()), jax.tree.map(jnp.zeros_like, now.field.motion)
     motion, widths = none, _widths(none, config.geometry_width, receiver)
     variances, numbers = np.asarray(ravel_pytree(widths)[0], np.float64) ** 2, adjusted_numbers(now.prepared, none)
     covariance = np.diag(variances[numbers])
     for highest in frequencies_apart(frequency):
-        heard.say(f"calibration: positions of surfaces, up to {highest / 1e9:.4g} GHz")
+        observed.say(f"calibration: positions of surfaces, up to {highest / 1e9:.4g} GHz")
         if highest > TRACED_AGAIN * traced_at:
             now, motion = _retraced(dataclasses.replace(now, field=now.field.moved(motion)), now.params, links, data), none
-            now = heard.named(now, 1) if named else now
+            now = observed.with_materials(now, 1) if named else now
             traced_at = float(highest)
-        now = _doubted(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
-        pool = heard.spectra[frequency <= highest * (1 + 1e-6)]
+        now = _uncertain(now, min(SPREAD * SPEED_OF_LIGHT / float(highest), config.geometry_width))
+        pool = observed.spectra[frequency <= highest * (1 + 1e-6)]
         if data.snapshots is not None:
             count, before = config.geometry_snapshots, (motion, covariance, widths)
-            motion, covariance = adjust(now.field, now.params, now.prepared, *before, numbers, data, pool, count, heard.rng)
+            motion, covariance = adjust(now.field, now.params, now.prepared, *before, numbers, data, pool, count, observed.rng)
         else:
             count = config.geometry_steps
-            params, motion = descend(now.field, now.params, now.prepared, motion, widths, data, pool, count, heard.rng)
+            params, motion = descend(now.field, now.params, now.prepared, motion, widths, data, pool, count, observed.rng)
             now = dataclasses.replace(now, params=params)
     known = _known(covariance, numbers, variances, len(none.shift)) if data.snapshots is not None else None
     return dataclasses.replace(now, field=now.field.moved(motion), known=known)
@@ -290,10 +296,10 @@ def _widths(motion: Motion, shift: float, receiver: tuple[float, float]) -> Moti
     return Motion(**{name: jnp.full_like(getattr(motion, name), width) for name, width in far.items()})
 
 
-def _judged(place: Place, moved: list[Place], heard: _Heard) -> tuple[Place, GeometryReport]:
+def _accepted(place: Place, moved: list[Place], observed: _Observed) -> tuple[Place, GeometryReport]:
     """Returns the best candidate with its position uncertainty. A displaced one must fit spectra significantly better than the
     nominal one; the likelihood of snapshots is not used, since it tolerates an inaccurate mesh with a large uncertainty."""
-    (as_it_was, *others), (before, *after), tx = heard.compared([place, *moved])
+    (as_it_was, *others), (before, *after), tx = observed.compared([place, *moved])
     best = int(np.argmin([own.mean() for own in after]))
     kept = surely_better(before - after[best], tx, SURE)
     chosen = others[best]
@@ -342,7 +348,7 @@ def _retraced(now: Place, params: WaveParams, links: Links, data: TrainingData) 
     return dataclasses.replace(now, params=params, prepared=now.field.prepare(links, data.receivers))
 
 
-def _doubted(now: Place, spread: float) -> Place:
+def _uncertain(now: Place, spread: float) -> Place:
     """Returns a candidate with this position_std (metres) for all surfaces; that of the transmitters is unchanged."""
     placement = now.params.placement
     spreads = jnp.full_like(placement, np.log(spread)).at[-1].set(placement[-1])

@@ -21,7 +21,7 @@ from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.fields.losses import GOOD_MATCH
 from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.training.calibration.objective import Told, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, surely_better
 
 ROUNDS = 20
 """Iterations of least squares."""
@@ -49,17 +49,17 @@ class TuningReport:
     """Standard deviation of the amplitudes of elements."""
 
 
-def search_tuning(params: WaveParams, told: Told, count: int) -> tuple[Calibratable, TuningReport]:
+def search_tuning(params: WaveParams, problem: CalibrationProblem, count: int) -> tuple[Calibratable, TuningReport]:
     """Returns the field with calibrated array gains if these fit significantly better, else unchanged. `params` are its
-    parameters, and `told` training spectra, with snapshots, and the field; `count` spectra are used: the gains are estimated on
-    half of them and tested on the other half."""
-    field, links = told.field, told.data.links
-    chosen = told.spectra[:count]
+    parameters, and `problem` has snapshots; `count` spectra are used: the gains are estimated on half of them and tested on the
+    other half."""
+    field, links = problem.field, problem.data.links
+    chosen = problem.spectra[:count]
     half = np.unique(np.asarray(links.tx_index)[chosen], return_inverse=True)[1] % 2 == 0
-    tuned = field.with_gains(gains_of(field, params, told, chosen[half]))
-    judge = dataclasses.replace(told, spectra=chosen[~half])
-    before, after = (dataclasses.replace(judge, field=one).scores(compared="spectra")([params])[0] for one in (field, tuned))
-    kept = surely_better(before - after, judge.tx_index(), SURE)
+    tuned = field.with_gains(gains_of(field, params, problem, chosen[half]))
+    held_out = dataclasses.replace(problem, spectra=chosen[~half])
+    before, after = (dataclasses.replace(held_out, field=one).scores(compared="spectra")([params])[0] for one in (field, tuned))
+    kept = surely_better(before - after, held_out.tx_index(), SURE)
     phase, amplitude = (np.sqrt(np.mean(np.square(part - part.mean()))) for part in _parts(tuned))
     report = TuningReport(float(before.mean()), float(after.mean()), kept, float(np.rad2deg(phase)), float(amplitude))
     return tuned if kept else field, report
@@ -72,32 +72,32 @@ def _parts(tuned: Calibratable) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gains_of(
-    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+    field: Calibratable, params: WaveParams, problem: CalibrationProblem, spectra: Int[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "r elements"]:
     """Returns the gains of the elements of all receivers, 1 for receivers with too few snapshots. Their mean phase is 0 and
     their root mean square 1, since a common factor is not observable."""
-    receiver = np.asarray(told.data.links.receiver_index)[spectra]
-    positions = told.data.receivers.element_positions
+    receiver = np.asarray(problem.data.links.receiver_index)[spectra]
+    positions = problem.data.receivers.element_positions
     gains = np.ones(positions.shape[:2], complex)
     for number in np.unique(receiver):
         own = spectra[receiver == number]
         if len(own) >= FEWEST:
-            gains[number] = least_squares(*_snapshots(field, params, told, own))
+            gains[number] = least_squares(*_snapshots(field, params, problem, own))
     return gains
 
 
 def _snapshots(
-    field: Calibratable, params: WaveParams, told: Told, spectra: Int[np.ndarray, " n"]
+    field: Calibratable, params: WaveParams, problem: CalibrationProblem, spectra: Int[np.ndarray, " n"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns predicted and measured snapshots (n, elements) of links."""
     padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeated to whole blocks
-    predicted = _said(field, params, told.prepared, told.data, jnp.asarray(padded, jnp.int32))
-    assert told.data.snapshots is not None, "array gains are estimated from snapshots"
-    return np.asarray(predicted)[: len(spectra)], np.asarray(told.data.snapshots)[spectra]
+    predicted = _predicted(field, params, problem.prepared, problem.data, jnp.asarray(padded, jnp.int32))
+    assert problem.data.snapshots is not None, "array gains are estimated from snapshots"
+    return np.asarray(predicted)[: len(spectra)], np.asarray(problem.data.snapshots)[spectra]
 
 
 @jax.jit
-def _said(
+def _predicted(
     field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " n"]
 ) -> Complex[Array, "n elements"]:
     def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
@@ -111,13 +111,13 @@ def _said(
 
 
 def least_squares(
-    said: Complex[np.ndarray, "n elements"], heard: Complex[np.ndarray, "n elements"]
+    predicted: Complex[np.ndarray, "n elements"], measured: Complex[np.ndarray, "n elements"]
 ) -> Complex[np.ndarray, " elements"]:
     """Returns the gains that turn predicted snapshots into measured ones, each up to a complex factor."""
-    power = _power(said) * _power(heard)
+    power = _power(predicted) * _power(measured)
     usable = np.isfinite(power) & (power > 0)
-    x, y = (part[usable].astype(complex) / np.sqrt(_power(part[usable]))[:, None] for part in (said, heard))
-    gains = np.ones(said.shape[1], complex)
+    x, y = (part[usable].astype(complex) / np.sqrt(_power(part[usable]))[:, None] for part in (predicted, measured))
+    gains = np.ones(predicted.shape[1], complex)
     for _ in range(ROUNDS if len(x) else 0):
         tuned = gains * x
         factor = np.sum(tuned.conj() * y, 1) / np.maximum(_power(tuned), np.finfo(float).tiny)

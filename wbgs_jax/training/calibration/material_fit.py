@@ -19,7 +19,7 @@ from wbgs_jax._util.pytree import same
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import Materials, WaveParams
-from wbgs_jax.training.calibration.objective import Compared, Told
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared
 
 ITU_MATERIALS: dict[str, tuple[float, float, float]] = {
     # name: relative permittivity, c and d of the conductivity c f^d (S/m, f in GHz)
@@ -73,18 +73,24 @@ class SearchReport:
 
 
 def search_materials(
-    params: WaveParams, told: Told, count: int, config: CalibrationConfig, compared: Compared = "snapshots", usual: bool = False
+    params: WaveParams,
+    problem: CalibrationProblem,
+    count: int,
+    config: CalibrationConfig,
+    compared: Compared = "snapshots",
+    usual: bool = False,
 ) -> tuple[WaveParams, SearchReport]:
-    """Returns parameters with the materials that fit spectra best. `told` are training spectra, with the field and its paths.
+    """Returns parameters with the materials that fit spectra best.
 
     Args:
         params: parameters with `materials`.
+        problem: training spectra, with the field and its paths.
         count: number of spectra in use.
         config: settings of the calibration.
         compared: the compared quantity.
         usual: whether changed materials also get their usual thickness, which has no effect if the scene defines the thickness.
     """
-    score, tx_index = told.scores(count, compared), told.tx_index(count)
+    score, tx_index = problem.scores(count, compared), problem.tx_index(count)
     before, taken, settled = np.zeros(0), dict[int, str](), 0
     materials = len(params.materials.slope)
     for turn in range(config.rounds * materials):

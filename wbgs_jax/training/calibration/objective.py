@@ -91,8 +91,8 @@ def make_scores(
 
 
 @dataclass(frozen=True)
-class Told:
-    """Training spectra, with a field and the paths of their transmitters, for scoring candidates."""
+class CalibrationProblem:
+    """What candidates are scored on: training spectra, with a field and the paths of their transmitters."""
 
     field: Calibratable
     prepared: PreparedPaths

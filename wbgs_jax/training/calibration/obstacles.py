@@ -33,7 +33,7 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.batches import TrainingData, batches_of_one_receiver
 from wbgs_jax.training.calibration.antennas import ENDS
 from wbgs_jax.training.calibration.material_fit import search_materials, with_properties
-from wbgs_jax.training.calibration.objective import Told, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, surely_better
 from wbgs_jax.training.calibration.uncertainty import search_placement
 from wbgs_jax.training.hooks import Say, silent
 
@@ -67,10 +67,10 @@ class AbsentReport:
 
 
 def search_absent(
-    params: WaveParams, told: Told, config: CalibrationConfig, say: Say = silent
-) -> tuple[WaveParams, Told, AbsentReport]:
-    """Returns parameters, and the field with its paths, without spurious bodies. `told` are training spectra with the field;
-    they need snapshots, since spectra alone would take ten times as long.
+    params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig, say: Say = silent
+) -> tuple[WaveParams, CalibrationProblem, AbsentReport]:
+    """Returns parameters, and the field with its paths, without spurious bodies. The problem needs snapshots,
+    since spectra alone would take ten times as long.
 
     Args:
         params: parameters with materials that have been chosen with the first of the spectra.
@@ -78,42 +78,44 @@ def search_absent(
             sufficiently accurate.
         say: called with a description of every pass.
     """
-    judged = dataclasses.replace(told, spectra=told.spectra[::-1])  # spectra other than those that materials are chosen with
-    tx, where = judged.tx_index(config.spectra), list[list[float]]()
-    before = now = _explained(params, judged, config)
+    held_out = dataclasses.replace(
+        problem, spectra=problem.spectra[::-1]
+    )  # spectra other than those that materials are chosen with
+    tx, where = held_out.tx_index(config.spectra), list[list[float]]()
+    before = now = _explained(params, held_out, config)
     once = dataclasses.replace(config, rounds=1)
     for _ in range(ROUNDS):
         say("calibration: objects of the mesh that the room lacks")
-        movers = absent_movers(params, told, config)
+        movers = absent_movers(params, problem, config)
         if not len(movers):
             break
-        field = told.field.without(movers)
-        fewer = dataclasses.replace(told, field=field, prepared=field.prepare(told.data.links, told.data.receivers))
+        field = problem.field.without(movers)
+        fewer = dataclasses.replace(problem, field=field, prepared=field.prepare(problem.data.links, problem.data.receivers))
         others, _ = search_materials(_carried(params, field), fewer, config.spectra, once)
-        after = _explained(others, dataclasses.replace(fewer, spectra=judged.spectra), config)
+        after = _explained(others, dataclasses.replace(fewer, spectra=held_out.spectra), config)
         if not surely_better(now - after, tx, SURE):
             break
-        middles = np.asarray(centres(told.field.facets, len(told.field.motion.shift)))[movers]
+        middles = np.asarray(centres(problem.field.facets, len(problem.field.motion.shift)))[movers]
         where += np.round(middles.astype(float), 3).tolist()
-        params, told, now = others, fewer, after
-    return params, told, AbsentReport(float(before.mean()), float(now.mean()), where)
+        params, problem, now = others, fewer, after
+    return params, problem, AbsentReport(float(before.mean()), float(now.mean()), where)
 
 
-def _explained(params: WaveParams, told: Told, config: CalibrationConfig) -> Float[np.ndarray, " n"]:
+def _explained(params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig) -> Float[np.ndarray, " n"]:
     """Returns the negative log-likelihoods of snapshots with the position uncertainty that fits best: phases of slightly
     displaced bodies then have little effect, and such a body fits better than none."""
-    doubted, _ = search_placement(params, told.scores(config.position_std_spectra, "covariances"))
-    return told.scores(config.spectra, "covariances")([doubted])[0]
+    uncertain, _ = search_placement(params, problem.scores(config.position_std_spectra, "covariances"))
+    return problem.scores(config.spectra, "covariances")([uncertain])[0]
 
 
-def absent_movers(params: WaveParams, told: Told, config: CalibrationConfig) -> Int[np.ndarray, " k"]:
+def absent_movers(params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig) -> Int[np.ndarray, " k"]:
     """Returns the rigid bodies without which snapshots fit significantly better, each tested without the previous ones; never
     all bodies."""
     highest = BELIEVED * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
-    low = told.frequency_hz() <= highest
+    low = problem.frequency_hz() <= highest
     if not low.any():
         return np.zeros(0, int)
-    own, params = _each_by_itself(params, told)
+    own, params = _each_by_itself(params, problem)
     own = dataclasses.replace(own, spectra=own.spectra[low][: config.spurious_spectra])
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
@@ -133,20 +135,20 @@ def absent_movers(params: WaveParams, told: Told, config: CalibrationConfig) -> 
     return np.sort(np.array(gone, int))
 
 
-def _each_by_itself(params: WaveParams, told: Told) -> tuple[Told, WaveParams]:
+def _each_by_itself(params: WaveParams, problem: CalibrationProblem) -> tuple[CalibrationProblem, WaveParams]:
     """Returns the field, its paths and its parameters with a separate material for every rigid body, equal to its current one
     but with a thickness that is a parameter."""
-    facets = told.field.facets
-    source = np.zeros(len(told.field.motion.shift), int)  # bodies of a large mesh may have lost all of their facets
+    facets = problem.field.facets
+    source = np.zeros(len(problem.field.motion.shift), int)  # bodies of a large mesh may have lost all of their facets
     source[np.asarray(facets.mover)] = np.asarray(facets.material)
-    thickness = jnp.log(told.field.material_properties(params).thickness[source])
+    thickness = jnp.log(problem.field.material_properties(params).thickness[source])
     own: Materials = jax.tree.map(lambda leaf: leaf[source], params.materials)
     own = dataclasses.replace(own, log_thickness=thickness)
-    field = replaced(told.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
-    surfaces = told.prepared.surfaces
+    field = replaced(problem.field, facets=replaced(facets, material=facets.mover), known_thickness=jnp.zeros_like(thickness))
+    surfaces = problem.prepared.surfaces
     surfaces = replaced(surfaces, facets=replaced(surfaces.facets, material=facets.mover))
-    prepared = replaced(told.prepared, surfaces=surfaces)
-    return dataclasses.replace(told, field=field, prepared=prepared), replaced(params, materials=own)
+    prepared = replaced(problem.prepared, surfaces=surfaces)
+    return dataclasses.replace(problem, field=field, prepared=prepared), replaced(params, materials=own)
 
 
 def _of_air(params: WaveParams, mover: int) -> WaveParams:
@@ -184,37 +186,37 @@ class ClutterReport:
 
 
 def search_clutter(
-    params: WaveParams, told: Told, config: CalibrationConfig, rng: np.random.Generator
-) -> tuple[WaveParams, Told, ClutterReport | None]:
+    params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig, rng: np.random.Generator
+) -> tuple[WaveParams, CalibrationProblem, ClutterReport | None]:
     """Returns parameters and field with an absorption grid if it fits significantly better, else unchanged, and a report, which
-    is None if there are too few transmitters. `told` are training spectra with the field.
+    is None if there are too few transmitters.
 
     Args:
         params: parameters of a coherent field without an absorption grid.
         config: settings of the calibration.
         rng: random numbers for the test transmitters, and for the batches of the others.
     """
-    tx = told.tx_index()
+    tx = problem.tx_index()
     everyone = rng.permutation(np.unique(tx))
-    judges = everyone[: round(JUDGES * len(everyone))]
-    if len(judges) < FEWEST:
-        return params, told, None
-    judge = np.isin(tx, judges)
-    judged = dataclasses.replace(told, spectra=told.spectra[judge][: config.absorption_spectra])
-    batches = batches_of_one_receiver(told.data, told.spectra[~judge], config.absorption_steps, BATCH, rng)
-    field = told.field.with_absorption()
-    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), told.prepared, told.data, batches)
-    others, fuller = replaced(params, clutter=clutter), dataclasses.replace(told, field=field)
-    before, after = _errors(judged, params), _errors(dataclasses.replace(judged, field=field), others)
+    testers = everyone[: round(JUDGES * len(everyone))]
+    if len(testers) < FEWEST:
+        return params, problem, None
+    of_testers = np.isin(tx, testers)
+    held_out = dataclasses.replace(problem, spectra=problem.spectra[of_testers][: config.absorption_spectra])
+    batches = batches_of_one_receiver(problem.data, problem.spectra[~of_testers], config.absorption_steps, BATCH, rng)
+    field = problem.field.with_absorption()
+    clutter = _fitted(field, replaced(params, clutter=field.first_clutter), problem.prepared, problem.data, batches)
+    others, fuller = replaced(params, clutter=clutter), dataclasses.replace(problem, field=field)
+    before, after = _errors(held_out, params), _errors(dataclasses.replace(held_out, field=field), others)
     gains = before - after
-    taken = bool(gains.mean() > LEAST_CLUTTER) and surely_better(gains, judged.tx_index(), SURE_OF_CLUTTER)
+    taken = bool(gains.mean() > LEAST_CLUTTER) and surely_better(gains, held_out.tx_index(), SURE_OF_CLUTTER)
     report = ClutterReport(float(before.mean()), float(after.mean()), taken)
-    return (others, fuller, report) if taken else (params, told, report)
+    return (others, fuller, report) if taken else (params, problem, report)
 
 
-def _errors(told: Told, params: WaveParams) -> Float[np.ndarray, " n"]:
+def _errors(problem: CalibrationProblem, params: WaveParams) -> Float[np.ndarray, " n"]:
     """Returns mean absolute errors; their logarithms would be dominated by spectra that are accurate anyway."""
-    found: Float[np.ndarray, " n"] = np.exp(told.scores(None, "spectra")([params])[0])
+    found: Float[np.ndarray, " n"] = np.exp(problem.scores(None, "spectra")([params])[0])
     return found
 
 

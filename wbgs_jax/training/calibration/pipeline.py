@@ -26,7 +26,7 @@ from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas
 from wbgs_jax.training.calibration.array_gains import search_tuning
 from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
-from wbgs_jax.training.calibration.objective import Scores, Told, comparable
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
@@ -53,11 +53,11 @@ def search_gain(params: WaveParams, score: Scores, gain: float = 0.0) -> tuple[W
     return params, gain
 
 
-def unusual_level(told: Told) -> float:
+def unusual_level(problem: CalibrationProblem) -> float:
     """Returns the median received power relative to free space (dB) if it is implausible (`ROOMS_DB`), else zero."""
-    assert told.data.snapshots is not None, "the level is that of snapshots"
-    snapshots, links = jax.tree.map(lambda leaf: leaf[told.spectra], (told.data.snapshots, told.data.links))
-    rx = told.data.receivers.position[links.receiver_index]
+    assert problem.data.snapshots is not None, "the level is that of snapshots"
+    snapshots, links = jax.tree.map(lambda leaf: leaf[problem.spectra], (problem.data.snapshots, problem.data.links))
+    rx = problem.data.receivers.position[links.receiver_index]
     beyond = beyond_free_space_db(received_power_db(snapshots), links.tx_position, rx, links.frequency_hz)
     received = np.asarray(snapshots).any(-1)
     level = float(np.median(np.asarray(beyond)[received])) if received.any() else 0.0
@@ -91,46 +91,46 @@ class Calibration(Hook):
         config, data, prepared, say = self.config, context.data, context.prepared, context.say
         spectra = rng.permutation(context.train)
         report: dict[str, Any] = {}
-        told = Told(field, prepared, data, spectra)
+        problem = CalibrationProblem(field, prepared, data, spectra)
         if not data.has_spectra:  # one number per link distinguishes materials, but contains neither phases nor directions
             say("calibration: gain and materials of the surfaces")
-            params, gain = search_gain(params, told.scores(config.spectra))
+            params, gain = search_gain(params, problem.scores(config.spectra))
             if config.rounds:
-                params, named = search_materials(params, told, config.spectra, config, usual=True)
-                params, gain = search_gain(params, told.scores(config.spectra))
+                params, named = search_materials(params, problem, config.spectra, config, usual=True)
+                params, gain = search_gain(params, problem.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
         if config.rounds:
             later = {comparable("covariances", data), comparable("spectra", data)} - {comparable("snapshots", data)}
             for compared in sorted(later):
-                context.ahead(("scores", compared), functools.partial(told.scores(1, compared), [params]))
+                context.ahead(("scores", compared), functools.partial(problem.scores(1, compared), [params]))
         if config.antenna_rounds:
             say("calibration: antenna patterns")
-            params, _ = self._antennas(params, told, report)
+            params, _ = self._antennas(params, problem, report)
         if config.rounds:
             say("calibration: materials of the surfaces")
-            params, named, _ = search_slabs(params, told, config, config.spectra)
+            params, named, _ = search_slabs(params, problem, config, config.spectra)
             report["search"] = dataclasses.asdict(named)
             if config.spurious_spectra and data.snapshots is not None:
-                params, told, absent = search_absent(params, told, config, say)
+                params, problem, absent = search_absent(params, problem, config, say)
                 report["absent"] = dataclasses.asdict(absent)
                 if absent.centres:
-                    field, prepared = told.field, told.prepared
-                    params, named, _ = search_slabs(params, told, config, config.spectra)
+                    field, prepared = problem.field, problem.prepared
+                    params, named, _ = search_slabs(params, problem, config, config.spectra)
                     report["search"] = dataclasses.asdict(named)
             say("calibration: delay by walls, curvature of waves")
             for _ in range(SWEEPS):
-                params = self._idealisations(params, told, report)
-                params, changed = self._antennas(params, told, report) if config.antenna_rounds else (params, False)
+                params = self._idealisations(params, problem, report)
+                params, changed = self._antennas(params, problem, report) if config.antenna_rounds else (params, False)
                 if not changed:
                     break
-                params, _ = search_materials(params, told, config.propagation_spectra, config)
+                params, _ = search_materials(params, problem, config.propagation_spectra, config)
             say("calibration: accuracy of the mesh")
-            _, guessed = search_placement(params, told.scores(config.position_std_spectra, "covariances"))
-            report["doubt"] = dataclasses.asdict(guessed)
-            field = self._tuning(params, told, report)
-            told = dataclasses.replace(told, field=field)
-            if config.geometry and guessed.spread_mm > 1e3 * config.geometry_position_std:
+            _, uncertainty = search_placement(params, problem.scores(config.position_std_spectra, "covariances"))
+            report["doubt"] = dataclasses.asdict(uncertainty)
+            field = self._tuning(params, problem, report)
+            problem = dataclasses.replace(problem, field=field)
+            if config.geometry and uncertainty.spread_mm > 1e3 * config.geometry_position_std:
                 place, moved = learn_geometry(Place(field, params, prepared), data, context.train, config, rng, say)
                 report["geometry"] = dataclasses.asdict(moved)
                 if "antennas" in report:  # the alignment may have reverted some of them
@@ -138,51 +138,51 @@ class Calibration(Hook):
                     kept = {end: name for end, name in found if same(getattr(params, end), getattr(place.params, end))}
                     report["antennas"]["taken"] = kept
                 params, field, prepared = place.params, place.field, place.prepared
-                told = Told(field, prepared, data, spectra)
-                field = self._tuning(params, told, report)
-                told = dataclasses.replace(told, field=field)
-            params, guessed = search_placement(params, told.scores(config.position_std_spectra, "spectra"))
-            report["placement"] = dataclasses.asdict(guessed)
-            params, field = self._clutter(params, told, report, rng, say)
-            thick = unknown_mm(params.materials, np.asarray(told.field.known_thickness))
+                problem = CalibrationProblem(field, prepared, data, spectra)
+                field = self._tuning(params, problem, report)
+                problem = dataclasses.replace(problem, field=field)
+            params, uncertainty = search_placement(params, problem.scores(config.position_std_spectra, "spectra"))
+            report["placement"] = dataclasses.asdict(uncertainty)
+            params, field = self._clutter(params, problem, report, rng, say)
+            thick = unknown_mm(params.materials, np.asarray(problem.field.known_thickness))
             report["search"] |= {"taken": entries_of(params.materials), "thickness_mm": thick}  # materials may have changed
-        if data.snapshots is not None and (level := unusual_level(told)):
-            told = dataclasses.replace(told, field=field)  # which may have an absorption grid now
-            params, report["gain_db"] = search_gain(params, told.scores(config.position_std_spectra, "powers"), level)
+        if data.snapshots is not None and (level := unusual_level(problem)):
+            problem = dataclasses.replace(problem, field=field)  # which may have an absorption grid now
+            params, report["gain_db"] = search_gain(params, problem.scores(config.position_std_spectra, "powers"), level)
         return Edit(params, (), None, report, field, prepared)
 
-    def _antennas(self, params: WaveParams, told: Told, report: dict[str, Any]) -> tuple[WaveParams, bool]:
+    def _antennas(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> tuple[WaveParams, bool]:
         """Returns parameters with calibrated antennas, and whether any antenna has changed."""
-        count, known = self.config.antenna_spectra, is_directional(told.data.receivers.antenna)
-        params, found = search_antennas(params, told.scores(count), told.tx_index(count), self.config, known)
+        count, known = self.config.antenna_spectra, is_directional(problem.data.receivers.antenna)
+        params, found = search_antennas(params, problem.scores(count), problem.tx_index(count), self.config, known)
         before = report.get("antennas", dataclasses.asdict(found))
         report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
         return params, bool(found.taken)
 
-    def _tuning(self, params: WaveParams, told: Told, report: dict[str, Any]) -> Calibratable:
+    def _tuning(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> Calibratable:
         """Returns the field with calibrated array gains, which needs at least two transmitters."""
         count = self.config.array_gain_spectra
-        if told.data.snapshots is None or not count or np.ptp(told.tx_index(count)) == 0:
-            return told.field
-        field, found = search_tuning(params, told, count)
+        if problem.data.snapshots is None or not count or np.ptp(problem.tx_index(count)) == 0:
+            return problem.field
+        field, found = search_tuning(params, problem, count)
         report["tuning"] = [*report.get("tuning", []), dataclasses.asdict(found)]
         return field
 
     def _clutter(
-        self, params: WaveParams, told: Told, report: dict[str, Any], rng: np.random.Generator, say: Say
+        self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any], rng: np.random.Generator, say: Say
     ) -> tuple[WaveParams, Calibratable]:
         """Returns parameters and field with an absorption grid, if it fits better."""
         if not self.config.absorption_spectra:
-            return params, told.field
+            return params, problem.field
         say("calibration: obstacles that the mesh lacks")
-        params, told, found = search_clutter(params, told, self.config, rng)
+        params, problem, found = search_clutter(params, problem, self.config, rng)
         if found:
             report["clutter"] = dataclasses.asdict(found)
-        return params, told.field
+        return params, problem.field
 
-    def _idealisations(self, params: WaveParams, told: Told, report: dict[str, Any]) -> WaveParams:
+    def _idealisations(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> WaveParams:
         """Returns parameters with calibrated propagation options."""
-        params, found = search_idealisations(params, told, self.config)
+        params, found = search_idealisations(params, problem, self.config)
         named = {name: dataclasses.asdict(one) for name, one in found.items()}
         report["idealisations"] = report.get("idealisations", {}) | named
         return params

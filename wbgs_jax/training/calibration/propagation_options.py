@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from wbgs_jax.config import CalibrationConfig
 from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.training.calibration.material_fit import search_materials
-from wbgs_jax.training.calibration.objective import Told, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, surely_better
 
 SURE = 3.0
 """n_sigma: standard errors over transmitters by which a gain must be significant (`surely_better`)."""
@@ -32,18 +32,18 @@ class Idealisation:
 
 
 def search_idealisations(
-    params: WaveParams, told: Told, config: CalibrationConfig
+    params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig
 ) -> tuple[WaveParams, dict[str, Idealisation]]:
     """Returns parameters with options set as in reality if spectra fit significantly better, and the results by option. Before
-    the finite thickness of walls is tested, materials are chosen again with it. `told` are training spectra with the field."""
+    the finite thickness of walls is tested, materials are chosen again with it."""
     once, found, count = dataclasses.replace(config, rounds=1), {}, config.propagation_spectra
-    score, tx_index = told.scores(count), told.tx_index(count)
+    score, tx_index = problem.scores(count), problem.tx_index(count)
     for name in ("curved", "thick"):
         if float(getattr(params, name)):
             continue
         natural = dataclasses.replace(params, **{name: 1 + getattr(params, name)})  # a new array: training donates it once
         if name == "thick":
-            natural, _ = search_materials(natural, told, count, once)
+            natural, _ = search_materials(natural, problem, count, once)
         before, after = score([params, natural])
         dropped = surely_better(before - after, tx_index, SURE)
         found[name] = Idealisation(float(before.mean()), float(after.mean()), dropped)

@@ -25,7 +25,7 @@ from wbgs_jax.training.calibration.material_fit import (
     unknown_mm,
     with_entry,
 )
-from wbgs_jax.training.calibration.objective import Compared, Scores, Told, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared, Scores, surely_better
 
 SHEETS = (0.002, 0.004, 0.006, 0.01, 0.015)
 """Thicknesses of sheets that are thinner than a step at the first frequency, metres."""
@@ -66,14 +66,14 @@ path."""
 
 def search_slabs(
     params: WaveParams,
-    told: Told,
+    problem: CalibrationProblem,
     config: CalibrationConfig,
     count: int,
     compared: Compared = "snapshots",
     likely: Likely | None = None,
 ) -> tuple[WaveParams, SearchReport, Likely | None]:
     """Returns parameters with the materials and unknown thicknesses that fit spectra best, a report, and the most likely slabs
-    (None if they have not been searched). `told` are training spectra with the field and its paths.
+    (None if they have not been searched). `problem` are training spectra with the field and its paths.
 
     Thicknesses are estimated from snapshots; with spectra alone, materials get their usual thickness.
 
@@ -84,16 +84,16 @@ def search_slabs(
         compared: the compared quantity.
         likely: slabs from an earlier search, to which this one is restricted; None for all.
     """
-    score, known = told.scores(count, compared), np.asarray(told.field.known_thickness)
+    score, known = problem.scores(count, compared), np.asarray(problem.field.known_thickness)
     unknown = known == 0
-    named, report = search_materials(params, told, count, config, compared, usual=bool(unknown.any()))
-    if not unknown.any() or told.data.snapshots is None:  # spectra cost ten times as much and contain less information
+    named, report = search_materials(params, problem, count, config, compared, usual=bool(unknown.any()))
+    if not unknown.any() or problem.data.snapshots is None:  # spectra cost ten times as much and contain less information
         return named, report, likely
     once = dataclasses.replace(config, rounds=1)
-    params, likely = _sized(named, unknown, told, config, compared, likely)
-    sized, anew = search_materials(params, told, count, once, compared)
+    params, likely = _sized(named, unknown, problem, config, compared, likely)
+    sized, anew = search_materials(params, problem, count, once, compared)
     before, after = score([named, sized])
-    if not surely_better(before - after, told.tx_index(count), SURE):
+    if not surely_better(before - after, problem.tx_index(count), SURE):
         return named, report, likely
     thick = unknown_mm(sized.materials, known)
     return sized, dataclasses.replace(anew, before=report.before, thickness_mm=thick), likely
@@ -102,22 +102,22 @@ def search_slabs(
 def _sized(
     params: WaveParams,
     unknown: Bool[np.ndarray, " m"],
-    told: Told,
+    problem: CalibrationProblem,
     config: CalibrationConfig,
     compared: Compared,
     likely: Likely | None,
 ) -> tuple[WaveParams, Likely]:
     """Returns parameters with materials and thicknesses estimated at successively higher frequencies, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
-    first, *others = frequencies_to_look_at(told.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
+    first, *others = frequencies_to_look_at(problem.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
     likely = dict(likely or {m: _all_slabs(first) for m in materials})
-    score = told.scores(config.thickness_spectra, compared, first)
+    score = problem.scores(config.thickness_spectra, compared, first)
     for _ in range(2):
         for material in materials:
             params, likely[material] = _best(params, material, likely[material], score, config.thickness_glance)
     before = first
     for frequency_hz in others:
-        score = told.scores(config.thickness_spectra, compared, frequency_hz)
+        score = problem.scores(config.thickness_spectra, compared, frequency_hz)
         for material in materials:
             seen = len(likely[material]) <= ONCE_MORE  # all slabs are equally likely for a material that occurs in no path
             entries = list(dict.fromkeys(slab.entry for slab in likely[material]))[: ENTRIES if seen else None]
