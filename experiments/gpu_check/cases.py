@@ -31,14 +31,14 @@ from wbgs_jax.training.loop import make_hook
 
 ON_THE_HOST = frozenset(
     """
-    as_deepmimo at_receiver cell_means choose_beams default_field evaluate export_field field_names from_deepmimo
-    from_paths from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings
+    as_deepmimo at_receiver cell_means choose_beams choose_next_places default_field evaluate export_field field_names
+    from_deepmimo from_paths from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings
     load_room load_scene load_trained load_walls make_locator make_mesh make_power_predictor make_predictor
     make_query make_receiver make_surface map_queries measure_limits pas_directions place_reflector planar_array
     power_at_users power_when_rotated predict_blocks predict_isotropic_paths predict_many predict_map predict_paths
     pytree rank_beams read_antenna read_deepmimo read_gaussians register save_paths save_scene scene_of_paths
     scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers surface_from_points
-    train_field write_deepmimo write_gaussians
+    train_field walking_order write_deepmimo write_gaussians
     """.split()  # noqa: SIM905
 )
 """Public functions that read and write, prepare, or make the functions that a device runs: those of the predictors, the locator

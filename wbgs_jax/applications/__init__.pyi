@@ -13,6 +13,9 @@ from .beams import score_beams as score_beams
 from .locate import Located as Located
 from .locate import Locator as Locator
 from .locate import make_locator as make_locator
+from .measurement_plan import NextPlaces as NextPlaces
+from .measurement_plan import choose_next_places as choose_next_places
+from .measurement_plan import walking_order as walking_order
 from .reflector import Reflector as Reflector
 from .reflector import make_reflector as make_reflector
 from .reflector import place_reflector as place_reflector

@@ -167,27 +167,38 @@ def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
 
 def read_queries(path: Path) -> tuple[Float[np.ndarray, "n 3"], tuple[float, ...]]:
     """Returns positions (metres) and frequencies (GHz) of a CSV file with the columns x, y, z and ghz, one row per query."""
-    rows = csv.DictReader(io.StringIO(read_text(path)))
+    table = _read_columns(path, COLUMNS, "queries")
+    return table[:, :3], tuple(table[:, 3].tolist())
+
+
+def read_positions(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Returns the positions (metres) of a CSV file with the columns x, y and z."""
+    return _read_columns(path, COLUMNS[:3], "places")
+
+
+def _read_columns(path: Path, columns: tuple[str, ...], name: str) -> Float[np.ndarray, "n columns"]:
+    """Returns columns of a CSV file, the first three of which are positions, metres."""
+    rows, needed = csv.DictReader(io.StringIO(read_text(path))), ",".join(columns)
+    units = "metres, gigahertz" if "ghz" in columns else "metres"
     names = [name.strip().lower() for name in rows.fieldnames or ()]
-    if missing := [name for name in COLUMNS if name not in names]:
-        raise UserError(f"{path} has no column {', '.join(missing)}; its first line must name x,y,z,ghz (metres, gigahertz)")
+    if missing := [column for column in columns if column not in names]:
+        raise UserError(f"{path} has no column {', '.join(missing)}; its first line must name {needed} ({units})")
     rows.fieldnames = names
     found = []
     for row in rows:
         try:
-            values = [float(row[name]) for name in COLUMNS]
+            values = [float(row[column]) for column in columns]
         except (TypeError, ValueError):
             values = [np.nan]
         if not np.isfinite(values).all():
-            raise UserError(f"line {rows.line_num} of {path} lacks a number; give x,y,z in metres and ghz in gigahertz")
+            raise UserError(f"line {rows.line_num} of {path} lacks a number; give {needed} ({units})")
         found.append(values)
         check_count(len(found), str(path))
     if not found:
-        raise UserError(f"{path} has no queries; give one per row below the line x,y,z,ghz")
-    table = np.array(found)
-    for row in table:
-        parse_vector(",".join(map(str, row[:3])), str(path), "position", UNIT)
-    return table[:, :3], tuple(table[:, 3].tolist())
+        raise UserError(f"{path} has no {name}; give one per row below the line {needed}")
+    for values in found:
+        parse_vector(",".join(map(str, values[:3])), str(path), "position", UNIT)
+    return np.array(found)
 
 
 def _three(word: str, option: str, example: str) -> list[str]:

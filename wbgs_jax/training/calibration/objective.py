@@ -92,7 +92,7 @@ def make_scores(
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """What candidates are scored on: training spectra, with a field and the paths of their transmitters."""
+    """Training spectra on which candidates are scored, with a field and the paths of their transmitters."""
 
     field: Calibratable
     prepared: PreparedPaths

@@ -1,0 +1,71 @@
+"""Where to measure next, against a search through all places and against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from wbgs_jax.applications import choose_next_places, walking_order
+from wbgs_jax.applications.measurement_plan import NUGGET
+
+
+def posterior(places, error, measured, length):
+    """The covariance of errors at places, given that others are measured, from the joint normal distribution."""
+    everything = np.concatenate([places, measured])
+    amplitude = np.concatenate([error, np.ones(len(measured))])
+    joint = np.exp(-cdist(everything, everything) / length) * np.outer(amplitude, amplitude)
+    n = len(places)
+    own = joint[n:, n:] + NUGGET * np.eye(len(measured))
+    return joint[:n, :n] - joint[:n, n:] @ np.linalg.inv(own) @ joint[n:, :n]
+
+
+def after(covariance, error, one):
+    """The mean variance that a measurement of one place leaves."""
+    column = covariance[:, one]
+    return np.mean(np.diag(covariance) - column**2 / (covariance[one, one] + NUGGET * error[one] ** 2))
+
+
+@pytest.fixture
+def places():
+    rng = np.random.default_rng(3)
+    return rng.uniform(0, 5, (40, 3)), rng.uniform(0.1, 0.4, 40), rng.uniform(0, 5, (6, 3))
+
+
+def test_the_first_place_is_the_best_of_all_and_the_error_is_that_of_the_normal_distribution(places):
+    candidates, error, measured = places
+    covariance = posterior(candidates, error, measured, 1.5)
+    left = [after(covariance, error, one) for one in range(len(candidates))]
+    found = choose_next_places(candidates, error, measured, 1.5, 3)
+    assert found.numbers[0] == np.argmin(left)
+    np.testing.assert_allclose(found.error[:2] ** 2, [np.mean(np.diag(covariance)), min(left)], rtol=1e-9)
+    assert (np.diff(found.error) < 0).all()
+    assert len(set(found.numbers.tolist())) == 3
+
+
+def test_a_batch_covers_two_rooms_and_leaves_out_what_is_measured():
+    rng = np.random.default_rng(0)
+    rooms = [rng.normal(0, 0.3, (20, 3)) + np.array([x, 0, 0]) for x in (0, 10, 20)]
+    found = choose_next_places(np.concatenate(rooms), np.full(60, 0.2), rooms[1], 2.0, 2)
+    assert sorted(found.numbers // 20) == [0, 2]
+
+
+def test_an_error_that_is_expected_attracts_measurements():
+    candidates = np.array([[0.0, 0, 0], [50, 0, 0]])
+    assert choose_next_places(candidates, np.array([0.1, 0.3]), np.zeros((0, 3)), 1.0, 1).numbers.tolist() == [1]
+
+
+@pytest.mark.parametrize(("count", "length"), [(0, 1.0), (41, 1.0), (3, 0.0)])
+def test_impossible_choices_are_refused(places, count, length):
+    with pytest.raises(ValueError, match="is"):
+        choose_next_places(*places, length, count)
+
+
+def test_a_walk_visits_every_place_once_and_is_short():
+    places = np.random.default_rng(1).uniform(0, 1, (12, 3))
+    order = walking_order(places, np.zeros(3))
+    assert sorted(order) == list(range(12))
+    walks = [order, *(np.random.default_rng(k).permutation(12) for k in range(200))]
+    corners = [np.concatenate([np.zeros((1, 3)), places[walk]]) for walk in walks]
+    length, *others = [np.linalg.norm(np.diff(points, axis=0), axis=1).sum() for points in corners]
+    assert length < min(others)
+    line = np.array([[3.0, 0, 0], [1, 0, 0], [2, 0, 0], [0.5, 0, 0]])
+    assert walking_order(line, np.zeros(3)).tolist() == [3, 1, 2, 0]

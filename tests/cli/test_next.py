@@ -1,0 +1,38 @@
+"""`wbgs-jax next` as people call it."""
+
+import numpy as np
+import pytest
+from builders.commands import assert_error_for_people, call
+from builders.flats import folder
+
+from wbgs_jax.commands.next import main
+
+
+def test_places_are_chosen_where_readings_lack(tmp_path, rng):
+    data, out = folder(tmp_path, rng, n=25), tmp_path / "next.csv"
+    (tmp_path / "places.csv").write_text("x,y,z\n1,1,1.3\n7,1,1.3\n7.1,1,1.3\n500,1,1.3\n4,1.5,1.3\n")
+    done = call(main, "--data", data, "--candidates", tmp_path / "places.csv", "--count", 2, "--start", "0,0,1.3", "--out", out)
+    assert done.code == 0, done.err
+    table = np.genfromtxt(out, delimiter=",", names=True)
+    assert len(table) == 2 and table["x"].max() < 10 and (table["expected_error"] > 0).all()
+    assert "1 of 5 candidates are left out" in done.err
+    assert done.out.splitlines()[0].lstrip().startswith("1. (")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ([], "give --run RUN of a trained field, or --data FOLDER"),
+        (["--data", "DATA"], "give the places that can be measured"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 0], "--count 0 is not a number of places"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 9], "are fewer than --count 9"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:200x200x1"], "are too many; at most 4,000"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--length", -1], "--length -1 is not a distance"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--ghz", 3], "--ghz and --rx are those of a trained field"),
+        (["--data", "DATA", "--candidates", "nowhere.csv"], "cannot read nowhere.csv"),
+        (["--run", "nowhere", "--grid", "0,0,1:1,1,1:2x2x1"], "nowhere"),
+    ],
+)
+def test_errors_are_for_people(tmp_path, rng, options, says):
+    data = folder(tmp_path, rng, n=20)
+    assert_error_for_people(call(main, *(str(data) if word == "DATA" else word for word in options)), says)

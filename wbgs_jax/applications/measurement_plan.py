@@ -1,0 +1,129 @@
+"""Where to measure next: the places whose measurement reduces the expected error of a field most, in an order to walk them.
+
+The error of a prediction is modelled as a Gaussian process over places: its amplitude is the error that the field itself
+expects there, its correlation decays with the distance (exponential covariance), and measured places condition it.
+Places are chosen one after the other, each as the one that removes most variance from all places of interest given those before
+(active learning of Cohn 1996; greedy A-optimal design). Neighbouring places are thus not chosen together.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+NUGGET = 0.15
+"""Variance of what a measurement does not share with its surroundings, such as fading, relative to the variance of errors."""
+SWAPS = 1000
+"""Maximum number of reversals that shorten a walk."""
+
+
+class NextPlaces(NamedTuple):
+    """Places to measure next."""
+
+    numbers: Int[np.ndarray, " count"]
+    """Indices of the candidates, in the order of choice."""
+    error: Float[np.ndarray, " count+1"]
+    """Root mean square error over the candidates that is expected before the first and after each measurement, in the unit of
+    the expected errors."""
+
+
+def choose_next_places(
+    candidates: Float[np.ndarray, "c 3"],
+    expected_error: Float[np.ndarray, " c"],
+    measured: Float[np.ndarray, "m 3"],
+    length: float,
+    count: int,
+) -> NextPlaces:
+    """Returns the candidates whose measurement reduces the expected error over all candidates most (host).
+
+    Args:
+        candidates: places that can be measured, metres.
+        expected_error: error that is expected at each now, at least 0: of any unit.
+        measured: places that are measured already, metres.
+        length: distance over which errors are alike, metres.
+        count: number of places to choose, at most that of the candidates.
+
+    Returns:
+        The places, and the expected error after each.
+
+    Raises:
+        ValueError: the count exceeds the number of candidates, or the length is not positive.
+    """
+    if not 0 < count <= len(candidates):
+        raise ValueError(f"count is {count}; there are {len(candidates)} candidates")
+    if not length > 0:
+        raise ValueError(f"length is {length}; it must be positive")
+    covariance = _given(candidates, expected_error, measured, length)
+    nugget = NUGGET * np.square(expected_error) + np.finfo(float).tiny
+    chosen, error = np.zeros(count, int), np.zeros(count + 1)
+    error[0] = _root_mean(covariance)
+    open_ = np.ones(len(candidates), bool)
+    for number in range(count):
+        total = np.diag(covariance) + nugget
+        gain = np.square(covariance).sum(0) / total
+        chosen[number] = one = int(np.argmax(np.where(open_, gain, -1)))
+        open_[one] = False
+        column = covariance[:, one].copy()
+        covariance -= np.outer(column, column) / total[one]
+        error[number + 1] = _root_mean(covariance)
+    return NextPlaces(chosen, error)
+
+
+def walking_order(places: Float[np.ndarray, "n 3"], start: Float[np.ndarray, "3"] | None = None) -> Int[np.ndarray, " n"]:
+    """Returns a short walk through all places: the nearest one next, then parts reversed as long as that shortens the walk
+    (2-opt; Croes 1958).
+
+    Args:
+        places: metres.
+        start: where the walk begins, metres; by default at the first place.
+
+    Returns:
+        Indices of the places, in order.
+    """
+    points = places if start is None else np.concatenate([start[None], places])
+    distance = cdist(points, points)
+    order, left = [0], set(range(1, len(points)))
+    while left:
+        order.append(min(left, key=lambda one: float(distance[order[-1], one])))
+        left.remove(order[-1])
+    walk = np.array(order, int)
+    for _ in range(SWAPS):
+        if (shorter := _reversed_part(walk, distance)) is None:
+            break
+        walk = shorter
+    return walk if start is None else walk[1:] - 1
+
+
+def _reversed_part(walk: Int[np.ndarray, " n"], distance: Float[np.ndarray, "n n"]) -> Int[np.ndarray, " n"] | None:
+    """Returns a shorter walk with one part reversed, which is never the first place; None if there is none."""
+    for i in range(1, len(walk) - 1):
+        for j in range(i + 1, len(walk)):
+            before, first, last = walk[i - 1], walk[i], walk[j]
+            gain = distance[before, first] - distance[before, last]
+            if j + 1 < len(walk):
+                gain += distance[last, walk[j + 1]] - distance[first, walk[j + 1]]
+            if gain > 1e-9:
+                return np.concatenate([walk[:i], walk[i : j + 1][::-1], walk[j + 1 :]])
+    return None
+
+
+def _given(
+    candidates: Float[np.ndarray, "c 3"],
+    expected_error: Float[np.ndarray, " c"],
+    measured: Float[np.ndarray, "m 3"],
+    length: float,
+) -> Float[np.ndarray, "c c"]:
+    """Returns the covariance of errors at candidates, given that measured places have none."""
+    covariance = np.exp(-cdist(candidates, candidates) / length)
+    if len(measured):
+        between, own = (np.exp(-cdist(measured, places) / length) for places in (candidates, measured))
+        own[np.diag_indices(len(measured))] += NUGGET
+        covariance -= between.T @ cho_solve(cho_factor(own), between)
+    covariance *= np.outer(expected_error, expected_error)
+    return covariance
+
+
+def _root_mean(covariance: Float[np.ndarray, "c c"]) -> float:
+    return float(np.sqrt(np.mean(np.maximum(np.diag(covariance), 0))))
