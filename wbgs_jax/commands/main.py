@@ -18,6 +18,9 @@ class Entry(NamedTuple):
 COMMANDS = {
     "train": Entry("wbgs_jax.commands.train", "train a field on the spectra of a scene"),
     "eval": Entry("wbgs_jax.commands.evaluate", "score a trained field on held-out transmitters, and draw figures"),
+    "benchmark": Entry(
+        "wbgs_jax.commands.benchmark", "score any program's predictions for the test links of the released scenes"
+    ),
     "predict": Entry("wbgs_jax.commands.predict", "predict spectra or channel quantities with a trained field, or export it"),
     "map": Entry("wbgs_jax.commands.map", "predict maps over a floor: received power, best beams, K-factor, spreads"),
     "view": Entry("wbgs_jax.commands.view", "show a trained field in a browser: drag the transmitter, see paths and maps"),
@@ -30,7 +33,7 @@ COMMANDS = {
 
 def usage() -> str:
     """Returns what `wbgs-jax --help` prints."""
-    rows = [f"  {name:8} {entry.help}" for name, entry in COMMANDS.items()]
+    rows = [f"  {name:9} {entry.help}" for name, entry in COMMANDS.items()]
     head, tail = "usage: wbgs-jax COMMAND [OPTIONS]", "wbgs-jax COMMAND --help lists the options of a command."
     return "\n".join([head, "", "Wideband RF radiance fields in JAX.", "", *rows, "", tail])
 

@@ -238,16 +238,12 @@ def evaluate(
     own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
-    truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
-    normal = plane_normal(np.asarray(dataset.receiver().element_positions))
-    figures = metrics.figures(np.asarray(predictions.pas), truth, normal)
-    report |= metrics.summarise(figures, *groups, dataset.receiver_index[index])
-    noisy, ssim = as_observed(trained.field, trained.params, np.asarray(predictions.pas)), figures["ssim"]
+    spectra, ssim = score_spectra(np.asarray(predictions.pas), dataset, index, reference)
+    report |= spectra
+    noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
     if not np.array_equal(noisy, predictions.pas):
-        ssim = metrics.ssim(noisy, truth)
+        ssim = metrics.ssim(noisy, np.asarray(dataset.pas(index)))
         report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
-    repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
-    report |= {} if repeats is None else {"truth_repeats": repeats}
     report |= own | ({"power": power} if power else {})
     intervals = trained.intervals
     if (
@@ -257,11 +253,33 @@ def evaluate(
     ):
         report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
     report |= time_queries(trained, dataset)
-    beside = baselines(reference) if can_lend(reference, index) else {}
-    report["baselines"] = {
-        name: metrics.score(np.asarray(predict(index)), truth, *groups, normal) for name, predict in beside.items()
-    }
     return report, np.asarray(predictions.pas)
+
+
+def score_spectra(
+    pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"], reference: Dataset
+) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
+    """Returns the report of spectra predicted for links, with the baselines and the repeatability of the scene beside them, and
+    the SSIM of each.
+
+    Args:
+        pas: predicted spectra.
+        dataset: the data.
+        index: indices of the links.
+        reference: the same data, whose training links the baselines use.
+
+    Raises:
+        UserError: a prediction is NaN or infinite.
+    """
+    truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
+    normal = plane_normal(np.asarray(dataset.receiver().element_positions))
+    figures = metrics.figures(pas, truth, normal)
+    report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
+    repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
+    report |= {} if repeats is None else {"truth_repeats": repeats}
+    beside = baselines(reference) if can_lend(reference, index) else {}
+    rivals = {name: metrics.score(np.asarray(predict(index)), truth, *groups, normal) for name, predict in beside.items()}
+    return report | {"baselines": rivals}, figures["ssim"]
 
 
 def expectations(
