@@ -14,7 +14,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.floor_plan import NO_WALLS, Walls
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.model import LENGTH, MAX_PLACES, Scales, learn_map, received_power
-from wbgs_jax.power_map.validation import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores
+from wbgs_jax.power_map.validation import FOLDS, NINETY, folds, inverse_distance, kriging, log_distance, scores, wrong_plans
 
 GUIDE = Path(__file__).parents[2] / "docs" / "measured.md"
 WALLS = Walls(WALL, np.ones(1))
@@ -116,7 +116,27 @@ def test_walls_tell_about_rooms_that_were_not_measured(rng):
         assert score.error_db < 3 < score.rivals_db["log-distance"] + 1.5
         assert score.error_db < min(score.rivals_db.values()) + 0.3
         assert score.within > 0.8
+        assert set(score.controls_db) == {"plan turned", "plan mirrored in y"}  # mirrored in x this plan is the same
+        assert score.plan_helps and score.error_db + 0.5 < min(score.controls_db.values())
     assert found["squares of 1 m"].error_db < found["squares of 1 m"].rivals_db["inverse distance"] + 0.1
+
+
+@pytest.mark.heavy
+def test_a_wrong_plan_is_not_shown_to_help(rng):
+    tx = places(rng, 120)
+    wrong = wrong_plans(readings(tx, powers(tx)), WALLS)["plan turned"]
+    found = scores(readings(tx, powers(tx, 2.0, rng)), wrong)
+    assert not any(score.plan_helps for score in found)
+
+
+def test_plans_are_turned_and_mirrored_about_the_middle_of_the_building(rng):
+    cells = readings(places(rng, 10), powers(places(rng, 10)))
+    cells = dataclasses.replace(cells, places=np.array([[0.0, 0, 1], [8, 4, 1], *cells.places[2:]]))
+    walls = Walls(np.array([[[1.0, 0.0], [1.0, 3.0]]]), np.ones(1))
+    wrong = wrong_plans(cells, walls)
+    np.testing.assert_allclose(wrong["plan turned"].ends, [[[7, 4], [7, 1]]])
+    np.testing.assert_allclose(wrong["plan mirrored in x"].ends, [[[7, 0], [7, 3]]])
+    assert wrong_plans(cells, NO_WALLS) == {}
 
 
 def test_rivals_where_nobody_was_heard(rng):

@@ -111,6 +111,18 @@ def table(found: list[Score]) -> Table:
     return shown
 
 
+def of_the_plan(found: list[Score]) -> list[str]:
+    """Returns what the controls show about the floor plan, one line for each way of holding out."""
+    lines = []
+    for score in found:
+        if score.plan_helps is not None:
+            others = {"left out": score.rivals_db["without walls"]} | score.controls_db
+            listed = ", ".join(f"{name.removeprefix('plan ')} {error:.2f}" for name, error in others.items())
+            shown = "the plan helps" if score.plan_helps else "that the plan helps is not shown"
+            lines.append(f"{score.held_out}: {score.error_db:.2f} dB with the plan, {listed}: {shown}")
+    return lines
+
+
 def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain) -> list[list[str]]:
     """Returns a header, then one row per transmitter: its position, then mean power and half width of the 90 % interval
     for every receiver; the latter is NaN outside of the measured domain."""
@@ -148,7 +160,9 @@ def report(learned: PowerMap, found: list[Score], command: Command, size: float)
 
 
 def _as_json(score: Score) -> dict[str, Any]:
-    return dataclasses.asdict(score) | {"rivals_db": {_key(name): error for name, error in score.rivals_db.items()}}
+    return dataclasses.asdict(score) | {
+        kind: {_key(name): error for name, error in getattr(score, kind).items()} for kind in ("rivals_db", "controls_db")
+    }
 
 
 def _key(name: str) -> str:
@@ -195,6 +209,8 @@ def main(arguments: list[str] | None = None) -> None:
     if command.out or not (command.tx or command.picture):
         found = scores(cells, walls)
         Console(width=None if sys.stdout.isatty() else 140).print(table(found))
+        for line in of_the_plan(found):
+            print(line)
         if command.out:
             write_json(command.out, report(learned, found, command, size))
             say(f"scores: {command.out}")

@@ -1,20 +1,25 @@
 """Validation of a map on held-out measurements: whole rooms and squares of one metre, compared with baselines, most of which
 ignore walls.
 
+A floor plan has controls: the same plan turned and mirrored about its middle, and none. Only if its map is better than all of
+them has it been shown that the plan itself helps, and not merely some walls.
+
 Scores are the mean absolute error of the means of small cells, and the fraction of these within the 90 % intervals. The means
 have an error of their own: fading divided by the square root of the number of readings.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.floor_plan import NO_WALLS, Walls
+from wbgs_jax._util.statistics import standard_error
+from wbgs_jax.data.floor_plan import NO_WALLS, Walls, crossings
 from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.power_map.model import APART, MIN_POWERS, NEAREST, Scales, alike, distances, learn_map, noise, received_power
 
@@ -22,6 +27,8 @@ BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
 NINETY = 1.6449
 """Half width of the 90 % interval of a normal distribution, in standard deviations."""
+SURE = 2.0
+"""Standard errors over squares by which a floor plan must be better than its controls."""
 Parts = list[Bool[np.ndarray, " n"]]
 Rival = Callable[[Readings], Float[np.ndarray, "n r"]]
 
@@ -39,6 +46,10 @@ class Score:
     """... and the fraction of means within its 90 % intervals."""
     rivals_db: dict[str, float]
     """Mean absolute errors of the baselines."""
+    controls_db: dict[str, float]
+    """Mean absolute errors with the floor plan turned and mirrored; empty without one."""
+    plan_helps: bool | None
+    """Whether the plan is better than all controls and than none, by more than `SURE` standard errors; None without one."""
 
 
 def scores(cells: Readings, walls: Walls) -> list[Score]:
@@ -59,9 +70,15 @@ def scores(cells: Readings, walls: Walls) -> list[Score]:
 
 def folds(cells: Readings) -> Parts:
     """Returns masks of the cells of every square of the plan; if there are many squares, of random groups of them."""
-    _, square = np.unique(np.floor(cells.places[:, :2] / BLOCK).astype(int), axis=0, return_inverse=True)
-    fold = np.random.default_rng(0).permutation(square.max() + 1)[square.reshape(-1)] % FOLDS
+    square = squares(cells)
+    fold = np.random.default_rng(0).permutation(square.max() + 1)[square] % FOLDS
     return [fold == number for number in np.unique(fold)]
+
+
+def squares(cells: Readings) -> Int[np.ndarray, " n"]:
+    """Returns the number of the square of the plan that each cell lies in."""
+    _, square = np.unique(np.floor(cells.places[:, :2] / BLOCK).astype(int), axis=0, return_inverse=True)
+    return square.reshape(-1)
 
 
 def _usable(parts: Parts, cells: Readings) -> Parts:
@@ -78,11 +95,42 @@ def _score(name: str, parts: Parts, cells: Readings, walls: Walls) -> Score:
         predictions[rival] = np.full(mean.shape, np.nan)
         for part in parts:
             predictions[rival][part] = predict(cells.without(part))[part]
+    changed = wrong_plans(cells, walls)
+    predictions |= {control: _mapped(parts, cells, other)[0] for control, other in changed.items()}
     scored = np.isfinite(cells.powers) & np.any(parts, 0)[:, None]
     off = {rival: np.abs(powers - cells.powers)[scored] for rival, powers in (("map", mean), *predictions.items())}
     errors = {rival: float(error.mean()) for rival, error in off.items()}
     within = float((off["map"] <= NINETY * spread[scored]).mean())
-    return Score(name, int(scored.sum()), errors.pop("map"), within, errors)
+    square = np.broadcast_to(squares(cells)[:, None], scored.shape)[scored]
+    others = [off[control] - off["map"] for control in ("without walls", *changed)]
+    helps = all(_surely_positive(gain, square) for gain in others) if changed else None
+    controls = {control: errors.pop(control) for control in changed}
+    return Score(name, int(scored.sum()), errors.pop("map"), within, errors, controls, helps)
+
+
+def _surely_positive(gains: Float[np.ndarray, " n"], square: Int[np.ndarray, " n"]) -> bool:
+    """Returns whether the mean gain over squares is positive by more than `SURE` standard errors."""
+    gain, error = standard_error(gains, square)
+    return gain > SURE * error
+
+
+def wrong_plans(cells: Readings, walls: Walls) -> dict[str, Walls]:
+    """Returns the floor plan turned by 180 degrees and mirrored about the middle of the building, by name, as far as that puts
+    other walls between readings and receivers; none without walls."""
+    if not len(walls.ends):
+        return {}
+    ends = np.asarray(walls.ends, float)
+    points = np.concatenate([ends.reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
+    middle = (points.min(0) + points.max(0)) / 2
+    plans = {name: dataclasses.replace(walls, ends=middle + signs * (ends - middle)) for name, signs in SIGNS.items()}
+    between = [crossings(plan, cells.places[:, None, :2], cells.receivers[None, :, :2]) for plan in (walls, *plans.values())]
+    return {
+        name: plan for (name, plan), own in zip(plans.items(), between[1:], strict=True) if not np.allclose(own, between[0])
+    }
+
+
+SIGNS = {"plan turned": np.array([-1, -1]), "plan mirrored in x": np.array([-1, 1]), "plan mirrored in y": np.array([1, -1])}
+"""Factors on coordinates relative to the middle that make a floor plan wrong, by name."""
 
 
 def _mapped(parts: Parts, cells: Readings, walls: Walls) -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
