@@ -23,7 +23,7 @@ MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
 .PHONY: help setup train eval view measured test test-heavy test-slow test-faults conformance lowest newest locks coverage simulator data lint \
-	typecheck bench gpu-check experiments tables docs site notebooks package clean
+	typecheck bench gpu-check experiments tables example docs site notebooks package clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -130,6 +130,9 @@ experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE
 
 tables: setup  ## write docs/results.md and the marked numbers of all pages from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
+
+example: setup  ## train the example field that comes with the package anew, score it: about ten minutes
+	$(PY) -m tools.example_field
 
 docs: setup  ## write docs/api.md from the docstrings, and check the spelling
 	$(PY) docs/make_api.py && $(VENV)/bin/codespell

@@ -1,5 +1,6 @@
 """Predict spectra or channel quantities with a trained field, or export it:
 
+wbgs-jax predict --example --tx 1,0.5,1.5 --ghz 28 --picture spectrum.png
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
 wbgs-jax predict --run RUN --line 0,0,1.5:4,0,1.5:41 --ghz 28 --what power --out line.csv --picture line.png
 wbgs-jax predict --run RUN --tx x,y,z --sweep 1:100:50 --what delay-spread --out sweep.npz
@@ -24,7 +25,14 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn, warn_of_intervals
+from wbgs_jax.commands.options import (
+    TrainedFieldOptions,
+    check_suffixes,
+    load_field,
+    parse_frequencies,
+    warn,
+    warn_of_intervals,
+)
 from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference import results_file
 from wbgs_jax.inference.quantities import COMPILED, INTERVALS, QUANTITIES, Options, names_for
@@ -47,11 +55,9 @@ BLOCK = 256
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(TrainedFieldOptions):
     """Predict spectra or channel quantities with a trained field, or export it."""
 
-    run: Path
-    """Run folder."""
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
     line: str = ""
@@ -92,6 +98,7 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid or incomplete command line."""
+    _ = command.folder  # one is named
     form = QUANTITIES[command.what].form
     out = (".npz",) if form == "array" else (".npz", ".csv")
     check_suffixes(command, {"out": out, "picture": (".png",), "export": (".zip",)})
@@ -155,7 +162,7 @@ def _export(command: Command) -> None:
     from wbgs_jax.training.run_folder import open_run
 
     assert command.export is not None
-    trained = open_run(command.run)
+    trained = open_run(command.folder)
     dataset = trained.dataset()
     check_quantity("spectra", trained.field, dataset)
     export_field(trained, command.export, dataset=dataset)
@@ -167,18 +174,18 @@ def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField
     from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
 
     lowest, few = lowest_queried(command, queries), len(queries) <= MOST
-    if cached := load_cached(command.run, command.rx, command.what, len(queries), lowest):
+    if cached := load_cached(command.folder, command.rx, command.what, len(queries), lowest):
         return cached
     from wbgs_jax.inference.evaluate_quantities import check_quantity
     from wbgs_jax.training.run_folder import sources_of
 
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
     options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
-    loaded = load_field(command.run, command.rx, lowest, options)
+    loaded = load_field(command.folder, command.rx, lowest, options)
     check_quantity(command.what, loaded.trained.field, loaded.dataset)
     if few and command.what in COMPILED:
-        watched = sources_of(command.run, loaded.trained.config)
-        return make_cached(command.run, command.rx, len(queries), loaded, watched) or loaded
+        watched = sources_of(command.folder, loaded.trained.config)
+        return make_cached(command.folder, command.rx, len(queries), loaded, watched) or loaded
     return loaded
 
 
@@ -209,7 +216,7 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
-    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
+    return options | {"run": str(command.folder.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
 
 
 def answer(command: Command, queries: Queries) -> None:
