@@ -1,8 +1,8 @@
 """Makes the trained field that comes with the package (`wbgs-jax view --example`): python -m tools.example_field
 
-Trains the default field of released scene 1 with the preset `cpu`, scores it on test and validation transmitters, and copies what
-predictions need into the package: the configuration, the parameters of the last checkpoint without the optimiser's state, what
-was learned after the last step, and the manifest, which holds the scores with their provenance.
+Trains the default field of released scene 1 with the preset `cpu`, scores it on test and validation transmitters, and copies
+what predictions need into the package: the configuration, the parameters of the last checkpoint without the optimiser's state,
+what was learned after the last step, and the manifest, which holds the scores with their provenance.
 """
 
 import shutil

@@ -19,9 +19,10 @@ import tyro
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.files import check_writable
 from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import (
+    PICTURES,
     TrainedFieldOptions,
     check_suffixes,
     load_field,
@@ -60,7 +61,7 @@ class Command(TrainedFieldOptions):
     out: Path | None = None
     """Write the maps to this .npz file, as arrays (frequency, y, x)."""
     picture: Path | None = None
-    """Draw the maps (the first 6) and the walls to this .png file."""
+    """Draw the maps (the first 6) and the walls to this .png, .svg or .pdf file."""
 
 
 def check(command: Command) -> None:
@@ -68,7 +69,7 @@ def check(command: Command) -> None:
     _ = command.folder  # one is named
     if not (command.out or command.picture):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
-    check_suffixes(command, {"out": (".npz",), "picture": (".png",)})
+    check_suffixes(command, {"out": (".npz",), "picture": PICTURES})
     if not (np.isfinite(command.step) and command.step > 0):
         raise UserError(f"--step {command.step:g} is not a distance; give metres, such as --step 0.25")
     if command.height is not None and not np.isfinite(command.height):
@@ -119,10 +120,9 @@ def make_maps(command: Command) -> None:
         write_arrays(command.out, answer, field.source | {"what": command.what})
         say(f"map: {command.out} ({size})")
     if command.picture:
-        from wbgs_jax.plotting import draw_maps
+        from wbgs_jax.plotting import draw_maps, save
 
-        with atomic_write(command.picture) as stream:
-            draw_maps(command.what, answer, cut_at(field.dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
+        save(draw_maps(command.what, answer, cut_at(field.dataset, plane.height), field.source), command.picture)
         say(f"picture: {command.picture}")
 
 

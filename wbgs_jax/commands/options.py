@@ -27,6 +27,8 @@ SHORTEST = 1e-3
 """Minimum length of a quaternion; the maximum is its inverse. Others are mistakes."""
 SHOWN = 12
 """Maximum number of warnings printed."""
+PICTURES = (".png", ".svg", ".pdf")
+"""Suffixes of pictures."""
 
 
 @dataclass(frozen=True, kw_only=True)

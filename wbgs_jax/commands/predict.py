@@ -19,13 +19,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from wbgs_jax._util.cli import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.files import check_writable
 from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import (
+    PICTURES,
     TrainedFieldOptions,
     check_suffixes,
     load_field,
@@ -91,7 +93,7 @@ class Command(TrainedFieldOptions):
     resume: bool = False
     """Continue the same command after an interruption."""
     picture: Path | None = None
-    """Draw them to this .png file: up to 12 spectra, or curves."""
+    """Draw them to this .png, .svg or .pdf file: up to 12 links, or curves."""
     export: Path | None = None
     """Write the field to this .zip file, which runs without the model's code (docs/inference.md)."""
 
@@ -101,7 +103,7 @@ def check(command: Command) -> None:
     _ = command.folder  # one is named
     form = QUANTITIES[command.what].form
     out = (".npz",) if form == "array" else (".npz", ".csv")
-    check_suffixes(command, {"out": out, "picture": (".png",), "export": (".zip",)})
+    check_suffixes(command, {"out": out, "picture": PICTURES, "export": (".zip",)})
     places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
     bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
     asks, writes = bool(places or bands), bool(command.out or command.picture)
@@ -119,9 +121,6 @@ def check(command: Command) -> None:
         raise UserError(
             f"--band-mhz {command.band_mhz:g} --points {command.points} is not a band; give 2 to {MOST_POINTS} points"
         )
-    drawn = command.what == "spectra" or form == "scalar"
-    if not drawn and (command.picture or (asks and not command.out)):
-        raise UserError(f"--what {command.what} cannot be drawn; give --out channel.npz, and no --picture")
 
 
 def queries_of(command: Command) -> Queries:
@@ -221,7 +220,7 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
 
 def answer(command: Command, queries: Queries) -> None:
     """Predicts for the queries and writes the requested files."""
-    if command.what == "spectra" and command.out is None:
+    if QUANTITIES[command.what].form != "scalar" and command.out is None:
         queries = queries.some(shown_rows(len(queries)))  # only these are drawn
     field = open_field(command, queries)
     positions, frequencies = queries.tx_positions, queries.frequencies_hz
@@ -242,24 +241,31 @@ def answer(command: Command, queries: Queries) -> None:
         results_file.write(command.out, command.what, answers, queries, field.source)
         say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
-        write_picture(command.picture, command.what, answers, queries)
+        write_picture(command.picture, command.what, answers, queries, field)
         say(f"picture: {command.picture}")
     answers.remove()
 
 
-def write_picture(path: Path, what: str, answers: Answers, queries: Queries) -> None:
-    """Draws spectra, or curves of a scalar quantity."""
-    from wbgs_jax.plotting import draw_answers, draw_sweeps  # imported here because Matplotlib takes a while to load
+def write_picture(path: Path, what: str, answers: Answers, queries: Queries, field: "CachedField | LoadedField") -> None:
+    """Draws the predictions: numbers of all queries, anything else of some links."""
+    from wbgs_jax.plotting import draw_prediction, save  # imported here because Matplotlib takes a while to load
 
-    name = answers.names()[0]
-    if what == "spectra":
-        shown = shown_rows(len(queries))
-        positions, frequencies = queries.flat()
-        figure = draw_answers(answers.rows(name, shown), positions[shown], frequencies[shown])
-    else:
-        figure = draw_sweeps(QUANTITIES[what], answers.whole(name), queries)
-    with atomic_write(path) as stream:
-        figure.savefig(stream, format="png", dpi=110)
+    form, shown = QUANTITIES[what].form, shown_rows(len(queries))
+    rows = answers.rows if form == "array" else lambda name, _: answers.whole(name)
+    found = answers.shared() | {name: rows(name, shown) for name in answers.names()}
+    walls = np.zeros((0, 2, 2))
+    if what == "paths":
+        walls = floor_plan(field, queries)
+    save(draw_prediction(what, found, queries if form == "scalar" else queries.some(shown), field.source, walls), path)
+
+
+def floor_plan(field: "CachedField | LoadedField", queries: Queries) -> Float[np.ndarray, "n 2 2"]:
+    """Returns the walls at the median height of the transmitters, of a field that was not cached."""
+    from wbgs_jax.inference.cached_field import CachedField
+    from wbgs_jax.inference.radio_map import cut_at
+
+    assert not isinstance(field, CachedField), "it has no paths"
+    return cut_at(field.dataset, float(np.median(queries.tx_positions[:, 2])))
 
 
 def main(arguments: list[str] | None = None) -> None:
