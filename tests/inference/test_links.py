@@ -169,7 +169,11 @@ def test_a_table_becomes_a_file(asked, tmp_path):
     table = paths(asked, tx=np.concatenate([TX, TX + 0.5]))
     write_csv(tmp_path / "paths.csv", table_rows(Answers([table])))
     header, rows = read_table(tmp_path / "paths.csv")
-    assert header == list(table) and len(rows) == len(table["tx"]) and set(table["tx"]) == {0, 1}
+    assert (
+        header == [name for name in table if name != "points_m"]
+        and len(rows) == len(table["tx"])
+        and set(table["tx"]) == {0, 1}
+    )
     powers = np.array([float(row[header.index("power_db")]) for row in rows])
     np.testing.assert_allclose(powers, table["power_db"], atol=1e-3)
     assert [row[header.index("interactions")] for row in rows] == table["interactions"].tolist()

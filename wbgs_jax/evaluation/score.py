@@ -34,7 +34,6 @@ from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, Po
 from wbgs_jax.inference.kriging import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_links, render_pas
 from wbgs_jax.inference.trained_field import TrainedField
-from wbgs_jax.metrics import plane_normal
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.channel import NO_PATH_DB, free_space_db
 
@@ -239,8 +238,8 @@ def evaluate(
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
     truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
-    normal = plane_normal(np.asarray(dataset.receiver().element_positions))
-    figures = metrics.figures(np.asarray(predictions.pas), truth, normal)
+    elements = dataset.receiver().element_positions
+    figures = metrics.figures(np.asarray(predictions.pas), truth, elements)
     report |= metrics.summarise(figures, *groups, dataset.receiver_index[index])
     noisy, ssim = as_observed(trained.field, trained.params, np.asarray(predictions.pas)), figures["ssim"]
     if not np.array_equal(noisy, predictions.pas):
@@ -259,7 +258,7 @@ def evaluate(
     report |= time_queries(trained, dataset)
     beside = baselines(reference) if can_lend(reference, index) else {}
     report["baselines"] = {
-        name: metrics.score(np.asarray(predict(index)), truth, *groups, normal) for name, predict in beside.items()
+        name: metrics.score(np.asarray(predict(index)), truth, *groups, elements) for name, predict in beside.items()
     }
     return report, np.asarray(predictions.pas)
 
