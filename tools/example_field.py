@@ -2,7 +2,7 @@
 
 Trains the default field of released scene 1 with the preset `cpu`, scores it on test and validation transmitters, and copies
 what predictions need into the package: the configuration, the parameters of the last checkpoint without the optimiser's state,
-what was learned after the last step, and the manifest, which holds the scores with their provenance.
+what was learned after the last step, and the scores with their provenance (manifest and reports).
 """
 
 import shutil
@@ -15,13 +15,16 @@ import tyro
 
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax.commands import evaluate, train
+from wbgs_jax.evaluation.report import with_part
 from wbgs_jax.inference import intervals, kriging
 from wbgs_jax.training import EXAMPLE, checkpoint
 from wbgs_jax.training.run_folder import MANIFEST, load_trained
 from wbgs_jax.training.step import TrainState
 
-BESIDE = ("config.json", MANIFEST, kriging.FILE, intervals.FILE, intervals.POWER_FILE)
-"""Files of a run folder that predictions read, as far as they exist, and the manifest."""
+PARTS = ("validation", "test")
+SCORES = tuple(f"{with_part('eval', part)}.json" for part in PARTS)
+BESIDE = ("config.json", MANIFEST, *SCORES, kriging.FILE, intervals.FILE, intervals.POWER_FILE)
+"""Files of a run folder that predictions read, as far as they exist, and its scores."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,8 @@ def pack(run: Path, out: Path) -> None:
             if (run / name).exists():
                 shutil.copyfile(run / name, made / name)
         checkpoint.save(made / "checkpoints", trained.step, state, trained.field, saved.metadata, keep=1)
+        for note in made.rglob("commit_success.txt"):  # of Orbax, with a path of this machine; object stores alone need it
+            note.unlink()
         shutil.rmtree(out, ignore_errors=True)
         made.rename(out)
 
@@ -55,7 +60,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     command = tyro.cli(Command, args=arguments, prog="python -m tools.example_field")
     train.main(["--scene", "1", "--preset", "cpu", "--seed", "0", "--out", str(command.run), "--resume"])
-    for part in ("validation", "test"):
+    for part in PARTS:
         evaluate.main(["--run", str(command.run), "--part", part, "--no-pictures"])
     pack(command.run, command.out)
     size = sum(path.stat().st_size for path in command.out.rglob("*") if path.is_file())
