@@ -456,7 +456,7 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
     first, last = (point_words(queries.tx_positions[i]) for i in (0, -1))
     if len(steps):
-        axis.set_xlabel(f"distance along the transmitters from {first} to {last} [m]")
+        axis.set_xlabel(f"distance along the transmitters from {first.removesuffix(' m')} to {last.removesuffix(' m')} [m]")
     else:
         axis.set_xticks([0.0], [f"TX {first}"])
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]

@@ -126,12 +126,12 @@ def open_run(folder: Path) -> TrainedField:
     return trained
 
 
-def load_trained(folder: Path | str = EXAMPLE) -> TrainedField:
+def load_trained(folder: Path | str | None = None) -> TrainedField:
     """Returns the field of a run's newest checkpoint; the data are not read.
 
     Args:
-        folder: a run folder of `wbgs-jax train` or `train_field`; by default the example that comes with the package, a hybrid
-            field of scene 1.
+        folder: a run folder of `wbgs-jax train` or `train_field`; None: the example that comes with the package, a hybrid field
+            of scene 1.
 
     Returns:
         The field with its parameters, corrections and prediction intervals.
@@ -139,7 +139,7 @@ def load_trained(folder: Path | str = EXAMPLE) -> TrainedField:
     Raises:
         UserError: the folder is not a run folder, or it has no valid checkpoint.
     """
-    folder = Path(folder)
+    folder = EXAMPLE if folder is None else Path(folder)
     config = read_config(folder)
     steps = checkpoint.checkpoint_steps(folder / "checkpoints")
     if not steps:
