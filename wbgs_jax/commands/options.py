@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float
 
 from wbgs_jax._util.cli import say
@@ -37,8 +38,8 @@ class TrainedFieldOptions:
 
     run: Path | None = None
     """Run folder."""
-    example: bool = False
-    """Instead of --run: the example, a field of scene 1 that comes with the package."""
+    example: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Instead: the trained field in the package, of scene 1."""
 
     @property
     def folder(self) -> Path:

@@ -79,7 +79,7 @@ class Command(TrainedFieldOptions):
     what: What = "spectra"
     """Quantity to predict: power angular spectra, or one that only some fields provide."""
     tx_velocity: str = "0,0,0"
-    """Velocity of the transmitters, metres per second, for Doppler shifts of paths."""
+    """Velocity of transmitters, metres per second (Doppler shifts)."""
     rx_velocity: str = "0,0,0"
     """Velocity of the receiver."""
     band_mhz: float = 100.0
@@ -93,9 +93,9 @@ class Command(TrainedFieldOptions):
     resume: bool = False
     """Continue the same command after an interruption."""
     picture: Path | None = None
-    """Draw them to this .png, .svg or .pdf file: up to 12 links, or curves."""
+    """Draw 12 links or curves to this .png, .svg or .pdf file."""
     export: Path | None = None
-    """Write the field to this .zip file, which runs without the model's code (docs/inference.md)."""
+    """Write the field as a program to this .zip file (docs/inference.md)."""
 
 
 def check(command: Command) -> None:
