@@ -79,7 +79,7 @@ class Command(TrainedFieldOptions):
     what: What = "spectra"
     """Quantity to predict: power angular spectra, or one that only some fields provide."""
     tx_velocity: str = "0,0,0"
-    """Velocity of transmitters, metres per second (Doppler shifts)."""
+    """Velocity of the transmitters, metres per second (Doppler)."""
     rx_velocity: str = "0,0,0"
     """Velocity of the receiver."""
     band_mhz: float = 100.0
@@ -95,7 +95,7 @@ class Command(TrainedFieldOptions):
     picture: Path | None = None
     """Draw 12 links or curves to this .png, .svg or .pdf file."""
     export: Path | None = None
-    """Write the field as a program to this .zip file (docs/inference.md)."""
+    """Write the field as a program to this .zip file."""
 
 
 def check(command: Command) -> None:
