@@ -20,6 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from wbgs_jax import metrics
 from wbgs_jax._util.cli import point_words
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
@@ -58,6 +59,8 @@ def draw_all(
     }
     if curves:
         figures["curves.png"] = draw_curves(curves)
+    for figure in figures.values():
+        figure.suptitle(origin_words(report), fontsize=9)
     return [save(figure, folder / name) for name, figure in figures.items()]
 
 
@@ -179,9 +182,7 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
         label = f"{name}: {result['median_ssim']:.3f}"
         axis.plot([r["frequency_ghz"] for r in rows], [r["median_ssim"] for r in rows], label=label, **style)
     ticks = [r["frequency_ghz"] for r in report["per_frequency"]]
-    axis.set(
-        xscale="log", xlabel="frequency [GHz]", ylabel="median SSIM", title=f"{report['scene']}: held-out spectra", ylim=(0, 1)
-    )
+    axis.set(xscale="log", xlabel="frequency [GHz]", ylabel="median SSIM", title="held-out spectra", ylim=(0, 1))
     axis.set_xticks(ticks, [f"{t:g}" for t in ticks], fontsize=8, rotation=45)
     axis.minorticks_off()
     axis.grid(alpha=0.3)
@@ -312,7 +313,13 @@ def draw_answers(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
 def draw_paths(
     found: Mapping[str, np.ndarray], queries: Queries, walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
 ) -> Figure:
-    """Returns a figure of the strongest paths of links from above, coloured by power, on the floor plan."""
+    """Returns a figure of the strongest paths of links from above, coloured by power, on the floor plan.
+
+    Raises:
+        UserError: the field does not predict where paths bend.
+    """
+    if "points_m" not in found:
+        raise UserError("the paths of this field have no points to draw; give --out paths.csv, and no --picture")
     positions, frequencies = queries.flat()
     figure, axes = _panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
     figure.set_layout_engine("compressed")  # panels keep their aspect
@@ -329,9 +336,8 @@ def draw_paths(
         axis.plot(*rx[:2], **STAR)
         axis.plot(*place[:2], **DISC)
         axis.set_aspect("equal")
-        axis.set_title(
-            f"{axis.get_title()}\n{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted", fontsize=8
-        )
+        words = f"{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted" if len(own) else "no paths"
+        axis.set_title(f"{axis.get_title()}\n{words}", fontsize=8)
     axes[0].legend(fontsize=8, loc="upper right")
     _name_axes(axes, "x [m]", "y [m]")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="power of a path [dB of the strongest]")

@@ -8,6 +8,7 @@ from builders.synthetic import tiny_dataset
 from matplotlib import pyplot as plt
 from PIL import Image
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation, select_frequencies
 from wbgs_jax.inference.quantities import QUANTITIES, names_for
 from wbgs_jax.inference.queries import Queries
@@ -223,6 +224,16 @@ def test_paths_are_those_of_the_link_and_weak_ones_are_left_out(rng):
         np.testing.assert_allclose(one[[0, -1]], [place[:2], [0, 1]])
         assert "1 of 2 paths, the strongest -60.0 dB" in axis.get_title()
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["receiver", "transmitter"]
+
+
+def test_links_without_paths_and_paths_without_points(tmp_path, rng):
+    one = Queries(PLACES[:1], HERTZ[:1], paired=True)
+    nothing = {name: values[:0] for name, values in found_for("paths", one, rng).items()}
+    figure = draw_prediction("paths", nothing, one, SOURCE, WALLS)
+    assert "no paths" in figure.axes[0].get_title() and save(figure, tmp_path / "a.png").stat().st_size
+    del nothing["points_m"]
+    with pytest.raises(UserError, match="have no points to draw"):
+        draw_prediction("paths", nothing, one, SOURCE, WALLS)
 
 
 def test_errors_have_a_scale_of_their_own(dataset):

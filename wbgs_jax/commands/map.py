@@ -67,6 +67,8 @@ class Command(TrainedFieldOptions):
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line, or one without an output."""
     _ = command.folder  # one is named
+    if not command.ghz:
+        raise UserError("--ghz has no frequency; give gigahertz, such as --ghz 28")
     if not (command.out or command.picture):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
     check_suffixes(command, {"out": (".npz",), "picture": PICTURES})

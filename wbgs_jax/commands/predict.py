@@ -15,7 +15,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import tyro
@@ -253,19 +253,16 @@ def write_picture(path: Path, what: str, answers: Answers, queries: Queries, fie
     form, shown = QUANTITIES[what].form, shown_rows(len(queries))
     rows = answers.rows if form == "array" else lambda name, _: answers.whole(name)
     found = answers.shared() | {name: rows(name, shown) for name in answers.names()}
-    walls = np.zeros((0, 2, 2))
-    if what == "paths":
-        walls = floor_plan(field, queries)
+    walls = floor_plan(field, queries) if form == "table" else np.zeros((0, 2, 2))
     save(draw_prediction(what, found, queries if form == "scalar" else queries.some(shown), field.source, walls), path)
 
 
 def floor_plan(field: "CachedField | LoadedField", queries: Queries) -> Float[np.ndarray, "n 2 2"]:
-    """Returns the walls at the median height of the transmitters, of a field that was not cached."""
-    from wbgs_jax.inference.cached_field import CachedField
+    """Returns the walls at the median height of the transmitters."""
     from wbgs_jax.inference.radio_map import cut_at
 
-    assert not isinstance(field, CachedField), "it has no paths"
-    return cut_at(field.dataset, float(np.median(queries.tx_positions[:, 2])))
+    loaded = cast("LoadedField", field)  # tables are not predicted from the cache
+    return cut_at(loaded.dataset, float(np.median(queries.tx_positions[:, 2])))
 
 
 def main(arguments: list[str] | None = None) -> None:
