@@ -1,4 +1,4 @@
-# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; ARGS of `make data`; PROFILE MINUTES of
+# One word a target; `make help` lists them. Variables: SCENE FIELD PRESET DATA OUT SEED; EXAMPLE of `make view`; ARGS of `make data`; PROFILE MINUTES of
 # `make experiments`; PYTHON for set-up; QUICK of `make lowest` and `newest`.
 SCENE  ?= 1
 FIELD  ?= hybrid
@@ -23,7 +23,7 @@ MEASURED := $(if $(OUT),$(OUT),runs/$(NAME)-measured)
 RUN    := $(if $(OUT),$(OUT),runs/$(NAME)-$(FIELD)-$(PRESET)-seed$(SEED))
 
 .PHONY: help setup train eval view measured test test-heavy test-slow test-faults conformance lowest newest locks coverage simulator data lint \
-	typecheck bench gpu-check experiments tables docs site notebooks package clean
+	typecheck bench gpu-check experiments tables example docs site notebooks package clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -50,8 +50,8 @@ train: setup  ## train, evaluate, draw: make train SCENE=1 [FIELD= PRESET=smoke|
 eval: setup  ## evaluate a trained run again: make eval OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
 	$(VENV)/bin/wbgs-jax eval --run $(RUN)
 
-view: setup  ## look at a trained run in the browser: make view OUT=runs/x (or the SCENE, FIELD, PRESET, SEED of the training)
-	$(VENV)/bin/wbgs-jax view --run $(RUN)
+view: setup  ## look at a trained run in the browser: make view EXAMPLE=1, or OUT=runs/x (or the SCENE, FIELD, ... of the training)
+	$(VENV)/bin/wbgs-jax view $(if $(EXAMPLE),--example,--run $(RUN))
 
 measured: setup  ## learn and score a map of measured powers: make measured DATA=folder [OUT=folder]  (docs/measured.md)
 	@test -n "$(DATA)" || { echo "error: give the folder with the readings: make measured DATA=folder" >&2; exit 2; }
@@ -130,6 +130,9 @@ experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE
 
 tables: setup  ## write docs/results.md and the marked numbers of all pages from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
+
+example: setup  ## train the example field that comes with the package anew, score it: about ten minutes
+	$(PY) -m tools.example_field
 
 docs: setup  ## write docs/api.md from the docstrings, and check the spelling
 	$(PY) docs/make_api.py && $(VENV)/bin/codespell

@@ -91,6 +91,11 @@ def new_field(names: dict) -> None:
 
 def recipes(names: dict) -> None:
     np.testing.assert_allclose(names["at_once"], names["mapped"], atol=1e-5)
+    np.testing.assert_allclose(names["spectra"][0], names["predict"]([1.0, 0.5, 1.5], 28e9), atol=1e-5)
+    assert names["degrees"].shape == (6,) and 0 <= names["within_5_degrees"] <= 1
+    assert names["response_db"].shape == (2, 256) and -120 < float(names["response_db"].mean()) < -40
+    np.testing.assert_allclose(names["snr_db"], names["rssi_dbm"] + 80, atol=1e-4)
+    assert bool((names["sinr_db"] < names["snr_db"]).all()) and float(names["errors"].max()) < 0.2
     assert float(names["mismatch"](names["positions"]).min()) < float(names["mismatch"](names["starts"]).min())
     assert float(names["misfit"](names["params"])) < float(names["first"])
     assert float(abs(names["slopes"]["params"]["field"].gaussians.means).max()) > 0

@@ -1,5 +1,6 @@
 """The documentation builds without a warning, holds every page, and asks no other host for anything."""
 
+import json
 import re
 import subprocess
 import sys
@@ -36,3 +37,9 @@ def test_every_picture_is_described():
     for page in (ROOT / "docs").rglob("*.md"):
         for words in re.findall(r"!\[([^\]]*)\]\(", page.read_text()):
             assert len(words) > 10, f"{page.name}: ![{words}]"
+
+
+@pytest.mark.parametrize("word", ["frequency response", "impulse response", "sinr", "rssi", "link simulation", "csv"])
+def test_the_search_finds_usual_names_in_headings(site, word):
+    entries = json.loads((site / "search" / "search_index.json").read_text())["docs"]
+    assert [entry["location"] for entry in entries if word in entry["title"].lower()]

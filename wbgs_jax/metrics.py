@@ -5,42 +5,14 @@ strongest direction, and the power lost by choosing beams from predicted spectra
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from skimage.metrics import structural_similarity
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.radio.array import codebook, pas_directions
+from wbgs_jax.radio.array import codebook, peak_direction_error
 
-FLAT = 1e-4
-"""Largest distance of the elements of a planar array from its plane, relative to the array's size."""
 FAINTEST_DB = -60.0
 """Power relative to the best beam below which a beam counts as receiving nothing."""
-
-
-def angle_error_deg(
-    predicted: Float[np.ndarray, "n 90 360"],
-    truth: Float[np.ndarray, "n 90 360"],
-    array_normal: Float[np.ndarray, "3"] | None = None,
-) -> Float[np.ndarray, " n"]:
-    """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
-
-    A planar array cannot distinguish its front from its back: if its normal is given, the smaller of both angles counts.
-    """
-    directions = pas_directions().reshape(-1, 3)
-    a, b = (directions[spectra.reshape(len(spectra), -1).argmax(1)] for spectra in (predicted, truth))
-    twins = [a] if array_normal is None else [a, a - 2 * (a @ array_normal)[:, None] * array_normal]
-    angles = [np.arctan2(np.linalg.norm(np.cross(twin, b), axis=-1), (twin * b).sum(-1)) for twin in twins]
-    return np.degrees(np.min(angles, 0))
-
-
-def plane_normal(element_positions: Float[np.ndarray, "elements 3"]) -> Float[np.ndarray, "3"] | None:
-    """Returns the unit normal of the plane of an array's elements; None if they do not determine a single plane."""
-    centred = element_positions - element_positions.mean(0)
-    if len(centred) < 3:
-        return None
-    _, sizes, axes = np.linalg.svd(centred.astype(np.float64), full_matrices=False)
-    flat = sizes < FLAT * max(sizes[0], 1e-12)
-    return axes[-1] if flat.tolist() == [False, False, True] else None
 
 
 def beam_loss_db(
@@ -87,7 +59,7 @@ def score(
     truth: Float[np.ndarray, "n 90 360"],
     frequencies_hz: Float[np.ndarray, " n"],
     sight: Bool[np.ndarray, " n"] | None = None,
-    array_normal: Float[np.ndarray, "3"] | None = None,
+    element_positions: Float[Array | np.ndarray, "elements 3"] | None = None,
 ) -> dict[str, Any]:
     """Returns a report of predicted spectra, ready for JSON.
 
@@ -96,7 +68,7 @@ def score(
         truth: observed spectra.
         frequencies_hz: of every spectrum.
         sight: whether there is a line of sight to the transmitter, if known.
-        array_normal: of a planar array, which cannot distinguish its front from its back.
+        element_positions: of the array, for directions that it receives alike (`radio.peak_direction_error`).
 
     Returns:
         n; median_ssim, mean_ssim and the percentiles p5_ssim, p10_ssim; psnr_db (median); mae (mean); angle_error_deg of the
@@ -107,13 +79,13 @@ def score(
     Raises:
         UserError: there are no spectra, or a prediction contains NaN or infinity.
     """
-    return summarise(figures(predicted, truth, array_normal), frequencies_hz, sight)
+    return summarise(figures(predicted, truth, element_positions), frequencies_hz, sight)
 
 
 def figures(
     predicted: Float[np.ndarray, "n 90 360"],
     truth: Float[np.ndarray, "n 90 360"],
-    array_normal: Float[np.ndarray, "3"] | None = None,
+    element_positions: Float[Array | np.ndarray, "elements 3"] | None = None,
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Returns the figures of `score` for every spectrum; raises the same errors."""
     if len(predicted) == 0:
@@ -124,7 +96,7 @@ def figures(
         "ssim": ssim(predicted, truth),
         "psnr_db": psnr_db(predicted, truth),
         "mae": mae(predicted, truth),
-        "angle_error_deg": angle_error_deg(predicted, truth, array_normal),
+        "angle_error_deg": np.asarray(peak_direction_error(predicted, truth, element_positions)),
         "beam_loss_db": beam_loss_db(predicted, truth),
         "beam_loss_top3_db": beam_loss_db(predicted, truth, 3),
     }

@@ -1,23 +1,26 @@
-"""Plots, written as PNG files, atomically: spectra (rectangular and polar), training curves and SSIM by frequency of a run;
-predicted spectra, and quantities along a line, over a frequency sweep or per query; maps of a quantity over a floor with walls
-and receiver; maps of received power over a floor plan.
+"""Figures, written as PNG, SVG or PDF files, atomically: spectra (rectangular and polar), training curves and SSIM by frequency
+of a run; every quantity that `wbgs-jax predict` provides; maps of a quantity over a floor with walls and receiver; maps of
+received power over a floor plan.
 """
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from wbgs_jax import metrics
 from wbgs_jax._util.cli import point_words
+from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
@@ -31,6 +34,8 @@ SHOWN = 6
 """Maximum number of spectra in a plot."""
 LONGEST_ARROW = 0.1
 """Length of the longest arrow, relative to the scene's size."""
+DOTS = 110
+"""Pixels per inch."""
 SIZES = ("gaussians",)
 """Counts of a field that change during training."""
 
@@ -54,7 +59,9 @@ def draw_all(
     }
     if curves:
         figures["curves.png"] = draw_curves(curves)
-    return [_save(figure, folder / name) for name, figure in figures.items()]
+    for figure in figures.values():
+        figure.suptitle(origin_words(report), fontsize=9)
+    return [save(figure, folder / name) for name, figure in figures.items()]
 
 
 def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
@@ -72,26 +79,29 @@ def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -
 
 def _title(dataset: Dataset, index: int) -> str:
     x, y, z = dataset.tx_positions[index]
-    return f"{dataset.frequencies_hz[index] / 1e9:g} GHz, TX ({x:.1f}, {y:.1f}, {z:.1f}) m"
+    return f"{dataset.frequencies_hz[index] / 1e9:g} GHz, TX ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
 def draw_spectra(truth: Float[np.ndarray, "k 90 360"], predicted: Float[np.ndarray, "k 90 360"], titles: list[str]) -> Figure:
-    """Returns truth, prediction and absolute error over azimuth and zenith, one row per spectrum."""
+    """Returns truth, prediction and absolute error, on a scale of its own, over azimuth and zenith, one row per spectrum."""
     figure = Figure(figsize=(13, 1.75 * len(truth) + 0.6), layout="constrained")
     axes = figure.subplots(len(truth), 3, squeeze=False)
+    tops = (1.0, 1.0, max(float(np.abs(truth - predicted).max()), np.finfo(np.float32).eps))
     ssim = metrics.ssim(predicted, truth)
     for row, (a, b, title, score) in enumerate(zip(truth, predicted, titles, ssim, strict=True)):
         images = (a, b, np.abs(a - b))
         labels = (f"truth: {title}", f"prediction: SSIM {score:.3f}", f"|error|: mean {images[2].mean():.3f}")
-        for axis, image, label in zip(axes[row], images, labels, strict=True):
-            shown = axis.imshow(image, vmin=0, vmax=1, cmap="viridis", extent=(-180, 180, 90, 0), aspect="auto")
+        colors = (COLORS, COLORS, "magma")
+        for axis, image, label, top, cmap in zip(axes[row], images, labels, tops, colors, strict=True):
+            shown = axis.imshow(image, vmin=0, vmax=top, cmap=cmap, extent=(-180, 180, 90, 0), aspect="auto")
             axis.set_title(label, fontsize=9)
             axis.set_xticks(range(-180, 181, 90))
             axis.set_yticks((0, 45, 90))
         axes[row, 0].set_ylabel("zenith [deg]")
     for axis in axes[-1]:
         axis.set_xlabel("azimuth [deg]")
-    figure.colorbar(shown, ax=axes, shrink=0.5, label="normalised amplitude")
+    figure.colorbar(axes[0, 0].images[0], ax=axes[:, :2], shrink=0.5, label="normalised amplitude")
+    figure.colorbar(shown, ax=axes[:, 2], shrink=0.5, label="error of the amplitude")
     return figure
 
 
@@ -120,7 +130,7 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(13 if sizes else 9, 3.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, 3 if sizes else 2))
     axes[0].plot([e["step"] for e in steps], [e["loss"] for e in steps], color="C0")
-    axes[0].set(title="training loss", xlabel="step")
+    axes[0].set(title="training loss", xlabel="step", ylabel="loss")
     batch = [(e["step"], e["batch_ssim"]) for e in steps if e.get("batch_ssim") is not None]
     if batch:
         axes[1].plot(*zip(*batch, strict=True), color="C0", alpha=0.6, label="training batches: mean SSIM (11x11)")
@@ -128,12 +138,12 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
         points = [(e["step"], e[name]) for e in steps if name in e]
         label = "held-out sample: median SSIM (7x7)" if name == "held_out_ssim" else name.replace("_", " ")
         axes[1].plot(*zip(*points, strict=True), "o-", color="C3", label=label)
-    axes[1].set(title="quality", xlabel="step")
+    axes[1].set(title="quality", xlabel="step", ylabel="SSIM")
     if batch or held_out:
         axes[1].legend(fontsize=8)
     for name in sizes:
         axes[2].plot([e["step"] for e in steps], [e.get(name) for e in steps], color="C2")
-        axes[2].set(title=name, xlabel="step", ylim=(0, None))
+        axes[2].set(title=name, xlabel="step", ylabel="number", ylim=(0, None))
     for axis in axes:
         axis.grid(alpha=0.3)
     return figure
@@ -158,7 +168,7 @@ def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[
         axis.autoscale_view()
     shown = ScalarMappable(Normalize(0, size.max()), "viridis")
     figure.colorbar(shown, ax=axes, label="displacement [mm]", shrink=0.8)
-    return _save(figure, folder / "surfaces_moved.png")
+    return save(figure, folder / "surfaces_moved.png")
 
 
 def draw_frequencies(report: dict[str, Any]) -> Figure:
@@ -172,9 +182,7 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
         label = f"{name}: {result['median_ssim']:.3f}"
         axis.plot([r["frequency_ghz"] for r in rows], [r["median_ssim"] for r in rows], label=label, **style)
     ticks = [r["frequency_ghz"] for r in report["per_frequency"]]
-    axis.set(
-        xscale="log", xlabel="frequency [GHz]", ylabel="median SSIM", title=f"{report['scene']}: held-out spectra", ylim=(0, 1)
-    )
+    axis.set(xscale="log", xlabel="frequency [GHz]", ylabel="median SSIM", title="held-out spectra", ylim=(0, 1))
     axis.set_xticks(ticks, [f"{t:g}" for t in ticks], fontsize=8, rotation=45)
     axis.minorticks_off()
     axis.grid(alpha=0.3)
@@ -182,72 +190,291 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
     return figure
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
+    """Writes a figure in the format that the suffix of the file names; returns the file."""
     with atomic_write(path) as stream:
-        figure.savefig(stream, format="png", dpi=110)
+        figure.savefig(stream, format=path.suffix[1:], dpi=DOTS)
     return path
 
 
 COLORS = "viridis"
+PATH_COLORS = "plasma"
+FADED_DB = 40.0
+"""Paths and taps of impulse responses are drawn that are less than this below the strongest one."""
+STAR: dict[str, Any] = {
+    "marker": "*",
+    "color": "white",
+    "markeredgecolor": "black",
+    "markersize": 14,
+    "linestyle": "none",
+    "label": "receiver",
+}
+DISC: dict[str, Any] = {
+    "marker": "o",
+    "color": "white",
+    "markeredgecolor": "black",
+    "markersize": 7,
+    "linestyle": "none",
+    "label": "transmitter",
+}
 
 
-def draw_answers(
-    pas: Float[np.ndarray, "n 90 360"], tx_positions: Float[np.ndarray, "n 3"], frequencies_hz: Float[np.ndarray, " n"]
+def draw_prediction(
+    what: str, found: Mapping[str, np.ndarray], queries: Queries, source: Mapping[str, Any], walls: Float[np.ndarray, "n 2 2"]
 ) -> Figure:
-    """Returns a figure of spectra over azimuth and zenith, two per row."""
-    columns = min(2, len(pas))
-    rows = -(-len(pas) // columns)
-    figure = Figure(figsize=(5.5 * columns, 1.9 * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for i, axis in enumerate(axes.flat):
-        if i >= len(pas):
-            axis.axis("off")
-            continue
-        shown = axis.imshow(pas[i], vmin=0, vmax=1, cmap=COLORS, extent=(-180, 180, 90, 0), aspect="auto")
-        axis.set_title(f"{frequencies_hz[i] / 1e9:.4g} GHz, TX {point_words(tx_positions[i])}", fontsize=9)
+    """Returns a figure of a quantity of `wbgs-jax predict`, named by scene, field and receiver.
+
+    Args:
+        what: name of the quantity (`quantities.QUANTITIES`).
+        found: its arrays; the leading axis of those that are not common to all queries is the queries, or a table's rows.
+        queries: the queries, paired unless the quantity is a number.
+        source: provenance (`LoadedField.source`).
+        walls: ends of the walls of the floor plan, metres; only paths need them.
+    """
+    quantity, places = QUANTITIES[what], source["receiver"]["position"]
+    if quantity.form == "scalar":
+        figure = draw_sweeps(quantity, found, queries, source.get("power_interval_level"))
+    elif what == "spectra":
+        figure = draw_answers(found, queries)
+    elif what == "paths":
+        figure = draw_paths(found, queries, walls, np.asarray(places))
+    elif what == "frequency-response":
+        figure = draw_responses(found, queries)
+    elif what == "mimo":
+        figure = draw_matrices(found["mimo"], queries)
+    else:
+        figure = draw_snapshots(found["snapshots"], queries)
+    figure.suptitle(f"{origin_words(source)}, receiver {point_words(np.asarray(places))}", fontsize=9)
+    return figure
+
+
+def origin_words(source: Mapping[str, Any]) -> str:
+    """Returns scene and field of a figure."""
+    return f"{source['scene']}, {source['field']} field"
+
+
+def _link_titles(queries: Queries) -> list[str]:
+    positions, frequencies = queries.flat()
+    return [f"{hertz / 1e9:.4g} GHz, TX {point_words(place)}" for place, hertz in zip(positions, frequencies, strict=True)]
+
+
+def _panels(titles: list[str], columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
+    """Returns a figure with a panel for each title; `size` is that of a panel in inches."""
+    columns = min(columns, len(titles))
+    rows = -(-len(titles) // columns)
+    figure = Figure(figsize=(size[0] * columns + 0.8, size[1] * rows + 0.8), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+    for axis in axes[len(titles) :]:
+        axis.axis("off")
+    for axis, title in zip(axes, titles, strict=False):
+        axis.set_title(title, fontsize=9)
+    return figure, axes[: len(titles)]
+
+
+def _name_axes(axes: Iterable[Axes], x: str, y: str) -> None:
+    """Names the axes of panels that share them, at the left and where no panel is below."""
+    panels = [axis for axis in axes if axis.axison]
+    columns = panels[0].get_subplotspec().get_gridspec().ncols  # type: ignore[union-attr]
+    for number, axis in enumerate(panels):
+        if number + columns >= len(panels):
+            axis.set_xlabel(x, fontsize=9)
+            axis.tick_params(labelbottom=True)
+        if number % columns == 0:
+            axis.set_ylabel(y, fontsize=9)
+
+
+def _clipped(values: Float[np.ndarray, "*shape"], vmin: float, vmax: float) -> Any:
+    """Returns at which ends a colour bar needs an arrow, because values lie beyond it."""
+    below, above = bool(np.nanmin(values) < vmin), bool(np.nanmax(values) > vmax)
+    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
+
+
+def _amplitude_db(amplitude: Any) -> Float[np.ndarray, "*shape"]:
+    """Returns powers of complex amplitudes in dB; NaN where nothing arrives."""
+    power = np.abs(np.asarray(amplitude, np.complex128)) ** 2
+    received = power > 10 ** (NO_PATH_DB / 10)
+    return np.where(received, 10 * np.log10(np.where(received, power, 1.0)), np.nan)
+
+
+def draw_answers(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
+    """Returns a figure of spectra over azimuth and zenith with their expected SSIM, two per row."""
+    titles = _link_titles(queries)
+    for i, (ssim, low, high) in enumerate(found.get("expected", ())):
+        titles[i] += "" if np.isnan(ssim) else f"\nexpected SSIM {ssim:.2f} ({low:.2f} to {high:.2f})"
+    figure, axes = _panels(titles, 2, (5.4, 2.1), sharex=True, sharey=True)
+    for axis, pas in zip(axes, found["pas"], strict=True):
+        shown = axis.imshow(pas, vmin=0, vmax=1, cmap=COLORS, extent=(-180, 180, 90, 0), aspect="auto")
         axis.set(xticks=range(-180, 181, 90), yticks=(0, 45, 90))
-    figure.supxlabel("azimuth [deg]", fontsize=9)
-    figure.supylabel("zenith [deg]", fontsize=9)
+    _name_axes(axes, "azimuth [deg]", "zenith [deg]")
     figure.colorbar(shown, ax=axes, shrink=0.8, label="normalised amplitude")
     return figure
 
 
-def draw_sweeps(quantity: Quantity, values: Float[np.ndarray, " *shape"], queries: Queries) -> Figure:
+def draw_paths(
+    found: Mapping[str, np.ndarray], queries: Queries, walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
+) -> Figure:
+    """Returns a figure of the strongest paths of links from above, coloured by power, on the floor plan.
+
+    Raises:
+        UserError: the field does not predict where paths bend.
+    """
+    if "points_m" not in found:
+        raise UserError("the paths of this field have no points to draw; give --out paths.csv, and no --picture")
+    positions, frequencies = queries.flat()
+    figure, axes = _panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
+    figure.set_layout_engine("compressed")  # panels keep their aspect
+    shown = ScalarMappable(Normalize(-FADED_DB, 0), PATH_COLORS)
+    link = np.stack([found[name] for name in ("x", "y", "z", "frequency_ghz")], -1)
+    for axis, place, hertz in zip(axes, positions, frequencies, strict=True):
+        own = np.flatnonzero(np.isclose(link, [*place, hertz / 1e9]).all(-1))
+        top = found["power_db"][own].max(initial=NO_PATH_DB)
+        power = found["power_db"][own] - top
+        strong = np.argsort(power)[(np.sort(power) > -FADED_DB)]  # the strongest on top
+        axis.add_collection(LineCollection(list(walls), colors="grey", linewidths=0.8))
+        lines = list(found["points_m"][own[strong]][..., :2])
+        axis.add_collection(LineCollection(lines, colors=shown.to_rgba(power[strong]), linewidths=1.0))
+        axis.plot(*rx[:2], **STAR)
+        axis.plot(*place[:2], **DISC)
+        axis.set_aspect("equal")
+        words = f"{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted" if len(own) else "no paths"
+        axis.set_title(f"{axis.get_title()}\n{words}", fontsize=8)
+    axes[0].legend(fontsize=8, loc="upper right")
+    _name_axes(axes, "x [m]", "y [m]")
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="power of a path [dB of the strongest]")
+    return figure
+
+
+def draw_responses(found: Mapping[str, np.ndarray], queries: Queries) -> Figure:
+    """Returns a figure of frequency and impulse responses of the first element, a curve for every link."""
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    above, below = figure.subplots(2, 1)
+    names = ("frequency_response", "impulse_response")
+    response, impulses = (_amplitude_db(found[name][..., 0]) for name in names)
+    for share, title, one, other in zip(_shares(len(queries)), _link_titles(queries), response, impulses, strict=True):
+        style: dict[str, Any] = {"lw": 1.2, "color": colormaps[COLORS](share), "label": title, "marker": ".", "ms": 3}
+        above.plot(found["offsets_hz"] / 1e6, one, **style)
+        below.plot(found["delays_s"] * 1e9, other, **style)
+    unit = f"first of {found['frequency_response'].shape[-1]} elements [dB of the transmitted]"
+    above.set(xlabel="frequency relative to the carrier [MHz]", ylabel=f"frequency response,\n{unit}")
+    below.set(xlabel="delay, modulo the longest one shown [ns]", ylabel=f"impulse response,\n{unit}")
+    if np.isfinite(impulses).any():
+        below.set_ylim(np.nanmax(impulses) - FADED_DB, np.nanmax(impulses) + 3)
+    above.legend(fontsize=8)
+    for axis in (above, below):
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def draw_matrices(matrices: Complex[np.ndarray, "n elements m"], queries: Queries) -> Figure:
+    """Returns a figure of MIMO matrices, powers in dB."""
+    figure, axes = _panels(_link_titles(queries), 3, (3.4, 3.6), sharex=True, sharey=True)
+    values = _amplitude_db(matrices)
+    span: Any = {"vmin": float(np.nanmin(values)), "vmax": float(np.nanmax(values))} if np.isfinite(values).any() else {}
+    elements, columns = matrices.shape[1:]
+    for axis, value in zip(axes, values, strict=True):
+        shown = axis.imshow(value, cmap=COLORS, aspect="auto", extent=(0.5, columns + 0.5, elements + 0.5, 0.5), **span)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _name_axes(axes, "number of the transmitter's element", "number of the receiver's element")
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="power of the channel [dB of the transmitted]")
+    return figure
+
+
+def draw_snapshots(snapshots: Complex[np.ndarray, "n elements"], queries: Queries) -> Figure:
+    """Returns a figure of snapshots: power and phase at every element, in a colour for every link."""
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
+    numbers = np.arange(1, snapshots.shape[-1] + 1)
+    for share, title, values in zip(_shares(len(queries)), _link_titles(queries), snapshots, strict=True):
+        style: dict[str, Any] = {"linestyle": "none", "marker": "o", "ms": 5, "color": colormaps[COLORS](share), "label": title}
+        axes[0].plot(numbers, _amplitude_db(values), **style)
+        axes[1].plot(numbers, np.degrees(np.angle(values)), **style)
+    axes[0].set_ylabel("power [dB of the transmitted]")
+    axes[1].set(xlabel="number of the receiver's element", ylabel="phase [deg]", ylim=(-185, 185), yticks=range(-180, 181, 90))
+    axes[0].legend(fontsize=8)
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    return figure
+
+
+def _shares(count: int) -> Float[np.ndarray, " n"]:
+    """Returns where the colours of curves lie in the colour map, whose bright end is hard to see."""
+    return np.linspace(0, 0.9, count)
+
+
+def draw_sweeps(quantity: Quantity, found: Mapping[str, np.ndarray], queries: Queries, level: float | None) -> Figure:
     """Returns a figure of a quantity: over the frequency where there are more of these than transmitters, a curve each; else
-    over the distance from the first transmitter along the way to the last; of single queries over their numbers."""
-    figure = Figure(figsize=(7, 4), layout="constrained")
+    over the distance from the first transmitter along the way to the last; of single queries over their numbers.
+
+    Args:
+        quantity: the quantity; of two columns the second one is dashed.
+        found: its arrays, with a leading axis of all queries.
+        queries: the queries.
+        level: probability of the intervals of powers, if there are any.
+    """
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
     axis = figure.subplots()
-    values = quantity.scale * values.reshape(*queries.shape, -1)[..., 0]
+    values = quantity.scale * found[quantity.outputs[0]].reshape(*queries.shape, -1)
+    if quantity.name == "power":
+        values = np.where(values > NO_PATH_DB, values, np.nan)
+    within = found["within_db"].reshape(queries.shape) if "within_db" in found else np.full(queries.shape, np.nan)
+    places, legend = _places(axis, queries)
     if queries.paired:
-        curves, places, legend = values[None], np.arange(1, len(queries) + 1.0), [""]
-        axis.set_xlabel("query")
+        curves, bounds = values[None], within[None]
     elif len(queries.frequencies_hz) > len(queries.tx_positions):
-        curves, places = values, queries.frequencies_hz / 1e9
-        legend = [f"TX {point_words(tx)}" for tx in queries.tx_positions]
-        axis.set(xlabel="frequency [GHz]", xscale="log")
+        curves, bounds = values, within
     else:
-        steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
-        curves, places = values.T, np.concatenate([[0.0], np.cumsum(steps)])
-        legend = [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
-        axis.set_xlabel("distance along the transmitters [m]")
-    chosen = shown_rows(len(curves))
-    for share, number in zip(np.linspace(0, 0.9, len(chosen)), chosen, strict=True):
-        axis.plot(places, curves[number], ".-", ms=3, lw=1, label=legend[number], color=colormaps[COLORS](share))
+        curves, bounds = np.moveaxis(values, 1, 0), within.T
+    chosen, label = shown_rows(len(curves)), quantity.label
+    joined = "none" if queries.paired or len(places) == 1 else "-"  # a line between single points would mean nothing
+    style: dict[str, Any] = {"marker": "o" if joined == "none" else ".", "ms": 5 if joined == "none" else 3, "lw": 1.2}
+    for share, number in zip(_shares(len(chosen)), chosen, strict=True):
+        curve, color = curves[number], colormaps[COLORS](share)
+        axis.plot(places, curve[:, 0], linestyle=joined, label=legend[number], color=color, **style)
+        if curve.shape[-1] > 1:
+            axis.plot(places, curve[:, 1], linestyle="none" if joined == "none" else "--", color=color, mfc="white", **style)
+        if level is None or not np.isfinite(bounds[number]).any():
+            continue
+        ends = curve[:, 0] - bounds[number], curve[:, 0] + bounds[number]
+        if joined == "none":
+            axis.errorbar(places, curve[:, 0], bounds[number], fmt="none", ecolor=color, capsize=3)
+        else:
+            axis.fill_between(places, *ends, color=color, alpha=0.15, lw=0)
+        label = f"{quantity.label}\nand its {100 * level:.0f} % interval"
+    if values.shape[-1] > 1:
+        label = label.replace("the azimuth", "azimuth (filled) and\nzenith (open, dashed)")
     if legend != [""]:
-        axis.legend(fontsize=8)
-    axis.set_ylabel(quantity.label)
+        axis.legend(fontsize=8, title="" if len(chosen) == len(curves) else f"{len(chosen)} of {len(curves)}")
+    axis.set_ylabel(label)
     axis.grid(alpha=0.3)
     return figure
+
+
+def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list[str]]:
+    """Names the axis over which a quantity is drawn; returns the places on it, and the words for every curve."""
+    if queries.paired:
+        axis.set_xlabel("number of the query")
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        return np.arange(1, len(queries) + 1.0), [""]
+    if len(queries.frequencies_hz) > len(queries.tx_positions):
+        axis.set(xlabel="frequency [GHz]", xscale="log")
+        axis.xaxis.set_major_formatter("{x:g}")
+        return queries.frequencies_hz / 1e9, [f"TX {point_words(tx)}" for tx in queries.tx_positions]
+    steps = np.linalg.norm(np.diff(queries.tx_positions, axis=0), axis=-1)
+    first, last = (point_words(queries.tx_positions[i]) for i in (0, -1))
+    if len(steps):
+        axis.set_xlabel(f"distance along the transmitters from {first.removesuffix(' m')} to {last.removesuffix(' m')} [m]")
+    else:
+        axis.set_xticks([0.0], [f"TX {first}"])
+    return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
 
 
 SHOWN_MAPS = 6
 """Maximum number of frequencies in a plot."""
 
 
-def draw_maps(
-    what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
-) -> Figure:
-    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star."""
+def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
+    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star. `source`
+    is the provenance (`LoadedField.source`)."""
     quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
     values = _drawn(quantity, answer)[:SHOWN_MAPS]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
@@ -255,7 +482,7 @@ def draw_maps(
     wide = extent[1] - extent[0] > extent[3] - extent[2]
     rows, columns = (len(values), 1) if wide and len(values) < 4 else (-(-len(values) // 2), min(2, len(values)))
     ratio = (extent[3] - extent[2]) / (extent[1] - extent[0])
-    figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="constrained")
+    figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
     for i, axis in enumerate(axes.flat):
@@ -264,12 +491,13 @@ def draw_maps(
             continue
         shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=quantity.colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
-        axis.plot(*rx[:2], "*", color="white", markeredgecolor="black", markersize=14)
+        axis.plot(*source["receiver"]["position"][:2], **STAR)
         axis.set(xlim=extent[:2], ylim=extent[2:])
         axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
-    figure.supxlabel("x [m]", fontsize=9)
-    figure.supylabel("y [m]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label}, transmitters {answer['height']:.3g} m high")
+    axes[0, 0].legend(fontsize=8, loc="upper right")
+    _name_axes(axes.flat, "x [m]", "y [m]")
+    figure.suptitle(f"{origin_words(source)}, transmitters {answer['height']:.3g} m high", fontsize=9)
+    figure.colorbar(shown, ax=axes, shrink=0.8, label=quantity.label, extend=_clipped(values, **span))
     return figure
 
 
@@ -319,10 +547,10 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
         extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
         image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap="viridis", **span)
         _plan(axis, walls, cells.places)
-        axis.plot(*cells.receivers[r, :2], "*", color="white", markeredgecolor="black", markersize=14)
+        axis.plot(*cells.receivers[r, :2], **STAR)
         axis.set_title(f"receiver {r + 1}", fontsize=10)
-    figure.supxlabel("x [m]", fontsize=9)
-    figure.supylabel("y [m]", fontsize=9)
+    axes[0, 0].legend(fontsize=8, loc="upper right")
+    _name_axes(axes.flat, "x [m]", "y [m]")
     figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
     return figure
 

@@ -140,12 +140,15 @@ def arrays() -> list[Case]:
     snapshot = jnp.asarray(rng.normal(size=(B, 16)) + 1j * rng.normal(size=(B, 16)), jnp.complex64)
     directions = jnp.asarray(wb.radio.pas_directions()[::9, ::9].reshape(-1, 3), jnp.float32)
 
+    spectra = jnp.asarray(rng.uniform(size=(2, 90, 360)), jnp.float32)
+
     def beams(elements: Any, snapshot: Any) -> Any:
         return wb.radio.cbf(snapshot, wb.radio.steering_vector(elements, directions))
 
     return [
         Case("steering_vector", wb.radio.steering_vector, (elements, directions), (0, 1)),
         Case("cbf", beams, (elements, snapshot)),
+        Case("peak_direction_error", lambda one: wb.radio.peak_direction_error(one, spectra[1], elements), (spectra[0],)),
         Case("snapshot_to_pas", lambda elements, snapshot: wb.radio.snapshot_to_pas(snapshot, elements), (elements, snapshot)),
     ]
 

@@ -242,7 +242,7 @@ def main() -> None:
     use_compilation_cache()
     command = tyro.cli(Command, prog="python -m experiments.studies.viewer_pictures")
     begin = time.perf_counter()
-    viewer = start(ViewCommand(command.run, port=0, ghz=28.0))
+    viewer = start(ViewCommand(run=command.run, port=0, ghz=28.0))
     viewer.wait()
     loaded = time.perf_counter() - begin
     alone = updates_a_second(viewer)

@@ -128,8 +128,9 @@ def test_another_receiver_has_another_map(runs, tmp_path):
     ("field", "arguments", "words"),
     [
         ("wave", ["--ghz", "28"], ["nothing to do", "--picture"]),
+        ("wave", ["--out", "OUT/a.npz", "--ghz"], ["--ghz has no frequency"]),
         ("wave", ["--ghz", "28", "--out", "OUT/a.csv"], ["--out", ".npz"]),
-        ("wave", ["--ghz", "28", "--picture", "OUT/a.svg"], [".png"]),
+        ("wave", ["--ghz", "28", "--picture", "OUT/a.jpg"], [".png or .svg or .pdf"]),
         ("wave", ["--ghz", "0.1", "--out", "OUT/a.npz"], ["0.3 to 100 GHz"]),
         ("wave", ["--ghz", "28", "--step", "0", "--out", "OUT/a.npz"], ["--step 0"]),
         ("wave", ["--ghz", "28", "--step", "1e-4", "--out", "OUT/a.npz"], ["1,000,000 positions"]),

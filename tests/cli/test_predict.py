@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.commands import call
+from builders.commands import assert_error_for_people, call
 from builders.synthetic import tiny_scene
 from builders.toys import RippleConfig, RippleField, registered, toy_settings
 from builders.untrained import SETTINGS, State, make_coherent_run, make_run
@@ -17,6 +17,7 @@ from PIL import Image
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
+from wbgs_jax.commands import view as view_command
 from wbgs_jax.data.scene_file import save_scene
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.evaluate_quantities import LoadedField
@@ -89,7 +90,7 @@ ASK = ["--tx", INSIDE[0], "--ghz", "28"]
         (["--tx", INSIDE[0], "--ghz", "28e9", "--out", "OUT/a.npz"], ["2.8e+10", "0.3 to 100 GHz"]),
         (["--tx", INSIDE[0], "--ghz", "nan", "--out", "OUT/a.npz"], ["nan"]),
         ([*ASK, "--out", "OUT/a.csv"], ["--out", ".npz"]),
-        ([*ASK, "--picture", "OUT/a.jpg"], ["--picture", ".png"]),
+        ([*ASK, "--picture", "OUT/a.jpg"], ["--picture", ".png or .svg or .pdf"]),
         (["--export", "OUT/a.bin"], ["--export", ".zip"]),
         ([*ASK, "--rx", "1,2", "--out", "OUT/a.npz"], ["--rx 1,2 "]),
         ([*ASK, "--rx", "1,2,nan", "--out", "OUT/a.npz"], ["1,2,nan"]),
@@ -107,6 +108,14 @@ def test_what_cannot_be_asked(run, tmp_path, arguments, words):
     for word in words:
         assert word in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_has_to_be_named_once(run, tmp_path):
+    for named, words in (([], ["--example", "--run RUN"]), (["--run", run, "--example"], ["exclude each other"])):
+        for main in (predict_command.main, map_command.main, view_command.main):
+            asked = [] if main is view_command.main else ["--ghz", 28, "--picture", tmp_path / "a.png"]
+            more = ["--tx", INSIDE[0]] if main is predict_command.main else []
+            assert_error_for_people(call(main, *named, *asked, *more), *words)
 
 
 def test_runs_that_are_none(tmp_path):
@@ -217,7 +226,6 @@ def test_powers_come_with_how_sure_they_are(tmp_path):
     [
         (["--what", "power"], ["nothing to do"]),
         ([*ASK, "--what", "power"], ["--out"]),
-        ([*ASK, "--what", "snapshot", "--picture", "OUT/a.png", "--out", "OUT/a.npz"], ["no --picture"]),
         ([*ASK, "--what", "snapshot", "--out", "OUT/a.csv"], ["--out", ".npz"]),
         ([*ASK, "--line", "0,0,1:1,0,1:5", "--out", "OUT/a.npz"], ["--tx and --line exclude each other"]),
         ([*ASK, "--sweep", "1:9:5", "--out", "OUT/a.npz"], ["--ghz and --sweep exclude each other"]),

@@ -124,7 +124,8 @@ def test_row_k_belongs_to_image_k_whatever_the_padding(folder):
 def test_optional_files_may_be_absent(folder):
     for name in ("freq.txt", "train_index.txt", "test_index.txt", "point_cloud.ply"):
         (folder / name).unlink()
-    dataset = load_layout(folder)
+    with pytest.warns(UserWarning, match="does not record a frequency, and 1 GHz is assumed"):
+        dataset = load_layout(folder)
     assert dataset.vertices.shape == dataset.faces.shape == (0, 3)
     assert set(dataset.frequencies_hz) == {NOMINAL_FREQUENCY_HZ}
     assert len(dataset.train) == 4

@@ -4,8 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax.metrics import FAINTEST_DB, angle_error_deg, beam_loss_db, plane_normal
-from wbgs_jax.radio.array import RINGS, SECTORS, best_beams, codebook, pas_directions, planar_array, snapshot_to_pas
+from wbgs_jax.metrics import FAINTEST_DB, beam_loss_db
+from wbgs_jax.radio.array import (
+    RINGS,
+    SECTORS,
+    best_beams,
+    codebook,
+    pas_directions,
+    peak_direction_error,
+    planar_array,
+    snapshot_to_pas,
+)
 
 
 def spot(row, column, width=200.0):
@@ -19,14 +28,14 @@ def test_the_angle_is_that_between_the_peaks(rng):
     a, b = (spot(row, column) for row, column in zip(rows, columns, strict=True))
     directions = pas_directions()[rows, columns]
     expected = np.degrees(np.arccos(np.clip(directions[0] @ directions[1], -1, 1)))
-    np.testing.assert_allclose(angle_error_deg(a[None], b[None]), expected, atol=1e-4)
-    np.testing.assert_allclose(angle_error_deg(a[None], a[None]), 0, atol=1e-6)
+    np.testing.assert_allclose(peak_direction_error(a[None], b[None]), expected, atol=1e-4)
+    np.testing.assert_allclose(peak_direction_error(a[None], a[None]), 0, atol=1e-6)
 
 
 def test_both_ends_of_the_azimuth_are_one_direction():
     first, last = np.zeros((2, 1, 90, 360), np.float32)
     first[0, 60, 0], last[0, 60, 359] = 1, 1
-    assert angle_error_deg(first, last)[0] < 1e-5
+    assert peak_direction_error(first, last)[0] < 1e-5
 
 
 def test_the_codebook_covers_the_hemisphere():
@@ -77,7 +86,24 @@ def test_a_planar_array_does_not_tell_its_front_from_its_back(rng):
     front, back = (np.zeros((1, 90, 360)) for _ in range(2))
     row, column = 60, int(rng.integers(190, 250))
     front[0, row, column] = back[0, row, (538 - column) % 359] = 1
-    normal = plane_normal(planar_array())
-    np.testing.assert_allclose(np.abs(normal), [1, 0, 0], atol=1e-9)
-    assert angle_error_deg(front, back, normal)[0] < 1.1 and angle_error_deg(front, back)[0] > 20
-    assert plane_normal(rng.normal(size=(16, 3))) is None and plane_normal(np.arange(4.0)[:, None] * np.ones(3)) is None
+    assert peak_direction_error(front, back, planar_array())[0] < 1.1 and peak_direction_error(front, back)[0] > 20
+    spread = rng.normal(size=(16, 3))  # resolves all directions
+    np.testing.assert_allclose(peak_direction_error(front, back, spread), peak_direction_error(front, back), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "dimensions"), [("planar", 2), ("linear", 1), ("single", 0)])
+def test_the_error_is_the_smallest_angle_to_a_direction_that_the_array_receives_alike(rng, kind, dimensions):
+    """Against a search through directions that have the same components in the span of the array."""
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    array = rng.normal(size=(12 if dimensions else 1, dimensions)) @ axes[:dimensions]
+    rows, columns = rng.integers(1, 90, (2, 6)), rng.integers(0, 359, (2, 6))
+    a, b = (np.stack([spot(*pixel) for pixel in zip(*place, strict=True)]) for place in zip(rows, columns, strict=True))
+    found = peak_direction_error(a, b, array)
+    true, shown = pas_directions()[rows[1], columns[1]], pas_directions()[rows[0], columns[0]]
+    for one, other, error in zip(shown, true, np.asarray(found), strict=True):
+        fixed, free = axes[:dimensions], axes[dimensions:]
+        around = rng.normal(size=(200_000, len(free)))
+        around *= np.linalg.norm(free @ one) / np.linalg.norm(around, axis=1, keepdims=True)
+        twins = fixed.T @ (fixed @ one) + around @ free
+        best = np.degrees(np.arccos(np.clip(twins @ other, -1, 1).max()))
+        assert best - 1.5 < error <= best + 0.05

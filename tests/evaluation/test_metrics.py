@@ -8,7 +8,8 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.metrics import PSNR_LIMIT_DB, angle_error_deg, beam_loss_db, mae, psnr_db, score, ssim
+from wbgs_jax.metrics import PSNR_LIMIT_DB, beam_loss_db, mae, psnr_db, score, ssim
+from wbgs_jax.radio.array import peak_direction_error
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ def test_the_report_holds_every_frequency(pair):
     assert report["psnr_db"] == np.median(psnr_db(predicted, truth))
     assert report["mae"] == np.mean(mae(predicted, truth))
     assert report["p5_ssim"] == np.percentile(values, 5) <= report["p10_ssim"] == np.percentile(values, 10)
-    assert report["angle_error_deg"] == np.median(angle_error_deg(predicted, truth))
+    assert report["angle_error_deg"] == np.median(np.asarray(peak_direction_error(predicted, truth)))
     assert report["beam_loss_db"] == np.mean(beam_loss_db(predicted, truth)) > report["beam_loss_top3_db"] > 0
     rows = report["per_frequency"]
     assert [(row["frequency_ghz"], row["n"]) for row in rows] == [(1.0, 3), (2.4, 2), (94.0, 3)]

@@ -8,9 +8,22 @@ from builders.synthetic import tiny_dataset
 from matplotlib import pyplot as plt
 from PIL import Image
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.splits import hold_out_validation, select_frequencies
+from wbgs_jax.inference.quantities import QUANTITIES, names_for
+from wbgs_jax.inference.queries import Queries
 from wbgs_jax.metrics import score
-from wbgs_jax.plotting import draw_all, draw_curves, draw_frequencies, draw_motion, draw_spectra, spread
+from wbgs_jax.plotting import (
+    draw_all,
+    draw_curves,
+    draw_frequencies,
+    draw_maps,
+    draw_motion,
+    draw_prediction,
+    draw_spectra,
+    save,
+    spread,
+)
 
 CURVE = [
     {"step": 2, "loss": 0.3, "batch_ssim": 0.2, "gaussians": 60, "seconds": 1.0},
@@ -112,3 +125,130 @@ def test_surfaces_that_were_moved(tmp_path, rng):
     still = draw_motion(tmp_path, corners, np.zeros((12, 3))).read_bytes()
     moved = draw_motion(tmp_path, corners, rng.normal(0, 0.02, (12, 3))).read_bytes()
     assert still[:8] == moved[:8] == b"\x89PNG\r\n\x1a\n" and still != moved
+
+
+SOURCE = {
+    "scene": "box",
+    "field": "wave",
+    "receiver": {"position": [0.0, 1.0, 2.0]},
+    "interval_level": 0.9,
+    "power_interval_level": 0.8,
+}
+PLACES, HERTZ = np.array([[1, 0.25, 1.5], [1, 0.26, 1.5]]), np.array([28e9, 60e9])
+WALLS = np.array([[[0, 0], [4, 0]], [[4, 0], [4, 3]]], float)
+
+
+def found_for(what, queries, rng):
+    """Arrays as `wbgs-jax predict` predicts them; the second path of every link is 50 dB weaker."""
+    n = len(queries)
+    if what == "paths":
+        positions, frequencies = queries.flat()
+        link = {name: np.repeat(positions[:, k], 2) for k, name in enumerate("xyz")}
+        points = np.repeat(np.stack([positions] + [np.broadcast_to(SOURCE["receiver"]["position"], (n, 3))] * 4, 1), 2, 0)
+        power = np.tile([-60.0, -110.0], n)
+        return link | {"frequency_ghz": np.repeat(frequencies / 1e9, 2), "power_db": power, "points_m": points}
+    if what == "frequency-response":
+        response = rng.normal(size=(n, 8, 3)) + 1j
+        impulses = np.fft.ifft(response, axis=1)
+        shared = {"offsets_hz": np.arange(8) * 1e6, "delays_s": np.arange(8) / 8e6}
+        return {"frequency_response": response, "impulse_response": impulses} | shared
+    if what == "spectra":
+        return {"pas": rng.uniform(size=(n, 90, 360)), "expected": np.tile([0.9, 0.8, 0.95], (n, 1))}
+    shape = {"snapshot": (n, 16), "mimo": (n, 16, 2), "angular-spread": (n, 2)}.get(what, (n,))
+    values = rng.normal(size=shape) + (1j if what in ("snapshot", "mimo") else 0)
+    more = {"within_db": np.full(n, 2.0)} if what == "power" else {}
+    return {QUANTITIES[what].outputs[0]: values} | more
+
+
+def labels(figure):
+    """Names of the axes that are visible, colour bars included."""
+    return [name for axis in figure.axes for name in (axis.get_xlabel(), axis.get_ylabel()) if name]
+
+
+@pytest.mark.parametrize("what", names_for("predict"))
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_every_quantity_is_drawn_with_units_and_origin(tmp_path, rng, what, suffix):
+    pairs = Queries(PLACES, HERTZ, paired=True)
+    queries = Queries(PLACES, HERTZ) if QUANTITIES[what].form == "scalar" else pairs
+    figure = draw_prediction(what, found_for(what, queries, rng), queries, SOURCE, WALLS)
+    assert figure.get_suptitle() == "box, wave field, receiver (0, 1, 2) m"
+    unitless = ("normalised amplitude", "number of the")
+    assert labels(figure) and all("[" in name or name.startswith(unitless) for name in labels(figure))
+    path = save(figure, tmp_path / f"a{suffix}")
+    assert path.read_bytes().startswith({".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix])
+    words = " ".join(text.get_text() for axis in figure.axes for text in [axis.title, *_legend(axis)]) + " ".join(
+        labels(figure)
+    )
+    for place in ("0.25", "0.26"):  # a centimetre apart
+        assert place in words
+    assert "28 GHz" in words
+
+
+def _legend(axis):
+    found = axis.get_legend()
+    return found.get_texts() if found else []
+
+
+def test_a_curve_shows_values_and_intervals_and_a_single_point_is_none(rng):
+    line = Queries(np.stack([np.linspace(0, 2, 5), np.zeros(5), np.ones(5)], -1), HERTZ[:1])
+    power = np.array([-60, -61, -250.0, -63, -64])
+    axis = draw_prediction("power", {"power_db": power, "within_db": np.full(5, 2.0)}, line, SOURCE, WALLS).axes[0]
+    (curve,) = axis.lines
+    np.testing.assert_allclose(curve.get_xdata(), [0, 0.5, 1, 1.5, 2])
+    np.testing.assert_allclose(curve.get_ydata(), [-60, -61, np.nan, -63, -64])  # nothing is received at the third
+    assert curve.get_linestyle() == "-" and "80 % interval" in axis.get_ylabel()
+    np.testing.assert_allclose(axis.collections[0].get_paths()[0].vertices[:, 1].min(), -63)
+    for queries in (Queries(PLACES[:1], HERTZ[:1]), Queries(PLACES, HERTZ, paired=True)):
+        axis = draw_prediction("k-factor", {"k_factor_db": np.ones(len(queries))}, queries, SOURCE, WALLS).axes[0]
+        assert (axis.lines[0].get_linestyle(), axis.lines[0].get_marker()) == ("None", "o")
+
+
+def test_responses_are_in_decibels_of_the_first_element(rng):
+    found = found_for("frequency-response", Queries(PLACES[:1], HERTZ[:1]), rng)
+    above, below = draw_prediction("frequency-response", found, Queries(PLACES[:1], HERTZ[:1], True), SOURCE, WALLS).axes
+    x, y = above.lines[0].get_xydata().T
+    np.testing.assert_allclose(x, np.arange(8))  # megahertz
+    np.testing.assert_allclose(y, 20 * np.log10(np.abs(found["frequency_response"][0, :, 0])))
+    x, y = below.lines[0].get_xydata().T
+    np.testing.assert_allclose(x, 125 * np.arange(8))  # nanoseconds
+    np.testing.assert_allclose(y, 20 * np.log10(np.abs(found["impulse_response"][0, :, 0])))
+
+
+def test_paths_are_those_of_the_link_and_weak_ones_are_left_out(rng):
+    queries = Queries(PLACES, HERTZ[:1])
+    figure = draw_prediction("paths", found_for("paths", queries, rng), queries, SOURCE, WALLS)
+    for axis, place in zip(figure.axes[:2], PLACES, strict=True):
+        walls, drawn = axis.collections
+        assert len(walls.get_segments()) == 2
+        (one,) = drawn.get_segments()
+        np.testing.assert_allclose(one[[0, -1]], [place[:2], [0, 1]])
+        assert "1 of 2 paths, the strongest -60.0 dB" in axis.get_title()
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["receiver", "transmitter"]
+
+
+def test_links_without_paths_and_paths_without_points(tmp_path, rng):
+    one = Queries(PLACES[:1], HERTZ[:1], paired=True)
+    nothing = {name: values[:0] for name, values in found_for("paths", one, rng).items()}
+    figure = draw_prediction("paths", nothing, one, SOURCE, WALLS)
+    assert "no paths" in figure.axes[0].get_title() and save(figure, tmp_path / "a.png").stat().st_size
+    del nothing["points_m"]
+    with pytest.raises(UserError, match="have no points to draw"):
+        draw_prediction("paths", nothing, one, SOURCE, WALLS)
+
+
+def test_errors_have_a_scale_of_their_own(dataset):
+    truth = np.asarray(dataset.pas(dataset.test[:2]))
+    figure = draw_spectra(truth, truth + np.float32(0.01), ["a", "b"])
+    assert [axis.images[0].get_clim()[1] for axis in figure.axes[:3]] == pytest.approx([1, 1, 0.01], rel=1e-4)
+
+
+@pytest.mark.parametrize(("outlier", "extend"), [(None, "neither"), (50.0, "max"), (-50.0, "min")])
+def test_a_colour_bar_has_an_arrow_where_it_saturates(outlier, extend):
+    values = np.zeros((1, 20, 20))
+    if outlier:
+        values[0, 0, 0] = outlier
+    answer = {"k_factor_db": values, "xs": np.arange(20.0), "ys": np.arange(20.0), "height": 1.5, "frequencies_hz": HERTZ[:1]}
+    figure = draw_maps("k-factor", answer, WALLS, SOURCE)
+    assert figure.axes[0].images[0].colorbar.extend == extend
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["receiver"]
+    assert "box, wave field" in figure.get_suptitle()

@@ -21,7 +21,6 @@ from wbgs_jax.evaluation.report import closing_lines, table
 from wbgs_jax.evaluation.score import evaluate, held_out, power_figures, score_snapshots, watch
 from wbgs_jax.fields import Observation
 from wbgs_jax.inference.predictor import observe_links
-from wbgs_jax.metrics import plane_normal
 
 
 @pytree
@@ -75,7 +74,7 @@ def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
     seen = observe_links(knowing.field, knowing.params, dataset, dataset.test)
     np.testing.assert_array_equal(predicted, seen.pas)
     truth, frequencies = np.asarray(dataset.pas(dataset.test)), dataset.frequencies_hz[dataset.test]
-    known = truth, frequencies, in_sight(dataset, dataset.test), plane_normal(np.asarray(dataset.receiver().element_positions))
+    known = truth, frequencies, in_sight(dataset, dataset.test), dataset.receiver().element_positions
     for key, value in metrics.score(predicted, *known).items():
         assert report[key] == value
     for key, value in score_snapshots(seen.snapshots, dataset.snapshots[dataset.test]).items():

@@ -91,6 +91,17 @@ def test_walls_mirror_the_transmitter(asked):
     assert {word.removeprefix("off ") for word in table["interactions"][words]} <= set(asked.dataset.materials.names)
 
 
+def test_points_of_a_path_span_its_length(asked):
+    """Also in an archive, not in a table of text, whose cells are single numbers."""
+    table = paths(asked)
+    points = table["points_m"]
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
+    np.testing.assert_allclose(lengths, table["length_m"], rtol=1e-4)
+    np.testing.assert_allclose(points[:, 0], np.broadcast_to(TX[0], (len(points), 3)), atol=1e-5)
+    np.testing.assert_allclose(points[:, -1], np.broadcast_to(RX, (len(points), 3)), atol=1e-5)
+    assert "points_m" not in next(table_rows(Answers([table])))
+
+
 @pytest.mark.heavy
 def test_paths_add_up_to_the_snapshot(asked):
     table = paths(asked)
@@ -158,7 +169,11 @@ def test_a_table_becomes_a_file(asked, tmp_path):
     table = paths(asked, tx=np.concatenate([TX, TX + 0.5]))
     write_csv(tmp_path / "paths.csv", table_rows(Answers([table])))
     header, rows = read_table(tmp_path / "paths.csv")
-    assert header == list(table) and len(rows) == len(table["tx"]) and set(table["tx"]) == {0, 1}
+    assert (
+        header == [name for name in table if name != "points_m"]
+        and len(rows) == len(table["tx"])
+        and set(table["tx"]) == {0, 1}
+    )
     powers = np.array([float(row[header.index("power_db")]) for row in rows])
     np.testing.assert_allclose(powers, table["power_db"], atol=1e-3)
     assert [row[header.index("interactions")] for row in rows] == table["interactions"].tolist()

@@ -49,7 +49,7 @@ CUT_OFF = """() => {
 
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory):
-    viewer = view.start(view.Command(make_coherent_run(tmp_path_factory.mktemp("view") / "box"), port=0))
+    viewer = view.start(view.Command(run=make_coherent_run(tmp_path_factory.mktemp("view") / "box"), port=0))
     viewer.wait()
     yield viewer
     viewer.stop()

@@ -34,7 +34,10 @@ COMMANDS = {
 def usage() -> str:
     """Returns what `wbgs-jax --help` prints."""
     rows = [f"  {name:9} {entry.help}" for name, entry in COMMANDS.items()]
-    head, tail = "usage: wbgs-jax COMMAND [OPTIONS]", "wbgs-jax COMMAND --help lists the options of a command."
+    head, tail = (
+        "usage: wbgs-jax COMMAND [OPTIONS]",
+        "wbgs-jax COMMAND --help lists the options of a command; wbgs-jax view --example needs no training.",
+    )
     return "\n".join([head, "", "Wideband RF radiance fields in JAX.", "", *rows, "", tail])
 
 

@@ -1,6 +1,7 @@
 """Predict maps with a trained field: a quantity at the receiver for transmitters all over a horizontal plane.
 
 wbgs-jax map --run RUN --ghz 28 [60 ...] --out map.npz --picture map.png
+wbgs-jax map --example --ghz 2.4 28 --picture map.png      the trained field that comes with the package
 wbgs-jax map --run RUN --ghz 28 --what best-beam|k-factor|delay-spread|angular-spread --height 1.2 --step 0.1 --out map.npz
 """
 
@@ -18,9 +19,17 @@ import tyro
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.files import check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn, warn_of_intervals
+from wbgs_jax.commands.options import (
+    PICTURES,
+    TrainedFieldOptions,
+    check_suffixes,
+    load_field,
+    parse_frequencies,
+    warn,
+    warn_of_intervals,
+)
 from wbgs_jax.inference.quantities import INTERVALS, names_for
 
 # Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
@@ -33,11 +42,9 @@ else:
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(TrainedFieldOptions):
     """Predict maps with a trained field, for transmitters all over a horizontal plane."""
 
-    run: Path
-    """Run folder."""
     ghz: tuple[float, ...]
     """Frequencies, one map for each; 1 to 100, or 0.3 to 100 for fields that predict paths."""
     what: What = "power"
@@ -54,14 +61,17 @@ class Command:
     out: Path | None = None
     """Write the maps to this .npz file, as arrays (frequency, y, x)."""
     picture: Path | None = None
-    """Draw the maps (the first 6) and the walls to this .png file."""
+    """Draw the maps (the first 6) and the walls to this .png, .svg or .pdf file."""
 
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line, or one without an output."""
+    _ = command.folder  # one is named
+    if not command.ghz:
+        raise UserError("--ghz has no frequency; give gigahertz, such as --ghz 28")
     if not (command.out or command.picture):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
-    check_suffixes(command, {"out": (".npz",), "picture": (".png",)})
+    check_suffixes(command, {"out": (".npz",), "picture": PICTURES})
     if not (np.isfinite(command.step) and command.step > 0):
         raise UserError(f"--step {command.step:g} is not a distance; give metres, such as --step 0.25")
     if command.height is not None and not np.isfinite(command.height):
@@ -96,7 +106,7 @@ def make_maps(command: Command) -> None:
     from wbgs_jax.inference.results_file import write_arrays
 
     frequencies_hz = parse_frequencies(command.ghz)
-    field = load_field(command.run, command.rx, float(frequencies_hz.min()))
+    field = load_field(command.folder, command.rx, float(frequencies_hz.min()))
     plane, rx = plane_of(command, field.dataset), np.asarray(field.receiver.position)
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
     warn(field.domain, rx, corners, frequencies_hz)
@@ -112,10 +122,9 @@ def make_maps(command: Command) -> None:
         write_arrays(command.out, answer, field.source | {"what": command.what})
         say(f"map: {command.out} ({size})")
     if command.picture:
-        from wbgs_jax.plotting import draw_maps
+        from wbgs_jax.plotting import draw_maps, save
 
-        with atomic_write(command.picture) as stream:
-            draw_maps(command.what, answer, cut_at(field.dataset, plane.height), rx).savefig(stream, format="png", dpi=110)
+        save(draw_maps(command.what, answer, cut_at(field.dataset, plane.height), field.source), command.picture)
         say(f"picture: {command.picture}")
 
 

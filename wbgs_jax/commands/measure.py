@@ -29,20 +29,20 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
-from wbgs_jax.commands.options import check_suffixes
+from wbgs_jax.commands.options import PICTURES, check_suffixes
 from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
 from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
 from wbgs_jax.data.tables import check_positions
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.domain import Domain
-from wbgs_jax.plotting import draw_power_maps
+from wbgs_jax.plotting import draw_power_maps, save
 from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_power
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 BEYOND_M = 2.0
 """Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
 the next building."""
-SUFFIXES = {"out": (".json",), "picture": (".png",), "answers": (".csv",), "mesh": (".ply",)}
+SUFFIXES = {"out": (".json",), "picture": PICTURES, "answers": (".csv",), "mesh": (".ply",)}
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Command:
     out: Path | None = None
     """Write the scores to this .json file."""
     picture: Path | None = None
-    """Draw the maps of all receivers to this .png file."""
+    """Draw the maps of all receivers to this .png, .svg or .pdf file."""
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres, for which to predict the received powers."""
     answers: Path | None = None
@@ -203,8 +203,7 @@ def main(arguments: list[str] | None = None) -> None:
             write_csv(command.answers, rows)
             say(f"answers: {command.answers}")
     if command.picture:
-        with atomic_write(command.picture) as stream:
-            draw_power_maps(learned, walls, cells).savefig(stream, format="png", dpi=110)
+        save(draw_power_maps(learned, walls, cells), command.picture)
         say(f"picture: {command.picture}")
     if command.out or not (command.tx or command.picture):
         found = scores(cells, walls)

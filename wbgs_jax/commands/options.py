@@ -5,14 +5,17 @@ JAX is not loaded before a run is opened, so that `--help` and errors of the com
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float
 
 from wbgs_jax._util.cli import say
 from wbgs_jax._util.errors import UserError
+from wbgs_jax.training import EXAMPLE
 
 if TYPE_CHECKING:
     from wbgs_jax.data.dataset import Dataset
@@ -25,6 +28,30 @@ SHORTEST = 1e-3
 """Minimum length of a quaternion; the maximum is its inverse. Others are mistakes."""
 SHOWN = 12
 """Maximum number of warnings printed."""
+PICTURES = (".png", ".svg", ".pdf")
+"""Suffixes of pictures."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedFieldOptions:
+    """The trained field of a command: a run of one's own, or the example."""
+
+    run: Path | None = None
+    """Run folder."""
+    example: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Instead: the trained field in the package, of scene 1."""
+
+    @property
+    def folder(self) -> Path:
+        """The run folder; a command line that names none, or two, is a `UserError`."""
+        if self.example and self.run is not None:
+            raise UserError("--run and --example exclude each other; give one of them")
+        if not self.example and self.run is None:
+            raise UserError(
+                "no trained field; give --example for the one that comes with the package, or --run RUN, a folder of "
+                "`wbgs-jax train --scene 1 --out RUN`"
+            )
+        return self.run or EXAMPLE
 
 
 def check_suffixes(command: Any, suffixes: Mapping[str, Sequence[str]]) -> None:

@@ -1,5 +1,6 @@
 """Predict spectra or channel quantities with a trained field, or export it:
 
+wbgs-jax predict --example --tx 1,0.5,1.5 --ghz 28 --picture spectrum.png
 wbgs-jax predict --run RUN --tx x,y,z [x,y,z ...] --ghz 28 [60 ...] --out spectra.npz [--picture spectra.png]
 wbgs-jax predict --run RUN --line 0,0,1.5:4,0,1.5:41 --ghz 28 --what power --out line.csv --picture line.png
 wbgs-jax predict --run RUN --tx x,y,z --sweep 1:100:50 --what delay-spread --out sweep.npz
@@ -14,17 +15,26 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from wbgs_jax._util.cli import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, check_writable
+from wbgs_jax._util.files import check_writable
 from wbgs_jax._util.progress_lines import CountProgress
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, warn, warn_of_intervals
+from wbgs_jax.commands.options import (
+    PICTURES,
+    TrainedFieldOptions,
+    check_suffixes,
+    load_field,
+    parse_frequencies,
+    warn,
+    warn_of_intervals,
+)
 from wbgs_jax.inference import queries as parsing
 from wbgs_jax.inference import results_file
 from wbgs_jax.inference.quantities import COMPILED, INTERVALS, QUANTITIES, Options, names_for
@@ -47,11 +57,9 @@ BLOCK = 256
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(TrainedFieldOptions):
     """Predict spectra or channel quantities with a trained field, or export it."""
 
-    run: Path
-    """Run folder."""
     tx: tuple[str, ...] = ()
     """Transmitters, each as x,y,z in metres (world frame)."""
     line: str = ""
@@ -71,7 +79,7 @@ class Command:
     what: What = "spectra"
     """Quantity to predict: power angular spectra, or one that only some fields provide."""
     tx_velocity: str = "0,0,0"
-    """Velocity of the transmitters, metres per second, for Doppler shifts of paths."""
+    """Velocity of the transmitters, metres per second (Doppler)."""
     rx_velocity: str = "0,0,0"
     """Velocity of the receiver."""
     band_mhz: float = 100.0
@@ -85,16 +93,17 @@ class Command:
     resume: bool = False
     """Continue the same command after an interruption."""
     picture: Path | None = None
-    """Draw them to this .png file: up to 12 spectra, or curves."""
+    """Draw 12 links or curves to this .png, .svg or .pdf file."""
     export: Path | None = None
-    """Write the field to this .zip file, which runs without the model's code (docs/inference.md)."""
+    """Write the field as a program to this .zip file."""
 
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid or incomplete command line."""
+    _ = command.folder  # one is named
     form = QUANTITIES[command.what].form
     out = (".npz",) if form == "array" else (".npz", ".csv")
-    check_suffixes(command, {"out": out, "picture": (".png",), "export": (".zip",)})
+    check_suffixes(command, {"out": out, "picture": PICTURES, "export": (".zip",)})
     places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
     bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
     asks, writes = bool(places or bands), bool(command.out or command.picture)
@@ -112,9 +121,6 @@ def check(command: Command) -> None:
         raise UserError(
             f"--band-mhz {command.band_mhz:g} --points {command.points} is not a band; give 2 to {MOST_POINTS} points"
         )
-    drawn = command.what == "spectra" or form == "scalar"
-    if not drawn and (command.picture or (asks and not command.out)):
-        raise UserError(f"--what {command.what} cannot be drawn; give --out channel.npz, and no --picture")
 
 
 def queries_of(command: Command) -> Queries:
@@ -155,7 +161,7 @@ def _export(command: Command) -> None:
     from wbgs_jax.training.run_folder import open_run
 
     assert command.export is not None
-    trained = open_run(command.run)
+    trained = open_run(command.folder)
     dataset = trained.dataset()
     check_quantity("spectra", trained.field, dataset)
     export_field(trained, command.export, dataset=dataset)
@@ -167,18 +173,18 @@ def open_field(command: Command, queries: Queries) -> "CachedField | LoadedField
     from wbgs_jax.inference.cached_field import MOST, load_cached, make_cached
 
     lowest, few = lowest_queried(command, queries), len(queries) <= MOST
-    if cached := load_cached(command.run, command.rx, command.what, len(queries), lowest):
+    if cached := load_cached(command.folder, command.rx, command.what, len(queries), lowest):
         return cached
     from wbgs_jax.inference.evaluate_quantities import check_quantity
     from wbgs_jax.training.run_folder import sources_of
 
     tx, rx = (parse_vector(word, f"--{name}-velocity") for name, word in _velocities(command).items())
     options = Options(tx, rx, 1e6 * command.band_mhz, command.points, parsing.parse_array(command.tx_array))
-    loaded = load_field(command.run, command.rx, lowest, options)
+    loaded = load_field(command.folder, command.rx, lowest, options)
     check_quantity(command.what, loaded.trained.field, loaded.dataset)
     if few and command.what in COMPILED:
-        watched = sources_of(command.run, loaded.trained.config)
-        return make_cached(command.run, command.rx, len(queries), loaded, watched) or loaded
+        watched = sources_of(command.folder, loaded.trained.config)
+        return make_cached(command.folder, command.rx, len(queries), loaded, watched) or loaded
     return loaded
 
 
@@ -209,12 +215,12 @@ def _question(command: Command, queries: Queries, source: dict[str, Any]) -> dic
     options = {
         name: getattr(command, name) for name in ("what", "rx", "tx_velocity", "rx_velocity", "band_mhz", "points", "tx_array")
     }
-    return options | {"run": str(command.run.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
+    return options | {"run": str(command.folder.resolve()), "queries": queries.digest(), "block": BLOCK, "source": source}
 
 
 def answer(command: Command, queries: Queries) -> None:
     """Predicts for the queries and writes the requested files."""
-    if command.what == "spectra" and command.out is None:
+    if QUANTITIES[command.what].form != "scalar" and command.out is None:
         queries = queries.some(shown_rows(len(queries)))  # only these are drawn
     field = open_field(command, queries)
     positions, frequencies = queries.tx_positions, queries.frequencies_hz
@@ -235,24 +241,28 @@ def answer(command: Command, queries: Queries) -> None:
         results_file.write(command.out, command.what, answers, queries, field.source)
         say(f"{command.what}: {command.out} ({count}){replaced}")
     if command.picture:
-        write_picture(command.picture, command.what, answers, queries)
+        write_picture(command.picture, command.what, answers, queries, field)
         say(f"picture: {command.picture}")
     answers.remove()
 
 
-def write_picture(path: Path, what: str, answers: Answers, queries: Queries) -> None:
-    """Draws spectra, or curves of a scalar quantity."""
-    from wbgs_jax.plotting import draw_answers, draw_sweeps  # imported here because Matplotlib takes a while to load
+def write_picture(path: Path, what: str, answers: Answers, queries: Queries, field: "CachedField | LoadedField") -> None:
+    """Draws the predictions: numbers of all queries, anything else of some links."""
+    from wbgs_jax.plotting import draw_prediction, save  # imported here because Matplotlib takes a while to load
 
-    name = answers.names()[0]
-    if what == "spectra":
-        shown = shown_rows(len(queries))
-        positions, frequencies = queries.flat()
-        figure = draw_answers(answers.rows(name, shown), positions[shown], frequencies[shown])
-    else:
-        figure = draw_sweeps(QUANTITIES[what], answers.whole(name), queries)
-    with atomic_write(path) as stream:
-        figure.savefig(stream, format="png", dpi=110)
+    form, shown = QUANTITIES[what].form, shown_rows(len(queries))
+    rows = answers.rows if form == "array" else lambda name, _: answers.whole(name)
+    found = answers.shared() | {name: rows(name, shown) for name in answers.names()}
+    walls = floor_plan(field, queries) if form == "table" else np.zeros((0, 2, 2))
+    save(draw_prediction(what, found, queries if form == "scalar" else queries.some(shown), field.source, walls), path)
+
+
+def floor_plan(field: "CachedField | LoadedField", queries: Queries) -> Float[np.ndarray, "n 2 2"]:
+    """Returns the walls at the median height of the transmitters."""
+    from wbgs_jax.inference.radio_map import cut_at
+
+    loaded = cast("LoadedField", field)  # tables are not predicted from the cache
+    return cut_at(loaded.dataset, float(np.median(queries.tx_positions[:, 2])))
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,5 +1,6 @@
 """Show a trained field in a browser:
 
+wbgs-jax view --example                     the trained field that comes with the package
 wbgs-jax view --run RUN [--port 8080]
 wbgs-jax view --run RUN --html scene.html --tx x,y,z --ghz 28      a page that opens without Python
 """
@@ -19,7 +20,7 @@ from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies, parse_receiver
+from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies, parse_receiver
 
 if TYPE_CHECKING:
     from wbgs_jax.viewer.app import Viewer
@@ -29,11 +30,9 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(TrainedFieldOptions):
     """Show a trained field in a browser: room, movable transmitter, received spectrum, paths, power maps and materials."""
 
-    run: Path
-    """Run folder."""
     host: str = "localhost"
     """Address to listen on; localhost: this machine only. There is no password: everyone who reaches the address has access."""
     port: int = 8080
@@ -53,6 +52,7 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid command line, or if viser is not installed."""
+    _ = command.folder  # one is named
     check_suffixes(command, {"html": (".html",)})
     if not 0 <= command.port <= 65535:
         raise UserError(f"--port {command.port} is not a port; give a number from 1 to 65535")
@@ -71,10 +71,10 @@ def start(command: Command) -> "Viewer":
     lowest = None if command.ghz is None else float(parse_frequencies((command.ghz,))[0])
     position = parse_positions((command.tx,))[0] if command.tx else None
 
-    if not (command.run / "config.json").exists():  # before there is a page
+    if not (command.folder / "config.json").exists():  # before there is a page
         from wbgs_jax.training.run_folder import read_config
 
-        read_config(command.run)
+        read_config(command.folder)
     from wbgs_jax.viewer.page import Page
 
     page = Page(command.host, command.port)
@@ -91,7 +91,7 @@ def _fill(page: "Page", command: Command, lowest_hz: float | None, position: Any
         where = "localhost" if command.host in LOCAL else command.host
         say(f"viewer: http://{where}:{page.port} (Ctrl-C stops it)")
     page.progress("reading the run", 10)
-    field = load_field(command.run, "", lowest_hz)
+    field = load_field(command.folder, "", lowest_hz)
     page.progress("preparing the receiver", 35)
 
     from wbgs_jax.viewer.app import Viewer
@@ -115,7 +115,7 @@ def main(arguments: list[str] | None = None) -> None:
     check_writable(command.html)
     use_compilation_cache()
     if command.html:
-        say(f"drawing the predictions of {command.run} ...")
+        say(f"drawing the predictions of {command.folder} ...")
     viewer = start(command)
     if command.html:
         viewer.wait()

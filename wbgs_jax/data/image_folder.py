@@ -290,10 +290,11 @@ def _read_frequencies(
 ) -> Float[np.ndarray, " n"]:
     if not path.exists():
         single = wanted_hz if wanted_hz is not None else gateway_hz
-        if single is None and walls:
+        if single is None:
+            wrong = ", or paths will be wrong" if walls else ""
             warnings.warn(
                 f"{path.parent} does not record a frequency, and {NOMINAL_FREQUENCY_HZ / 1e9:g} GHz is assumed; otherwise give "
-                f"--frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}, or paths will be wrong",
+                f"--frequency-ghz, {FREQUENCIES}, or `frequency` (GHz) in {GATEWAY}{wrong}",
                 stacklevel=3,
             )
         single = NOMINAL_FREQUENCY_HZ if single is None else single

@@ -34,7 +34,6 @@ from wbgs_jax.inference.intervals import Confidence, Expected, ExpectedPower, Po
 from wbgs_jax.inference.kriging import for_receiver, without_asked
 from wbgs_jax.inference.predictor import BLOCK, as_observed, observe, observe_links, render_pas
 from wbgs_jax.inference.trained_field import TrainedField
-from wbgs_jax.metrics import plane_normal
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.channel import NO_PATH_DB, free_space_db
 
@@ -272,13 +271,13 @@ def score_spectra(
         UserError: a prediction is NaN or infinite.
     """
     truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
-    normal = plane_normal(np.asarray(dataset.receiver().element_positions))
-    figures = metrics.figures(pas, truth, normal)
+    elements = dataset.receiver().element_positions
+    figures = metrics.figures(pas, truth, elements)
     report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
     repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
     beside = baselines(reference) if can_lend(reference, index) else {}
-    rivals = {name: metrics.score(np.asarray(predict(index)), truth, *groups, normal) for name, predict in beside.items()}
+    rivals = {name: metrics.score(np.asarray(predict(index)), truth, *groups, elements) for name, predict in beside.items()}
     return report | {"baselines": rivals}, figures["ssim"]
 
 

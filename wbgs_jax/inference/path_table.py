@@ -32,7 +32,8 @@ def path_table(
 
     Angles of arrival are in the receiver's frame, angles of departure in the world frame; zenith 0 is upwards. Amplitudes are
     relative to the transmitted amplitude and include the carrier phase: at an element of the array, and at isotropic elements
-    that are polarised along theta-hat and phi-hat. Their sum is the snapshot if the waves are plane.
+    that are polarised along theta-hat and phi-hat. Their sum is the snapshot if the waves are plane. `points_m` (rows, 5, 3)
+    are transmitter, points of reflection or diffraction, and receiver, which fills the rest; world frame.
 
     Args:
         field: a field that predicts paths.
@@ -83,7 +84,7 @@ def _rows(found: Any, shift: np.ndarray, link: dict[str, Any], materials: tuple[
     parts = {"element": found.amplitude, "theta": found.polarised[:, 0], "phi": found.polarised[:, 1]}
     for name, amplitude in parts.items():
         columns |= {f"{name}_re": amplitude[order].real, f"{name}_im": amplitude[order].imag}
-    return columns | {"doppler_hz": shift[order]}
+    return columns | {"doppler_hz": shift[order]} | ({} if found.points is None else {"points_m": found.points[order]})
 
 
 def describe_interactions(

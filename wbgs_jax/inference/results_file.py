@@ -223,8 +223,8 @@ def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
 
 
 def table_rows(answers: Answers) -> Iterator[list[Any]]:
-    """Yields a header, then the rows of a table."""
-    names = answers.names()
+    """Yields a header, then the rows of a table; columns that hold several numbers per row are in archives only."""
+    names = [name for name in answers.names() if next(answers.pieces(name)).ndim == 1]
     yield names
     for number in range(len(answers)):
         with answers.opened(number) as block:

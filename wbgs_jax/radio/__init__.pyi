@@ -3,6 +3,7 @@ from ..types import Transmitter as Transmitter
 from .antenna import Antenna as Antenna
 from .array import cbf as cbf
 from .array import pas_directions as pas_directions
+from .array import peak_direction_error as peak_direction_error
 from .array import planar_array as planar_array
 from .array import snapshot_to_pas as snapshot_to_pas
 from .array import steering_vector as steering_vector

@@ -270,6 +270,50 @@ def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
     return z.real**2 + z.imag**2
 
 
+FLAT = 1e-4
+"""Largest extent of an array across its plane or line, relative to its size."""
+
+
+@jax.jit
+def peak_direction_error(
+    predicted: Float[Array, "*b 90 360"],
+    truth: Float[Array, "*b 90 360"],
+    element_positions: Float[Array, "elements 3"] | None = None,
+) -> Float[Array, "*b"]:
+    """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
+
+    A planar array receives a wave and its mirror image at the array's plane alike, a linear array all waves on a cone around
+    its line. If the array is given, the smallest angle to any direction that it receives like the predicted one counts.
+
+    Args:
+        predicted: spectra (*b, 90, 360) in the receiver's frame.
+        truth: observed spectra of the same links.
+        element_positions: of the receiver (`Receiver.element_positions`), wavelengths or metres; None: no two directions are
+            taken for alike.
+
+    Returns:
+        Degrees (*b).
+
+    Example:
+        >>> import jax.numpy as jnp, wbgs_jax as wb
+        >>> front, back = (jnp.zeros((90, 360)).at[45, column].set(1) for column in (234, 304))
+        >>> [round(float(wb.radio.peak_direction_error(front, back, array))) for array in (None, wb.radio.planar_array())]
+        [48, 0]
+    """
+    directions = jnp.asarray(_pas_directions().reshape(-1, 3))
+    a, b = (directions[jnp.argmax(pas.reshape(*pas.shape[:-2], -1), -1)] for pas in (predicted, truth))
+    if element_positions is not None:
+        centred = jnp.asarray(element_positions, a.dtype)
+        _, sizes, axes = jnp.linalg.svd(centred - centred.mean(0), full_matrices=True)
+        sizes = jnp.pad(sizes, (0, 3))[:3]
+        across = jnp.where((sizes <= FLAT * sizes[0])[:, None], axes, 0)  # the array does not resolve these components
+        (p, q) = (jnp.matmul(direction, across.T, precision=EXACT) for direction in (a, b))
+        length = jnp.linalg.norm(q, axis=-1, keepdims=True)
+        turned = jnp.where(length > 0, q / jnp.where(length > 0, length, 1) * jnp.linalg.norm(p, axis=-1, keepdims=True), p)
+        a = a + jnp.matmul(turned - p, across, precision=EXACT)
+    return jnp.degrees(jnp.arctan2(jnp.linalg.norm(jnp.cross(a, b), axis=-1), jnp.sum(a * b, -1)))
+
+
 ALIKE = 0.05
 """Relative difference allowed between the amplitudes of mirrored beams ahead and behind: pixels are not exactly symmetric."""
 RINGS, SECTORS = 4, 16

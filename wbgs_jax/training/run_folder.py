@@ -30,7 +30,7 @@ from wbgs_jax.inference import intervals, kriging
 from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import read_neighbours
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
-from wbgs_jax.training import checkpoint
+from wbgs_jax.training import EXAMPLE, checkpoint
 
 FIRST_PRESET = "cpu"
 
@@ -126,11 +126,12 @@ def open_run(folder: Path) -> TrainedField:
     return trained
 
 
-def load_trained(folder: Path | str) -> TrainedField:
+def load_trained(folder: Path | str | None = None) -> TrainedField:
     """Returns the field of a run's newest checkpoint; the data are not read.
 
     Args:
-        folder: a run folder of `wbgs-jax train` or `train_field`.
+        folder: a run folder of `wbgs-jax train` or `train_field`; None: the example that comes with the package, a hybrid field
+            of scene 1.
 
     Returns:
         The field with its parameters, corrections and prediction intervals.
@@ -138,7 +139,7 @@ def load_trained(folder: Path | str) -> TrainedField:
     Raises:
         UserError: the folder is not a run folder, or it has no valid checkpoint.
     """
-    folder = Path(folder)
+    folder = EXAMPLE if folder is None else Path(folder)
     config = read_config(folder)
     steps = checkpoint.checkpoint_steps(folder / "checkpoints")
     if not steps:
