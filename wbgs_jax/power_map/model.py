@@ -197,17 +197,26 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
     chosen = []
     for r in range(len(readings.receivers)):
         own = outwards[received[outwards, r]][:LOOKED_AT]
-        chosen.append((readings.places[own], root_walls[own, r], left[own, r], readings.counts[own, r]))
+        close = alike(readings.places[own], readings.places[own])
+        by_walls = close * np.outer(root_walls[own, r], root_walls[own, r])
+        chosen.append((close, by_walls, 1 / readings.counts[own, r], left[own, r]))
 
-    def negative_log_posterior(logs: np.ndarray) -> float:
-        scales, total = Scales(*np.exp(logs)), 0.5 * np.sum(((logs - first) / WIDTH) ** 2)
-        for places, walls, values, counts in chosen:
-            k = _covariance(scales, places, walls) + np.diag(noise(scales, counts))
+    def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        away = (logs - first) / WIDTH
+        total, gradient = 0.5 * np.sum(away**2), away / WIDTH
+        room, wall, place, reading = np.exp(2 * logs)
+        for close, by_walls, shares, values in chosen:
+            k = room * close + wall * by_walls
+            k[np.diag_indices(len(values))] += place + reading * shares
             factor = cho_factor(k, lower=True)
-            total += 0.5 * values @ cho_solve(factor, values) + np.sum(np.log(np.diag(factor[0])))
-        return float(total)
+            weights, inverse = cho_solve(factor, values), cho_solve(factor, np.eye(len(values)))
+            total += 0.5 * values @ weights + np.sum(np.log(np.diag(factor[0])))
+            slope = inverse - np.outer(weights, weights)  # twice the derivative by K
+            own = np.diag(slope)
+            gradient = gradient + np.exp(2 * logs) * [np.sum(slope * close), np.sum(slope * by_walls), own.sum(), own @ shares]
+        return float(total), gradient
 
-    found = minimize(
-        negative_log_posterior, first, method="L-BFGS-B", bounds=[(x - 2, x + 2) for x in first], options={"maxiter": STEPS}
-    )
+    bounds = [(x - 2, x + 2) for x in first]
+    options = {"maxiter": STEPS}
+    found = minimize(negative_log_posterior, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return Scales(*(float(x) for x in np.exp(found.x)))
