@@ -22,7 +22,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.inference.quantities import QUANTITIES, Quantity
+from wbgs_jax.inference.quantities import NETWORK, QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NO_PATH_DB
@@ -245,9 +245,10 @@ SHOWN_MAPS = 6
 
 
 def draw_maps(
-    what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], rx: Float[np.ndarray, "3"]
+    what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], stars: Float[np.ndarray, "k 3"]
 ) -> Figure:
-    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star."""
+    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and stars: the receiver, or the
+    transmitters of a quantity of several."""
     quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
     values = _drawn(quantity, answer)[:SHOWN_MAPS]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
@@ -258,18 +259,40 @@ def draw_maps(
     figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
+    if what == "best-server":  # a colour of the map for each
+        span = {"vmin": -0.5, "vmax": colormaps[quantity.colors].N - 0.5}
     for i, axis in enumerate(axes.flat):
         if i >= len(values):
             axis.axis("off")
             continue
         shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=quantity.colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
-        axis.plot(*rx[:2], "*", color="white", markeredgecolor="black", markersize=14)
+        axis.plot(*stars[:, :2].T, "*", color="white", markeredgecolor="black", markersize=14)
         axis.set(xlim=extent[:2], ylim=extent[2:])
         axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
     figure.supxlabel("x [m]", fontsize=9)
     figure.supylabel("y [m]", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label}, transmitters {answer['height']:.3g} m high")
+    ends = "receivers" if what in NETWORK else "transmitters"
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label}, {ends} {answer['height']:.3g} m high")
+    if what == "best-server":
+        bar.ax.set(ylim=(-0.5, len(stars) - 0.5), yticks=range(len(stars)))
+    return figure
+
+
+def draw_distribution(what: str, answer: dict[str, np.ndarray]) -> Figure:
+    """Returns a figure of the cumulative distribution of a quantity over the positions of its maps at which antennas can be
+    placed, one curve a frequency. Positions without any path count as lower than all others."""
+    quantity = QUANTITIES[what]
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    for values, frequency in zip(_drawn(quantity, answer), answer["frequencies_hz"], strict=True):
+        placed = np.sort(values[~answer["no_confidence"]])  # NaN last
+        known = placed[np.isfinite(placed)]
+        share = (len(placed) - len(known) + 1 + np.arange(len(known))) / max(len(placed), 1)
+        axis.step(known, share, where="post", label=f"{frequency / 1e9:g} GHz")
+    axis.set(xlabel=quantity.label, ylabel="share of the positions", ylim=(0, 1))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
     return figure
 
 
@@ -277,7 +300,11 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
     values = answer[quantity.outputs[0]]
     if quantity.name == "best-beam":
         return answer["beam_azimuth_deg"][values]
-    received = values > NO_PATH_DB if quantity.name == "power" else np.ones(values.shape, bool)
+    received = np.ones(values.shape, bool)
+    if quantity.name == "power":
+        received = values > NO_PATH_DB
+    elif quantity.name in NETWORK:
+        received = answer["received_dbm"].max(0) > NO_PATH_DB
     drawn = quantity.scale * np.where(received, values, np.nan)
     return drawn[..., 0] if drawn.ndim > 3 else drawn
 

@@ -180,6 +180,9 @@ def channels() -> list[Case]:
         Case("free_space_db", wb.radio.free_space_db, (metres, jnp.full((B, 5), 28e9)), (0, 1)),
         Case("received_power_db", wb.radio.received_power_db, (snapshot[0],)),
         Case("correlation", wb.radio.correlation, tuple(snapshot), (0, 1)),
+        Case("noise_dbm", wb.radio.noise_dbm, (jnp.array(1e8), jnp.array(7.0)), (0, 1)),
+        Case("sinr_db", lambda dbm: wb.radio.sinr_db(dbm, -90.0, 0.5), (-40.0 - 2 * metres,)),
+        Case("throughput_bps", lambda ratio: wb.radio.throughput_bps(ratio, 1e8), (metres - 15.0,)),
     ]
 
 
