@@ -13,6 +13,12 @@ from .beams import score_beams as score_beams
 from .locate import Located as Located
 from .locate import Locator as Locator
 from .locate import make_locator as make_locator
+from .movement import add_body as add_body
+from .movement import doppler_spectrogram as doppler_spectrogram
+from .movement import make_movement as make_movement
+from .movement import paths_over_time as paths_over_time
+from .movement import person as person
+from .movement import plan_movement as plan_movement
 from .reflector import Reflector as Reflector
 from .reflector import make_reflector as make_reflector
 from .reflector import place_reflector as place_reflector
