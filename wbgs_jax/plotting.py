@@ -273,7 +273,7 @@ def draw_maps(
     figure.supxlabel("x [m]", fontsize=9)
     figure.supylabel("y [m]", fontsize=9)
     ends = "receivers" if what in NETWORK else "transmitters"
-    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label}, {ends} {answer['height']:.3g} m high")
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=f"{quantity.label},\n{ends} {answer['height']:.3g} m high")
     if what == "best-server":
         bar.ax.set(ylim=(-0.5, len(stars) - 0.5), yticks=range(len(stars)))
     return figure

@@ -48,7 +48,7 @@ class Options(NamedTuple):
 
 
 class Network(NamedTuple):
-    """What the quantities of `NETWORK` depend on besides the received powers."""
+    """Settings of the quantities of `NETWORK`, besides the positions of the transmitters."""
 
     power_dbm: tuple[float, ...] = (20.0,)
     """Transmitted powers, one each or one for all."""
@@ -56,7 +56,7 @@ class Network(NamedTuple):
     """Mean activity of the transmitters as interferers, 0 to 1, one each or one for all."""
     bandwidth_hz: float = 100e6
     noise_figure_db: float = 7.0
-    """Of the receivers."""
+    """Noise figure of the receivers."""
 
 
 _ALL = (
