@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from builders.mirrors import trained
 from builders.rooms import METAL, SPEED_OF_LIGHT, box, field_of, rectangle, room
 from builders.untrained import make_field, make_params
 from scipy.special import fresnel
@@ -178,3 +179,5 @@ def test_what_cannot_move():
         add_body(field, params, np.eye(3))
     with pytest.raises(UserError, match="predicts only the receivers"):
         add_body(make_field(), make_params(), person([0, 0, 0]))
+    with pytest.raises(UserError, match="traces no paths"):
+        plan_movement(trained().field, trained().params, make_receiver(RX), TX, make_movement(field, 2))

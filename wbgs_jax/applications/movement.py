@@ -1,8 +1,8 @@
 """The channel over time while transmitters, the receiver and bodies of the scene move.
 
 Paths are traced again at every instant, and phases follow from their exact lengths: the channel is sampled as a sounder would.
-Doppler shifts are not computed, they are what the samples show. A rate above twice v / lambda resolves all waves that one body
-moving at v has reflected.
+Doppler shifts are not computed, they are what the samples show. A rate above 4 v / lambda resolves the waves that one body
+moving at v reflects.
 """
 
 from collections.abc import Mapping
@@ -91,7 +91,7 @@ def _tracing(field: Field, params: Params) -> tuple[Calibratable, Params]:
     """Returns the part of a field that traces paths; a field without one is a `UserError`."""
     field, params = field.receiver_independent(params)
     if not isinstance(field, Calibratable):
-        raise UserError(f"the {field.name} field traces no paths; train --field wave on data with a mesh")
+        raise UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
     return field, params
 
 
