@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/concepts.md and docs/formats.md from the library itself: python docs/make_pictures.py [NAME ...].
+"""Draws pictures of concepts.md, formats.md and applications.md from the library: python docs/make_pictures.py [NAME ...].
 
 Colours are viridis and cividis, and lines differ in style as well, so that nothing depends on telling red from green.
 """
@@ -213,6 +213,30 @@ def draw_room(axis, receiver, transmitter) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize=8, frameon=False)
 
 
+def draw_movement() -> Figure:
+    """Returns a person who walks through a link of 60 GHz in a room: received power over time, and the spectrogram."""
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    field, receiver = wb.coherent.make_field(box_mesh()), wb.make_receiver([0.8, 2.0, 1.2])
+    field, params, body = wb.applications.add_body(
+        field, field.init(jax.random.key(0)), wb.applications.person([2.4, 0.6, 0.0], azimuth=np.pi / 2)
+    )
+    rate, instants = 2000.0, 5000
+    seconds = np.arange(instants) / rate
+    motion = wb.applications.make_movement(field, instants, {body: 1.2 * seconds[:, None] * np.array([0, 1, 0])})
+    tx = np.broadcast_to([5.0, 2.2, 1.4], (instants, 3))
+    plan = wb.applications.plan_movement(field, params, receiver, tx, motion)
+    paths = wb.applications.paths_over_time(params, plan, wb.make_query(tx, 60e9), motion)
+    response = paths.amplitude.sum(-1)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1, 1.4))
+    above.plot(seconds, 20 * np.log10(np.abs(response)), linewidth=0.8, color=colormaps["viridis"](0.3))
+    above.set(ylabel="received power [dB]", title="A person walks through a link of 60 GHz at 1.2 m/s")
+    hertz, times, power = wb.applications.doppler_spectrogram(response - response.mean(), rate, 256)
+    picture = below.pcolormesh(times, hertz, power, vmin=float(power.max()) - 50, shading="nearest", rasterized=True)
+    below.set(xlabel="time [s]", ylabel="Doppler shift [Hz]", xlim=seconds[[0, -1]], ylim=(-600, 600))
+    figure.colorbar(picture, ax=below, label="power density [dB]")
+    return figure
+
+
 PICTURES: dict[str, Callable[[], Figure]] = {
     "array": draw_array,
     "plane_wave": draw_plane_wave,
@@ -220,6 +244,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "coherent": draw_coherent,
     "paths": draw_paths,
     "conventions": draw_conventions,
+    "movement": draw_movement,
 }
 
 

@@ -99,6 +99,8 @@ def recipes(names: dict) -> None:
     assert float(names["mismatch"](names["positions"]).min()) < float(names["mismatch"](names["starts"]).min())
     assert float(names["misfit"](names["params"])) < float(names["first"])
     assert float(abs(names["slopes"]["params"]["field"].gaussians.means).max()) > 0
+    assert names["response"].shape == (200, 8) and float(abs(names["response"]).std(0).min()) > 0
+    assert names["density"].shape == (len(names["shifts"]), len(names["times"]))
     np.testing.assert_allclose(names["answer"], names["predict"]([1.0, 0.5, 1.5], 28e9), atol=1e-4)
 
 

@@ -25,7 +25,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
-from wbgs_jax.inference.quantities import QUANTITIES, Quantity
+from wbgs_jax.inference.quantities import NETWORK, QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NO_PATH_DB
@@ -473,9 +473,11 @@ SHOWN_MAPS = 6
 
 
 def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
-    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts, and the receiver as a star. `source`
-    is the provenance (`LoadedField.source`)."""
+    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts. Stars are the receiver
+    or, for quantities of several transmitters, these. `source` is the provenance (`LoadedField.source`)."""
     quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
+    network = what in NETWORK
+    stars = answer["tx_positions"] if network else np.array([source["receiver"]["position"]])
     values = _drawn(quantity, answer)[:SHOWN_MAPS]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
     extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
@@ -485,19 +487,41 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
     figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
+    if what == "best-server":  # a colour of the map for each
+        span = {"vmin": -0.5, "vmax": colormaps[quantity.colors].N - 0.5}
     for i, axis in enumerate(axes.flat):
         if i >= len(values):
             axis.axis("off")
             continue
         shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=quantity.colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
-        axis.plot(*source["receiver"]["position"][:2], **STAR)
+        axis.plot(*stars[:, :2].T, **STAR | {"label": "transmitters" if network else "receiver"})
         axis.set(xlim=extent[:2], ylim=extent[2:])
         axis.set_title(f"{answer['frequencies_hz'][i] / 1e9:g} GHz", fontsize=10)
     axes[0, 0].legend(fontsize=8, loc="upper right")
     _name_axes(axes.flat, "x [m]", "y [m]")
-    figure.suptitle(f"{origin_words(source)}, transmitters {answer['height']:.3g} m high", fontsize=9)
-    figure.colorbar(shown, ax=axes, shrink=0.8, label=quantity.label, extend=_clipped(values, **span))
+    ends = "receivers" if network else "transmitters"
+    figure.suptitle(f"{origin_words(source)}, {ends} {answer['height']:.3g} m high", fontsize=9)
+    bar = figure.colorbar(shown, ax=axes, shrink=0.8, label=quantity.label, extend=_clipped(values, **span))
+    if what == "best-server":
+        bar.ax.set(ylim=(-0.5, len(stars) - 0.5), yticks=range(len(stars)))
+    return figure
+
+
+def draw_distribution(what: str, answer: dict[str, np.ndarray]) -> Figure:
+    """Returns a figure of the cumulative distribution of a quantity over the positions of its maps at which antennas can be
+    placed, one curve a frequency. Positions without any path count as lower than all others."""
+    quantity = QUANTITIES[what]
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    for values, frequency in zip(_drawn(quantity, answer), answer["frequencies_hz"], strict=True):
+        placed = np.sort(values[~answer["no_confidence"]])  # NaN last
+        known = placed[np.isfinite(placed)]
+        share = (len(placed) - len(known) + 1 + np.arange(len(known))) / max(len(placed), 1)
+        axis.step(known, share, where="post", label=f"{frequency / 1e9:g} GHz")
+    axis.set(xlabel=quantity.label, ylabel="share of the positions", ylim=(0, 1))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
     return figure
 
 
@@ -505,7 +529,11 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
     values = answer[quantity.outputs[0]]
     if quantity.name == "best-beam":
         return answer["beam_azimuth_deg"][values]
-    received = values > NO_PATH_DB if quantity.name == "power" else np.ones(values.shape, bool)
+    received = np.ones(values.shape, bool)
+    if quantity.name == "power":
+        received = values > NO_PATH_DB
+    elif quantity.name in NETWORK:
+        received = answer["received_dbm"].max(0) > NO_PATH_DB
     drawn = quantity.scale * np.where(received, values, np.nan)
     return drawn[..., 0] if drawn.ndim > 3 else drawn
 

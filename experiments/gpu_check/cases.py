@@ -31,10 +31,11 @@ from wbgs_jax.training.loop import make_hook
 
 ON_THE_HOST = frozenset(
     """
-    as_deepmimo at_receiver cell_means choose_beams choose_next_places default_field evaluate export_field field_names
+    add_body as_deepmimo at_receiver cell_means choose_beams choose_next_places default_field evaluate export_field field_names
     from_deepmimo from_paths from_sionna get_field learn_map load_dataset load_deepmimo load_exported load_paths load_readings
     load_room load_scene load_trained load_walls make_locator make_mesh make_power_predictor make_predictor
-    make_query make_receiver make_surface map_queries measure_limits pas_directions place_reflector planar_array
+    make_movement make_query make_receiver make_surface map_queries measure_limits pas_directions person place_reflector
+    plan_movement planar_array
     power_at_users power_when_rotated predict_blocks predict_isotropic_paths predict_many predict_map predict_paths
     pytree rank_beams read_antenna read_deepmimo read_gaussians register save_paths save_scene scene_of_paths
     scene_of_sionna scene_of_snapshots score_beams stack_receivers static straight_powers surface_from_points
@@ -182,7 +183,11 @@ def channels() -> list[Case]:
         ),
         Case("free_space_db", wb.radio.free_space_db, (metres, jnp.full((B, 5), 28e9)), (0, 1)),
         Case("received_power_db", wb.radio.received_power_db, (snapshot[0],)),
+        Case("doppler_spectrogram", lambda h: wb.applications.doppler_spectrogram(h, 1e3, 8), (snapshot[0, 0],)),
         Case("correlation", wb.radio.correlation, tuple(snapshot), (0, 1)),
+        Case("noise_dbm", wb.radio.noise_dbm, (jnp.array(1e8), jnp.array(7.0)), (0, 1)),
+        Case("sinr_db", lambda dbm: wb.radio.sinr_db(dbm, -90.0, 0.5), (-40.0 - 2 * metres,)),
+        Case("throughput_bps", lambda ratio: wb.radio.throughput_bps(ratio, 1e8), (metres - 15.0,)),
     ]
 
 
@@ -320,7 +325,16 @@ def _of_waves(of: Known) -> list[Case]:
     """Returns what only the coherent field says: snapshots and paths."""
     plan = of.field.plan(of.params, of.dataset.receiver())
     says = {"coherent.snapshots": wb.coherent.snapshots, "coherent.channels": wb.coherent.channels}
-    return [Case(name, lambda params, do=do: do(params, plan, of.query), (of.params,)) for name, do in says.items()]
+    moving = wb.applications.make_movement(of.field, B, {0: np.linspace(0, 0.1, B)[:, None] * np.ones(3)})
+    following = wb.applications.plan_movement(of.field, of.params, of.dataset.receiver(), of.query.tx_position, moving)
+
+    def over_time(params: Any) -> Any:
+        return wb.applications.paths_over_time(params, following, of.query, moving)
+
+    return [
+        *(Case(name, lambda params, do=do: do(params, plan, of.query), (of.params,)) for name, do in says.items()),
+        Case("paths_over_time", over_time, (of.params,), costly=True),
+    ]
 
 
 def asking() -> list[Case]:

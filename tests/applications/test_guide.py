@@ -25,6 +25,7 @@ def test_the_guide_runs(monkeypatch):
     assert np.isfinite(names["slope"]).all() and 0 <= float(names["found"].loss) <= 1
     assert names["beams"].shape == (2, 3) and names["scores"] == (1, 1, 0, 0)
     assert names["best"].place.shape == (2, 3) and names["best"].loss[0] <= names["best"].loss[1]
+    assert [np.shape(slope) for slope in names["slopes"]] == [(2,), (2, 3)] and np.abs(names["slopes"][0]).max() > 0.1
     assert names["hung"].place.shape == (2, 5) and np.isfinite(names["hung"].loss).all()
     assert -names["hung"].loss[0] >= float(wbgs_jax.applications.soft_minimum(names["without"])) - 0.1
     assert names["turned"].place.shape == (4, 2) and np.linalg.norm(names["quaternion"]) == pytest.approx(1, abs=1e-5)

@@ -11,6 +11,7 @@ from builders.synthetic import tiny_dataset
 from builders.untrained import make_coherent_run, make_run
 from PIL import Image
 
+from wbgs_jax.applications.antenna_placement import power_at_users
 from wbgs_jax.commands import map as map_command
 from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.inference.evaluate_quantities import domain_of
@@ -18,6 +19,7 @@ from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.radio_map import BEST_BEAM, cut_at, pieces, plane_over
 from wbgs_jax.radio.array import codebook
+from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 from wbgs_jax.training.run_folder import load_trained
 
 AREA = ["--area", "-1,0:1,1", "--height", "1.3"]
@@ -124,9 +126,53 @@ def test_another_receiver_has_another_map(runs, tmp_path):
     assert np.abs(maps[1] - maps[0]).max() > 1
 
 
+NETWORK = ["--tx", "0.4,0.3,1.5", "-0.5,0.8,1.4", "--power-dbm", 20, 17, "--load", 0.5, "--bandwidth-mhz", 400]
+
+
+@pytest.mark.heavy
+def test_maps_of_several_transmitters_are_those_of_each(runs, tmp_path):
+    """What a receiver gets from a transmitter is what a field at the receiver predicts, with the ends exchanged."""
+    out, pictures = tmp_path / "sinr.npz", [tmp_path / "sinr.png", tmp_path / "cdf.png"]
+    files = ["--out", out, "--picture", pictures[0], "--cdf", pictures[1]]
+    result = ask(runs, "wave", "--ghz", 2.4, 28, "--what", "sinr", *NETWORK, *AREA, "--step", 0.5, *files)
+    assert result.code == 0, result.err
+    found = dict(np.load(out))
+    assert found["received_dbm"].shape == (2, 2, 2, 4) and found["sinr_db"].shape == (2, 2, 4)
+    each, meta = np.moveaxis(found["received_dbm"], 0, -1), json.loads(str(found["meta"]))
+    ratios = np.asarray(sinr_db(jnp.asarray(each), noise_dbm(400e6, 7.0), 0.5)).max(-1)
+    np.testing.assert_allclose(found["sinr_db"], ratios, atol=1e-3)
+    np.testing.assert_array_equal(found["best_server"], each.argmax(-1))
+    np.testing.assert_array_equal(found["rsrp_dbm"], each.max(-1))
+    np.testing.assert_allclose(found["throughput_bps"], throughput_bps(jnp.asarray(ratios), 400e6), rtol=1e-3)
+    assert meta["power_dbm"] == [20, 17] and meta["bandwidth_hz"] == 400e6 and "receiver" not in meta
+    assert len(np.unique(found["best_server"])) == 2
+    trained = load_trained(runs["wave"])
+    user = [found["xs"][1], found["ys"][0], float(found["height"])]
+    powers = power_at_users(trained.field, trained.params, user, 2.4e9)(found["tx_positions"], 0.0)[:, 0]
+    np.testing.assert_allclose(found["received_dbm"][:, 0, 0, 1], np.asarray(powers) + np.array([20, 17]), atol=0.1)
+    for picture in pictures:
+        with Image.open(picture) as image:
+            assert np.asarray(image.convert("L")).std() > 10
+
+
 @pytest.mark.parametrize(
     ("field", "arguments", "words"),
     [
+        ("wave", ["--ghz", "28", "--what", "sinr", "--out", "OUT/a.npz"], ["--what sinr needs --tx"]),
+        ("wave", ["--ghz", "28", "--tx", "0,0,1", "--out", "OUT/a.npz"], ["--what power takes no --tx", "throughput"]),
+        ("wave", ["--ghz", "28", *map(str, NETWORK), "--what", "rsrp", "--rx", "0", "--out", "OUT/a.npz"], ["omit --rx"]),
+        ("wave", ["--ghz", "28", "--what", "sinr", "--tx", "0,0,1", "--load", "2", "--out", "OUT/a.npz"], ["--load 2"]),
+        (
+            "wave",
+            ["--ghz", "28", "--what", "sinr", "--tx", "0,0,1", "--power-dbm", "1", "2", "--out", "OUT/a.npz"],
+            ["--power-dbm has 2 numbers"],
+        ),
+        (
+            "wave",
+            ["--ghz", "28", "--what", "sinr", "--tx", "0,0,1", "--bandwidth-mhz", "0", "--out", "OUT/a.npz"],
+            ["--bandwidth-mhz 0"],
+        ),
+        ("wideband", ["--ghz", "28", "--what", "sinr", "--tx", "0,0,1", "--out", "OUT/a.npz"], ["predicts only the receivers"]),
         ("wave", ["--ghz", "28"], ["nothing to do", "--picture"]),
         ("wave", ["--out", "OUT/a.npz", "--ghz"], ["--ghz has no frequency"]),
         ("wave", ["--ghz", "28", "--out", "OUT/a.csv"], ["--out", ".npz"]),

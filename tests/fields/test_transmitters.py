@@ -87,3 +87,30 @@ def test_wrong_shapes_of_properties_are_named(name, values):
     object.__setattr__(query, "transmitter", transmitter)
     with pytest.raises(ValueError, match=f"transmitter.{name}"):
         check_query(query)
+
+
+def test_two_polarisations_at_both_ends(setup):
+    """A line of sight keeps them apart, reflections mix them, and slanted ports are sums of both."""
+    _, params, _, render = setup
+    angles = jnp.array([0.0, np.pi / 2, np.pi / 4, -np.pi / 4])
+    ports = Antenna(None, jnp.zeros((4, 2)), slant=angles)
+    paths = render(params, make_query(np.broadcast_to(TX[0], (4, 3)), HZ, antenna=ports)).paths
+    matrix = np.moveaxis(np.asarray(paths.polarised), 0, -1)  # path, receiving theta and phi, transmitting port
+    (sight,) = np.flatnonzero((np.asarray(paths.interaction[0]) == 0).all(-1) & (np.abs(matrix).max((1, 2)) > 0))
+    strength = np.abs(matrix[sight, 0, 0])
+    np.testing.assert_allclose(np.abs(matrix[sight, :, :2]), strength * np.eye(2), atol=1e-4 * strength)
+    mixed = np.abs(matrix[:, 0, 1]).max()
+    assert 1e-3 * strength < mixed < strength
+    vertical, horizontal = matrix[..., 0], matrix[..., 1]
+    np.testing.assert_allclose(matrix[..., 2], (vertical + horizontal) / np.sqrt(2), atol=1e-4 * strength)
+    np.testing.assert_allclose(matrix[..., 3], (vertical - horizontal) / np.sqrt(2), atol=1e-4 * strength)
+
+
+def test_a_slanted_receiver_takes_its_share_of_both_polarisations():
+    angle = 0.6
+    field, params, plan = field_of(room(), (1.0, 1.0, 1.2), mirror_areas=(0.0,), specular_kept=8, diffracted_kept=1)
+    slanted = dataclasses.replace(plan.receiver, antenna=Antenna(None, jnp.zeros(2), slant=jnp.float32(angle)))
+    paths = field.render(params, dataclasses.replace(plan, receiver=slanted), make_query(TX, HZ)).paths
+    theta, phi = np.moveaxis(np.asarray(paths.polarised), -1, 0)
+    expected = np.cos(angle) * theta + np.sin(angle) * phi
+    np.testing.assert_allclose(paths.amplitude, expected, atol=1e-4 * np.abs(expected).max())

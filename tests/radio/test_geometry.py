@@ -81,3 +81,12 @@ def test_the_rows_span_the_zenith_range(projection, last_row):
     azimuth, zenith = pixel_to_angles(jnp.array([[0.0, 0.0], [359.0, 89.0], [179.5, 44.5]]), projection=projection)
     np.testing.assert_allclose(np.rad2deg(azimuth), [-180, 180, 0], atol=1e-3)
     np.testing.assert_allclose(np.rad2deg(zenith), [0, last_row, last_row / 2], atol=1e-3)
+
+
+def test_quaternions_of_rotation_vectors(rng):
+    vectors = np.concatenate([rng.normal(0, 1.5, (8, 3)), np.zeros((1, 3)), rng.normal(0, 1e-5, (1, 3))])
+    found = geometry.rotation_matrix(geometry.rotation_quaternion(jnp.asarray(vectors, jnp.float32)))
+    np.testing.assert_allclose(found, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-6)
+    np.testing.assert_array_equal(found[8], np.eye(3))
+    slope = jax.grad(lambda v: geometry.rotation_quaternion(v)[1])(jnp.zeros(3))
+    np.testing.assert_allclose(slope, [0.5, 0, 0], atol=1e-6)

@@ -78,3 +78,15 @@ def test_straight_up_and_down_antennas_have_gradients(exponents):
             assert np.isfinite(gradient).all()
     beside = jnp.array([1e-4, 0.0, 1.0])
     np.testing.assert_allclose(element_gain(beside), element_gain(jnp.array([0.0, 0.0, 1.0])), rtol=1e-3)
+
+
+@pytest.mark.parametrize("angle", [np.pi / 4, -np.pi / 4, np.pi / 2])
+def test_a_slanted_antenna_has_both_components(angle, rng):
+    """As in 3GPP TR 38.901, 7.3.2, model 2; its gain is that of the antenna."""
+    k, exponents = jnp.asarray(directions(rng)), jnp.array([0.7, 0.3])
+    upright_field = np.asarray(upright(exponents).field(k))
+    slanted = np.asarray(Antenna(None, exponents, slant=jnp.float32(angle)).field(k))
+    gain, theta = np.linalg.norm(upright_field, axis=-1), np.asarray(zenith_vector(k))
+    np.testing.assert_allclose(np.sum(slanted * theta, -1), np.cos(angle) * gain, atol=1e-5)
+    np.testing.assert_allclose(np.sum(slanted * np.cross(k, theta), -1), np.sin(angle) * gain, atol=1e-5)
+    np.testing.assert_allclose(np.sum(slanted * k, -1), 0, atol=1e-5)

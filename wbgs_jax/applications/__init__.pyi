@@ -16,6 +16,12 @@ from .locate import make_locator as make_locator
 from .measurement_plan import NextPlaces as NextPlaces
 from .measurement_plan import choose_next_places as choose_next_places
 from .measurement_plan import walking_order as walking_order
+from .movement import add_body as add_body
+from .movement import doppler_spectrogram as doppler_spectrogram
+from .movement import make_movement as make_movement
+from .movement import paths_over_time as paths_over_time
+from .movement import person as person
+from .movement import plan_movement as plan_movement
 from .reflector import Reflector as Reflector
 from .reflector import make_reflector as make_reflector
 from .reflector import place_reflector as place_reflector

@@ -19,10 +19,10 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of
-from wbgs_jax.types import make_query, make_receiver
+from wbgs_jax.types import Query, Transmitter, make_receiver
 
-Powers = Callable[[Float[Array, "k 3"], Any], Float[Array, "k users"]]
-"""(antenna positions (k, 3), smoothing length in metres) -> power (dB) that every user receives from each."""
+Powers = Callable[[Any, Any], Float[Array, "k users"]]
+"""(antenna positions (k, 3) or a `Transmitter`, smoothing length, metres) -> power (dB) that every user receives from each."""
 SOFT_DB = 3.0
 """Powers that differ by less than this have nearly equal weight in `soft_minimum`."""
 STEPS = 30
@@ -75,8 +75,9 @@ def tenth_percentile(power_db: Float[Array, "*k users"]) -> Float[Array, "*k"]:
 
 
 def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any) -> Powers:
-    """Returns a function for the powers (dB, mean over the frequencies) that users receive from an antenna at any position, all
-    antennas isotropic; differentiable in reverse mode with respect to the antenna's position.
+    """Returns a function for the powers (dB, mean over the frequencies) that users receive from antennas at any positions, all
+    antennas isotropic unless a `Transmitter` names its own; differentiable in reverse mode with respect to positions and
+    orientations.
 
     Every user is a receiver that is planned here and compiled together with the function: a dozen take a minute, hundreds are
     too many.
@@ -87,7 +88,8 @@ def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any
         frequencies_hz: (f,) or one, hertz.
 
     Returns:
-        The function: positions (k, 3) in metres and a smoothing length in metres -> powers (k, users), dB.
+        The function: positions (k, 3) in metres, or k antennas as a `radio.Transmitter` with orientations and patterns, and a
+        smoothing length in metres -> powers (k, users), dB relative to the transmitted powers.
 
     Raises:
         UserError: the field predicts no power, or only at the receivers it was trained for.
@@ -100,16 +102,16 @@ def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any
     plans = [field.plan(params, make_receiver(user, element_positions=one)) for user in places]
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))
 
-    def at(plan: Any, places: Float[Array, "k 3"], blur: Any, frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
-        query = make_query(places, frequency_hz)
+    def at(plan: Any, antennas: Transmitter, blur: Any, frequency_hz: Float[Array, ""]) -> Float[Array, " k"]:
+        query = Query(antennas, jnp.broadcast_to(frequency_hz, antennas.position.shape[:1]))
         power = field.render(field.smoothed(params, blur), plan, query).power_db
         assert power is not None, "the field predicts power"
         return power
 
     def powers(places: Any, blur: Any) -> Float[Array, "k users"]:
-        places = jnp.asarray(places, jnp.float32)
+        antennas = places if isinstance(places, Transmitter) else Transmitter(jnp.asarray(places, jnp.float32))
         # Under `vmap` over frequencies, whatever depends on positions alone, such as paths, is computed only once.
-        each = [jnp.mean(jax.vmap(partial(at, plan, places, blur))(frequencies), 0) for plan in plans]
+        each = [jnp.mean(jax.vmap(partial(at, plan, antennas, blur))(frequencies), 0) for plan in plans]
         return jnp.stack(each, -1)
 
     return powers

@@ -3,20 +3,22 @@
 wbgs-jax map --run RUN --ghz 28 [60 ...] --out map.npz --picture map.png
 wbgs-jax map --example --ghz 2.4 28 --picture map.png      the trained field that comes with the package
 wbgs-jax map --run RUN --ghz 28 --what best-beam|k-factor|delay-spread|angular-spread --height 1.2 --step 0.1 --out map.npz
+wbgs-jax map --run RUN --ghz 28 --what sinr|rsrp|best-server|throughput --tx x,y,z [x,y,z ...] --out map.npz --cdf cdf.png
 """
 
 import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
-from wbgs_jax._util.cli import run_command, say
+from wbgs_jax._util.cli import parse_positions, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable
@@ -30,12 +32,14 @@ from wbgs_jax.commands.options import (
     warn,
     warn_of_intervals,
 )
-from wbgs_jax.inference.quantities import INTERVALS, names_for
+from wbgs_jax.inference.quantities import INTERVALS, NETWORK, Network, names_for
 
 # Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
 
 MOST_PLACES = 1_000_000
 if TYPE_CHECKING:
+    from wbgs_jax.inference.evaluate_quantities import LoadedField
+
     What = str
 else:
     What = Literal[names_for("map")]
@@ -49,10 +53,20 @@ class Command(TrainedFieldOptions):
     """Frequencies, one map for each; 1 to 100, or 0.3 to 100 for fields that predict paths."""
     what: What = "power"
     """Quantity to map; some fields provide only best-beam."""
+    tx: tuple[str, ...] = ()
+    """Transmitters x,y,z in metres of rsrp, sinr, best-server and throughput, which are mapped over receivers."""
+    power_dbm: tuple[float, ...] = (20.0,)
+    """Their powers, one each or one for all."""
+    load: tuple[float, ...] = (1.0,)
+    """Their mean activity as interferers, 0 to 1, one each or one for all."""
+    bandwidth_mhz: float = 100.0
+    """Bandwidth of noise and throughput."""
+    noise_figure: float = 7.0
+    """Noise figure of the receivers, dB."""
     height: float | None = None
-    """Height of the transmitters, metres; by default the median in the data."""
+    """Height of the plane, metres; by default the median of the transmitters in the data."""
     step: float = 0.25
-    """Distance between neighbouring transmitters, metres."""
+    """Distance between neighbouring positions, metres."""
     area: str = ""
     """Corners of the plane, x0,y0:x1,y1 in metres; by default the whole scene."""
     rx: str = ""
@@ -62,6 +76,13 @@ class Command(TrainedFieldOptions):
     """Write the maps to this .npz file, as arrays (frequency, y, x)."""
     picture: Path | None = None
     """Draw the maps (the first 6) and the walls to this .png, .svg or .pdf file."""
+    cdf: Path | None = None
+    """Draw the distribution of the quantity over the plane to this .png, .svg or .pdf file."""
+
+    @property
+    def network(self) -> Network:
+        """Powers, loads and noise of several transmitters."""
+        return Network(self.power_dbm, self.load, 1e6 * self.bandwidth_mhz, self.noise_figure)
 
 
 def check(command: Command) -> None:
@@ -69,13 +90,35 @@ def check(command: Command) -> None:
     _ = command.folder  # one is named
     if not command.ghz:
         raise UserError("--ghz has no frequency; give gigahertz, such as --ghz 28")
-    if not (command.out or command.picture):
+    if not (command.out or command.picture or command.cdf):
         raise UserError("nothing to do; give --out map.npz, --picture map.png, or both")
-    check_suffixes(command, {"out": (".npz",), "picture": PICTURES})
+    check_suffixes(command, {"out": (".npz",), "picture": PICTURES, "cdf": PICTURES})
+    _check_network(command)
     if not (np.isfinite(command.step) and command.step > 0):
         raise UserError(f"--step {command.step:g} is not a distance; give metres, such as --step 0.25")
     if command.height is not None and not np.isfinite(command.height):
         raise UserError(f"--height {command.height:g} is not a height; give metres, such as --height 1.5")
+
+
+def _check_network(command: Command) -> None:
+    if (command.what in NETWORK) != bool(command.tx):
+        several = ", ".join(NETWORK)
+        raise UserError(
+            f"--what {command.what} {'needs' if not command.tx else 'takes no'} --tx x,y,z; it belongs to {several}"
+        )
+    if command.tx and command.rx:
+        raise UserError("--tx maps over all receivers of the plane; omit --rx")
+    for option, values in {"power-dbm": command.power_dbm, "load": command.load}.items():
+        if len(values) not in (1, max(len(command.tx), 1)) or not np.isfinite(values).all():
+            raise UserError(
+                f"--{option} has {len(values)} numbers for {len(command.tx)} transmitters; give one each or one for all"
+            )
+    if not all(0 <= load <= 1 for load in command.load):
+        raise UserError(f"--load {' '.join(map(str, command.load))} is not an activity; give numbers from 0 to 1")
+    if not (np.isfinite(command.bandwidth_mhz) and command.bandwidth_mhz > 0 and np.isfinite(command.noise_figure)):
+        raise UserError(
+            f"--bandwidth-mhz {command.bandwidth_mhz:g} --noise-figure {command.noise_figure:g}: no noise; give MHz and dB"
+        )
 
 
 def plane_of(command: Command, dataset: Any) -> Any:
@@ -100,18 +143,33 @@ def plane_of(command: Command, dataset: Any) -> Any:
     return plane_over(low, high, height, command.step)
 
 
+def at_transmitters(positions: Float[np.ndarray, "tx 3"], field: "LoadedField") -> "list[LoadedField]":
+    """Returns a trained field at isotropic antennas in the places of transmitters, which receive there."""
+    from wbgs_jax.inference.trained_field import at_receiver
+    from wbgs_jax.types import make_receiver
+
+    receivers = [make_receiver(position, element_positions=np.zeros((1, 3))) for position in positions]
+    return [replace(field, trained=at_receiver(field.trained, one, field.dataset), receiver=one) for one in receivers]
+
+
 def make_maps(command: Command) -> None:
     """Predicts the maps and writes the requested files."""
-    from wbgs_jax.inference.radio_map import cut_at, evaluate_plane, pieces
+    from wbgs_jax.inference.radio_map import cut_at, evaluate_network, evaluate_plane, pieces
     from wbgs_jax.inference.results_file import write_arrays
 
-    frequencies_hz = parse_frequencies(command.ghz)
+    frequencies_hz, positions = parse_frequencies(command.ghz), parse_positions(command.tx)
     field = load_field(command.folder, command.rx, float(frequencies_hz.min()))
-    plane, rx = plane_of(command, field.dataset), np.asarray(field.receiver.position)
+    plane = plane_of(command, field.dataset)
+    rx = positions if len(positions) else np.asarray(field.receiver.position)[None]
     corners = np.array([[x, y, plane.height] for x in plane.xs[[0, -1]] for y in plane.ys[[0, -1]]])
-    warn(field.domain, rx, corners, frequencies_hz)
-    with CountProgress(f"map of {command.what}", pieces(plane, frequencies_hz)) as progress:
-        answer = evaluate_plane(command.what, field, plane, frequencies_hz, progress.advance)
+    warn(field.domain, rx[0], np.concatenate([corners, rx[1:]]), frequencies_hz)
+    with CountProgress(f"map of {command.what}", len(rx) * pieces(plane, frequencies_hz)) as progress:
+        if len(positions):
+            fields = at_transmitters(positions, field)
+            answer = evaluate_network(fields, plane, frequencies_hz, command.network, progress.advance)
+            answer["tx_positions"] = positions
+        else:
+            answer = evaluate_plane(command.what, field, plane, frequencies_hz, progress.advance)
     outside = np.asarray(field.domain.outside(plane.positions())).reshape(len(plane.ys), len(plane.xs))
     missing = outside | np.asarray(field.domain.out_of_band(frequencies_hz))[:, None, None]
     answer["no_confidence"] = missing.all(0)
@@ -119,20 +177,32 @@ def make_maps(command: Command) -> None:
         warn_of_intervals(missing)
     size = f"{len(plane.xs)} x {len(plane.ys)} positions at {len(frequencies_hz)} frequencies"
     if command.out:
-        write_arrays(command.out, answer, field.source | {"what": command.what})
+        write_arrays(command.out, answer, _source(command, field))
         say(f"map: {command.out} ({size})")
-    if command.picture:
-        from wbgs_jax.plotting import draw_maps, save
+    if command.picture or command.cdf:
+        from wbgs_jax.plotting import draw_distribution, draw_maps, save
 
-        save(draw_maps(command.what, answer, cut_at(field.dataset, plane.height), field.source), command.picture)
-        say(f"picture: {command.picture}")
+        if command.picture:
+            save(draw_maps(command.what, answer, cut_at(field.dataset, plane.height), field.source), command.picture)
+            say(f"picture: {command.picture}")
+        if command.cdf:
+            save(draw_distribution(command.what, answer), command.cdf)
+            say(f"distribution: {command.cdf}")
+
+
+def _source(command: Command, field: "LoadedField") -> dict[str, Any]:
+    """Returns the provenance of the maps."""
+    if not command.tx:
+        return field.source | {"what": command.what}
+    source = {name: value for name, value in field.source.items() if name != "receiver"}
+    return source | {"what": command.what} | command.network._asdict()
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax map")
     check(command)
-    check_writable(command.out, command.picture)
+    check_writable(command.out, command.picture, command.cdf)
     use_compilation_cache()
     make_maps(command)
 

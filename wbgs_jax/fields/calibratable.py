@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float, Int, Key
 from wbgs_jax.fields.base import Field, MaterialProperties
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, WavePlan
 from wbgs_jax.fields.coherent_settings import WaveConfig
-from wbgs_jax.mesh.facets import Facets
+from wbgs_jax.mesh.facets import AnyArray, Facets
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.types import Links, Receiver
 
@@ -64,6 +64,15 @@ class Calibratable(Field):
     @abstractmethod
     def without(self, rigid_bodies: Int[np.ndarray, " k"]) -> "Calibratable":
         """Returns the field without some rigid bodies, given by their indices (host)."""
+
+    @abstractmethod
+    def with_body(self, params: WaveParams, body: Facets, material: MaterialProperties) -> tuple["Calibratable", WaveParams]:
+        """Returns the field and parameters with one more rigid body, the last one, of a material of its own (host)."""
+
+    @abstractmethod
+    def plan_movement(self, receiver: Receiver, tx_position: Float[AnyArray, "t 3"], motion: Motion) -> WavePlan:
+        """Returns a plan for all instants of a movement, (t, m, 3) and (t, 3), of surfaces and receiver, and of a transmitter,
+        for `coherent_model.moved_plan` (host)."""
 
     @abstractmethod
     def in_common_shapes(self, prepared: PreparedPaths, elements: int) -> tuple["Calibratable", PreparedPaths]:

@@ -41,12 +41,13 @@ from wbgs_jax.fields.coherent_model import (
 from wbgs_jax.fields.coherent_settings import PRESETS, WaveConfig
 from wbgs_jax.fields.losses import snapshot_losses
 from wbgs_jax.mesh.edges import Edges, common_size, edges_of_facets, padded_edges, padded_to
-from wbgs_jax.mesh.facets import Facets, remaining
+from wbgs_jax.mesh.facets import AnyArray, Facets, remaining
 from wbgs_jax.mesh.facets import moved as move_facets
 from wbgs_jax.mesh.simplification import facets_that_fit
 from wbgs_jax.propagation.absorption import Grid, grid_around
 from wbgs_jax.propagation.displacement import Motion, still
 from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
+from wbgs_jax.propagation.moving_tree import tree_over_time
 from wbgs_jax.radio.array import LagBasis, make_lag_basis
 from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import turned
@@ -72,6 +73,8 @@ __all__ = [
     "trace",
 ]
 
+EXACT_PLACE = float(np.log(1e-6))
+"""Logarithm of the standard deviation (metres) of a position that is known."""
 SAME_PLACE_M = 1e-3
 """Distance, metres, below which two receiver positions count as the same."""
 
@@ -134,6 +137,15 @@ class WaveField(Calibratable):
         return WavePlan(
             surfaces, receiver, array_gains, self.known_thickness, None, lag_basis, self.grid, prepared, self.config
         )
+
+    def plan_movement(self, receiver: Receiver, tx_position: Float[AnyArray, "t 3"], motion: Motion) -> WavePlan:
+        """Returns a plan for all instants of a movement (host), for `moved_plan`."""
+        check_receiver(receiver)
+        receiver, array_gains = self._as_found(receiver)
+        config = self.config
+        areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
+        tree = tree_over_time(self.facets, self.edges, np.asarray(receiver.position), tx_position, motion, *areas)
+        return WavePlan(tree, receiver, array_gains, self.known_thickness, None, None, self.grid, None, config)
 
     def displaced(self, plan: WavePlan, motion: Motion) -> WavePlan:
         """Returns a plan whose surfaces and receiver are displaced, to first order, from where its paths were traced.
@@ -226,6 +238,28 @@ class WaveField(Calibratable):
         motion = dataclasses.replace(self.motion, shift=self.motion.shift[stays], turn=self.motion.turn[stays])
         placement = self.first_placement[np.append(stays, -1)]
         return dataclasses.replace(self._of(remaining(self.facets, stays), motion), first_placement=placement)
+
+    def with_body(self, params: WaveParams, body: Facets, material: MaterialProperties) -> tuple["WaveField", WaveParams]:
+        """Returns the field and parameters with one more rigid body, the last one, of a material of its own (host)."""
+        old, numbers = self.facets, {"body": body.body, "material": body.material, "mover": body.mover}
+        first = {"body": np.max(old.body) + 1, "material": len(self.known_thickness), "mover": len(self.motion.shift)}
+        own = dataclasses.replace(body, **{name: np.full_like(of, first[name]) for name, of in numbers.items()})
+        facets = jax.tree.map(lambda a, b: np.concatenate([np.asarray(a), b]), old, own)
+        motion = dataclasses.replace(self.motion, shift=_longer(self.motion.shift, 0), turn=_longer(self.motion.turn, 0))
+        known = _longer(self.known_thickness, material.thickness)
+        field = dataclasses.replace(
+            self._of(facets, motion), known_thickness=known, first_placement=_longer(self.first_placement, EXACT_PLACE, at=-1)
+        )
+        values = np.log(material.permittivity - 1), np.log(material.conductivity), material.slope, np.log(material.thickness)
+        leaves, tree = jax.tree.flatten(params.materials)
+        materials = jax.tree.unflatten(tree, [_longer(leaf, value) for leaf, value in zip(leaves, values, strict=True)])
+        corrections = np.concatenate([params.facet_correction, np.zeros((len(body.offset), 2))])
+        return field, dataclasses.replace(
+            params,
+            materials=materials,
+            facet_correction=jnp.asarray(corrections, jnp.float32),
+            placement=_longer(params.placement, EXACT_PLACE, at=-1),
+        )
 
     def _of(self, facets: Facets, motion: Motion) -> "WaveField":
         parts = {"facets": facets, "edges": padded_edges(edges_of_facets(facets)), "motion": motion}
@@ -360,6 +394,12 @@ def make_field(mesh: Mesh, config: WaveConfig | None = None, receivers: Any = ()
     thickness, known = jnp.asarray(mesh.thickness, jnp.float32), jnp.asarray(receivers, jnp.float32).reshape(-1, 3)
     motion = to_device(still(rigid_bodies, len(known)))
     return WaveField(to_device(facets), to_device(edges), thickness, placement, known, motion, None, None, None, config)
+
+
+def _longer(rows: Any, value: Any, at: int | None = None) -> Float[Array, "..."]:
+    """Returns rows with one more, filled with a value, in front of `at`, by default at the end."""
+    place = len(rows) if at is None else at
+    return jnp.asarray(np.insert(np.asarray(rows), place, value, axis=0), jnp.float32)
 
 
 def _lag_basis(receiver: Receiver) -> LagBasis | None:

@@ -29,6 +29,7 @@ from wbgs_jax.propagation.displacement import Motion, length_changes, path_coher
 from wbgs_jax.propagation.image_method import ImageTree, Surfaces
 from wbgs_jax.propagation.materials import Slabs, complex_permittivity
 from wbgs_jax.propagation.mechanisms import MECHANISMS, concatenated, sizes_of, trace_paths
+from wbgs_jax.propagation.moving_tree import tree_at
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED, PathGeometry, TracedPaths
 from wbgs_jax.propagation.transport import arrivals, covariance_from_paths, snapshots_from_paths
 from wbgs_jax.radio.antenna import Antenna, upright
@@ -40,6 +41,7 @@ from wbgs_jax.radio.array import (
     wide_covariance_to_pas,
 )
 from wbgs_jax.radio.channel import FAINTEST, Paths, added_powers, decibels
+from wbgs_jax.radio.geometry import quaternion_product, rotation_quaternion
 from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
 FAINTEST_SUM = 1e-12
@@ -160,6 +162,15 @@ class WavePlan:
         if not isinstance(links, Links):
             raise TypeError("a plan with prepared paths traces no others; make a plan without them, or query `Links`")
         return self.prepared.of(links)
+
+
+def moved_plan(plan: WavePlan, motion: Motion) -> WavePlan:
+    """Returns a plan at one instant of a movement, (m, 3) and (3,), with its surfaces and receiver in their places; pure."""
+    assert isinstance(plan.surfaces, ImageTree), "of `plan_movement`"
+    tree = tree_at(plan.surfaces, motion)
+    orientation = quaternion_product(rotation_quaternion(jnp.asarray(motion.receiver_turn)), plan.receiver.orientation)
+    receiver = dataclasses.replace(plan.receiver, position=jnp.asarray(tree.receiver_position), orientation=orientation)
+    return dataclasses.replace(plan, surfaces=tree, receiver=receiver)
 
 
 def first_params(config: WaveConfig, facets: int, materials: int, placement: Any, clutter: Any) -> WaveParams:

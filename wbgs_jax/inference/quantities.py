@@ -47,6 +47,18 @@ class Options(NamedTuple):
     """Rows and columns of the transmitter's array for MIMO matrices."""
 
 
+class Network(NamedTuple):
+    """Settings of the quantities of `NETWORK`, besides the positions of the transmitters."""
+
+    power_dbm: tuple[float, ...] = (20.0,)
+    """Transmitted powers, one each or one for all."""
+    load: tuple[float, ...] = (1.0,)
+    """Mean activity of the transmitters as interferers, 0 to 1, one each or one for all."""
+    bandwidth_hz: float = 100e6
+    noise_figure_db: float = 7.0
+    """Noise figure of the receivers."""
+
+
 _ALL = (
     Quantity("spectra", ("pas", "expected"), "normalised amplitude", ("pas",), "array", ("predict",)),
     Quantity("snapshot", ("snapshots",), "snapshot", ("snapshots", "paths"), "array", ("predict",)),
@@ -64,9 +76,15 @@ _ALL = (
     Quantity("paths", ("tx",), "paths", ("paths",), "table", ("predict",)),
     Quantity("frequency-response", ("frequency_response",), "frequency response", ("paths",), "array", ("predict",)),
     Quantity("mimo", ("mimo",), "MIMO matrix", ("paths",), "array", ("predict",)),
+    Quantity("rsrp", ("rsrp_dbm",), "power of the best server [dBm]", ("power",), commands=("map",)),
+    Quantity("sinr", ("sinr_db",), "SINR of the best server [dB]", ("power",), commands=("map",)),
+    Quantity("best-server", ("best_server",), "best server", ("power",), commands=("map",), colors="tab10"),
+    Quantity("throughput", ("throughput_bps",), "bound on the throughput [Mbit/s]", ("power",), commands=("map",), scale=1e-6),
 )
 QUANTITIES: dict[str, Quantity] = {quantity.name: quantity for quantity in _ALL}
 """Quantities by name, in the order of `--help`."""
+NETWORK = ("rsrp", "sinr", "best-server", "throughput")
+"""Quantities of several transmitters, mapped over receivers."""
 COMPILED = ("spectra", "power", "snapshot")
 """Quantities that exported and cached fields provide: outputs of a field and their prediction intervals."""
 INTERVALS = tuple(name for quantity in _ALL for name in quantity.outputs[1:])

@@ -1,4 +1,5 @@
-"""Maps of a channel quantity over transmitters on a horizontal plane, and the cross-section of the walls with that plane."""
+"""Maps of a channel quantity over transmitters on a horizontal plane, maps of several transmitters over receivers there, and
+the cross-section of the walls with that plane."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +11,10 @@ from jaxtyping import Float
 
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.inference.evaluate_quantities import LoadedField
+from wbgs_jax.inference.quantities import Network
 from wbgs_jax.radio.array import codebook, pas_directions
 from wbgs_jax.radio.geometry import direction_to_angles
+from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 
 BEST_BEAM = "best-beam"
 AT_ONCE = 512
@@ -70,6 +73,42 @@ def evaluate_plane(
         maps[name] = values.reshape(len(frequencies_hz), *shape, *values.shape[2:])
     more = beam_angles() if what == BEST_BEAM else {}
     return maps | more | {"xs": plane.xs, "ys": plane.ys, "height": np.array(plane.height), "frequencies_hz": frequencies_hz}
+
+
+def evaluate_network(
+    fields: list[LoadedField],
+    plane: Plane,
+    frequencies_hz: Float[np.ndarray, " freq"],
+    network: Network,
+    advance: Callable[[], None] = lambda: None,
+) -> dict[str, np.ndarray]:
+    """Returns maps of several transmitters over the receivers of a plane: `received_dbm` (tx, freq, ny, nx) of each, and all
+    quantities of `quantities.NETWORK` by name with unit, (freq, ny, nx); and what `evaluate_plane` adds.
+
+    Channels are reciprocal: what a receiver of the plane receives from a transmitter equals what that transmitter would receive
+    from it. So every transmitter is the receiver of a field, and the plane holds the transmitters of the field.
+
+    Args:
+        fields: the trained field at each transmitter.
+        plane: positions of the receivers.
+        frequencies_hz: carrier frequencies.
+        network: transmitted powers, loads and noise.
+        advance: called after each of the `len(fields) * pieces(plane, frequencies_hz)` pieces of work.
+
+    Raises:
+        UserError: the field does not predict power.
+    """
+    maps = [evaluate_plane("power", field, plane, frequencies_hz, advance) for field in fields]
+    power = np.broadcast_to(network.power_dbm, len(fields))[:, None, None, None]
+    received = np.stack([one["power_db"] for one in maps]) + power
+    noise = noise_dbm(network.bandwidth_hz, network.noise_figure_db)
+    each = jnp.moveaxis(jnp.asarray(received, jnp.float32), 0, -1)
+    best = jnp.max(sinr_db(each, noise, jnp.asarray(network.load, jnp.float32)), -1)
+    server, strongest = np.argmax(received, 0), received.max(0)
+    found = {"rsrp_dbm": strongest, "sinr_db": best, "best_server": server}
+    found |= {"throughput_bps": throughput_bps(best, network.bandwidth_hz), "received_dbm": received}
+    shared = {name: maps[0][name] for name in ("xs", "ys", "height", "frequencies_hz")}
+    return {name: np.asarray(values) for name, values in found.items()} | shared
 
 
 def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:

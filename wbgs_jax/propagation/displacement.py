@@ -37,9 +37,9 @@ from wbgs_jax.radio.array import EXACT
 class Motion:
     """Small rigid displacements from the nominal positions, relative to the transmitters, world frame."""
 
-    shift: Float[AnyArray, "m 3"]
+    shift: Float[AnyArray, "*t m 3"]
     """Shift of every rigid body (`Facets.mover`), metres, ..."""
-    turn: Float[AnyArray, "m 3"]
+    turn: Float[AnyArray, "*t m 3"]
     """... and its rotation vector about the body's centre (`facets.centres`), radians."""
     receiver: Float[AnyArray, "*r 3"]
     """Shift of the receivers, metres, ..."""

@@ -7,6 +7,7 @@ strongest of those that pass are kept. The geometry depends neither on the frequ
 differentiated.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -148,6 +149,26 @@ def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: i
         promising(lambda some: _mirrored_then_diffracted(tx, tree, some), pairs.before, tried),
     ]
     return select_paths("diffracted", parts, tree, tried, kept, 3)
+
+
+def nearly_valid(tx: Float[Array, "3"], tree: ImageTree, slack: float) -> tuple[Bool[Array, " rows"], ...]:
+    """Returns masks of the reflection sequences of each order and, last, of the pairs behind and in front of edges: those that
+    would give a candidate if facets and edges were larger by `slack` metres on all sides."""
+    half_planes, edges = tree.half_planes, tree.edges
+    larger = dataclasses.replace(
+        tree,
+        half_planes=dataclasses.replace(half_planes, offset=half_planes.offset - slack),
+        edges=dataclasses.replace(
+            edges,
+            start=edges.start - slack * edges.direction,
+            length=jnp.where(edges.length > 0, edges.length + 2 * slack, 0),
+        ),
+    )
+    pairs = tree.diffracted
+    found = [_mirrored(tx, larger, sequences) for sequences in tree.sequences]
+    found.append(_diffracted_then_mirrored(tx, larger, pairs.after, pairs.after_image))
+    found.append(_mirrored_then_diffracted(tx, larger, pairs.before))
+    return tuple(one.score > 0 for one in found)
 
 
 def _diffracted_only(tx, tree: ImageTree) -> Candidates:

@@ -124,8 +124,8 @@ def arrivals(
 
 def _element_field(antenna: Antenna, further: Antenna, direction: Float[Array, "k 3"]) -> Inexact[Array, "k 3"]:
     """Returns the polarised amplitude gain of an element in its receiver's frame: that of its antenna times the gain of a
-    further one, which also determines the polarisation if the antenna has neither an orientation nor a table."""
-    if antenna.orientation is None and antenna.pattern is None:
+    further one, which also determines the polarisation if the antenna has neither an orientation nor a table nor a slant."""
+    if antenna.orientation is None and antenna.pattern is None and antenna.slant is None:
         return dataclasses.replace(further, exponents=further.exponents + antenna.exponents).field(direction)
     return antenna.field(direction) * further.parametric_gain(direction)[..., None]
 

@@ -97,6 +97,10 @@ class Antenna:
     """Exponents of the gains of the TR 38.901 element and of the short dipole."""
     pattern: Pattern | None = None
     """Tabulated pattern, which is multiplied by these gains; None for a parametric antenna."""
+    slant: Float[Array, "*n"] | None = None
+    """Angle (radians) by which the field is rotated about each direction, from theta-hat towards phi-hat: 0 for vertical,
+    pi / 2 for horizontal polarisation, +-pi / 4 for the two ports of a cross-polarised antenna (3GPP TR 38.901, 7.3.2, model
+    2). None for 0."""
 
     @jax.jit
     def field(self, direction: Float[Array, "*m 3"]) -> Inexact[Array, "*m 3"]:
@@ -105,6 +109,8 @@ class Antenna:
         gain = _parametric_gain(own, self.exponents)
         rotation = None if self.orientation is None else rotation_matrix(self.orientation)
         field = zenith_vector(own) if self.pattern is None else self.pattern.at(own)
+        if self.slant is not None:
+            field = jnp.cos(self.slant) * field + jnp.sin(self.slant) * jnp.cross(own, field)
         return gain[..., None] * (field if rotation is None else jnp.matmul(field, rotation.T, precision=EXACT))
 
     def parametric_gain(self, direction: Float[Array, "*m 3"]) -> Float[Array, "*m"]:

@@ -44,6 +44,13 @@ def quaternion_product(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Floa
     return jnp.concatenate([scalar, vector], -1)
 
 
+def rotation_quaternion(rotation: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
+    """Returns unit quaternions (wxyz) of rotation vectors, radians."""
+    half = rotation / 2
+    angle = jnp.sqrt(jnp.maximum(jnp.sum(half * half, -1, keepdims=True), 1e-24))  # differentiable where nothing rotates
+    return jnp.concatenate([jnp.cos(angle), half * (jnp.sin(angle) / angle)], -1)
+
+
 def turned(orientation: Float[Array, "4"], rotation: Float[Array, "3"]) -> Float[Array, "4"]:
     """Returns a quaternion (wxyz, of any length) after a small rotation of the world frame (rotation vector, radians), with an
     error of third order."""

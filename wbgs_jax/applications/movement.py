@@ -1,0 +1,197 @@
+"""The channel over time while transmitters, the receiver and bodies of the scene move.
+
+Paths are traced again at every instant, and phases follow from their exact lengths: the channel is sampled as a sounder would.
+Doppler shifts are not computed, they are what the samples show. A rate above 4 v / lambda resolves the waves that one body
+moving at v reflects.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Complex, Float
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.fields import Field
+from wbgs_jax.fields.base import MaterialProperties, Params
+from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.coherent_model import WavePlan, arrivals_at, moved_plan
+from wbgs_jax.mesh.facets import facets_from_mesh
+from wbgs_jax.propagation.displacement import Motion
+from wbgs_jax.propagation.image_method import ImageTree
+from wbgs_jax.propagation.mechanisms import sizes_of, trace_paths
+from wbgs_jax.radio.channel import Paths, decibels
+from wbgs_jax.types import Mesh, Query, Receiver
+
+SKIN = 7.98, 36.4
+"""Relative permittivity and conductivity (S/m) of dry skin at 60 GHz (Gabriel et al., Phys. Med. Biol. 41, 1996)."""
+
+
+def person(
+    position: Float[np.ndarray, "3"] | Any, height: float = 1.75, width: float = 0.5, depth: float = 0.24, azimuth: float = 0.0
+) -> Float[np.ndarray, "8 3"]:
+    """Returns the corners of a standard person: an upright prism with a rhombus as its cross-section.
+
+    Both ends of a link see the same edge of a rhombus on either side, so that one diffraction carries the wave around it.
+    Around a box it takes two, which a coherent field does not trace.
+
+    Args:
+        position: between the feet, world frame, metres.
+        height, width, depth: metres.
+        azimuth: direction in which the person looks, radians; at 0 towards +x, with the shoulders along y.
+
+    Returns:
+        Corners (8, 3), world frame, metres.
+    """
+    half = np.array([[depth, 0], [0, width], [-depth, 0], [0, -width]]) / 2
+    turn = np.array([[np.cos(azimuth), -np.sin(azimuth)], [np.sin(azimuth), np.cos(azimuth)]])
+    level = np.pad(half @ turn.T, ((0, 0), (0, 1)))
+    return np.concatenate([level, level + np.array([0, 0, height])]) + np.asarray(position, float)
+
+
+def add_body(
+    field: Field,
+    params: Params,
+    corners: Float[np.ndarray, "n 3"],
+    permittivity: float = SKIN[0],
+    conductivity: float = SKIN[1],
+) -> tuple[Field, Params, int]:
+    """Returns a field with paths, its parameters and the number of a convex body that is added to it.
+
+    Its two sides are slabs of half its smallest extent each, so that a wave that crosses it crosses all of its material.
+
+    Args:
+        field, params: a trained field, of which the receiver-independent part is used.
+        corners: of the body, world frame, metres (`person`).
+        permittivity: relative permittivity, above 1.
+        conductivity: S/m, at all frequencies; by default those of skin at 60 GHz.
+
+    Returns:
+        The field, its parameters, and the number of the body in `make_movement`.
+
+    Raises:
+        UserError: the field does not trace paths, or the corners span no body.
+    """
+    field, params = _tracing(field, params)
+    points = np.asarray(corners, float)
+    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-4) < 3:
+        raise UserError("the corners of the body lie in one plane; give at least four corners that span a volume, in metres")
+    hull = trimesh.Trimesh(points, process=False).convex_hull
+    one, thickness = np.zeros(len(hull.faces), np.int32), np.array([np.ptp(points, axis=0).min() / 2])
+    mesh = Mesh(*(jnp.asarray(a) for a in (np.float32(hull.vertices), np.int32(hull.faces), one, one, np.float32(thickness))))
+    material = MaterialProperties(np.array([permittivity]), np.array([conductivity]), np.zeros(1), thickness)
+    field, params = field.with_body(params, facets_from_mesh(mesh), material)
+    return field, params, len(field.motion.shift) - 1
+
+
+def _tracing(field: Field, params: Params) -> tuple[Calibratable, Params]:
+    """Returns the part of a field that traces paths; a field without one is a `UserError`."""
+    field, params = field.receiver_independent(params)
+    if not isinstance(field, Calibratable):
+        raise UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
+    return field, params
+
+
+def make_movement(
+    field: Field,
+    instants: int,
+    shift: Mapping[int, Any] | None = None,
+    turn: Mapping[int, Any] | None = None,
+    receiver_shift: Any = None,
+    receiver_turn: Any = None,
+) -> Motion:
+    """Returns the displacements of everything from where a field has it, at T instants.
+
+    Args:
+        field: that of `plan_movement`.
+        instants: number of instants T.
+        shift: displacements (T, 3) of bodies by their numbers, metres, world frame. The number of a body is that of `add_body`,
+            or its `Facets.mover` in `field.facets`.
+        turn: rotation vectors (T, 3) of bodies about their centres (means of the corners of their facets), radians.
+        receiver_shift, receiver_turn: displacements and rotation vectors (T, 3) of the receiver.
+
+    Returns:
+        The movement, with a leading axis of instants.
+
+    Raises:
+        ValueError: a body that the field does not have, or an array of another shape.
+    """
+    bodies = len(field.motion.shift) if isinstance(field, Calibratable) else 0
+
+    def of_all(some: Mapping[int, Any] | None) -> Float[np.ndarray, "t m 3"]:
+        rows = np.zeros((instants, bodies, 3), np.float32)
+        for number, values in (some or {}).items():
+            if not 0 <= number < bodies or np.shape(values) != (instants, 3):
+                raise ValueError(f"body {number} of {bodies} with an array {np.shape(values)}; expected ({instants}, 3)")
+            rows[:, number] = values
+        return rows
+
+    ends = [np.zeros((instants, 3)) if rows is None else rows for rows in (receiver_shift, receiver_turn)]
+    return Motion(of_all(shift), of_all(turn), *(np.broadcast_to(np.float32(rows), (instants, 3)) for rows in ends))
+
+
+def plan_movement(field: Field, params: Params, receiver: Receiver, tx_position: Any, motion: Motion) -> WavePlan:
+    """Returns the part of `paths_over_time` that is found on the host: all reflection sequences that may occur.
+
+    Args:
+        field, params: a field with paths.
+        receiver: at its nominal position.
+        tx_position: of the transmitter at T instants (T, 3), or (3,) at rest, world frame, metres.
+        motion: of bodies and receiver (`make_movement`).
+
+    Returns:
+        The plan, for this movement or for others that stay within 0.25 m of it.
+
+    Raises:
+        UserError: the field does not trace paths.
+    """
+    places = np.broadcast_to(np.asarray(tx_position, np.float32), (len(motion.shift), 3))
+    return _tracing(field, params)[0].plan_movement(receiver, places, motion)
+
+
+@jax.jit
+def paths_over_time(params: Any, plan: WavePlan, query: Query, motion: Motion) -> Paths:
+    """Returns the paths at T instants, traced and computed anew at each of them.
+
+    Args:
+        params: parameters of the field.
+        plan: of this movement (`plan_movement`).
+        query: the transmitter and the frequency at each instant (`make_query` with T positions).
+        motion: where bodies and receiver are at each instant.
+
+    Returns:
+        `Paths` with arrays (T, k, ...): `cfr` with delays that are not normalised is the channel over time.
+    """
+
+    def at(instant: tuple[Query, Motion]) -> Paths:
+        link, moved = instant
+        here = moved_plan(plan, moved)
+        assert isinstance(here.surfaces, ImageTree), "of `plan_movement`"
+        return arrivals_at(params, here, trace_paths(here.surfaces, link.tx_position, sizes_of(plan.config)), link)
+
+    found: Paths = jax.lax.map(at, (query, motion))
+    return found
+
+
+def doppler_spectrogram(
+    response: Complex[Array, " t"], rate_hz: float, window: int = 128
+) -> tuple[Float[Array, " f"], Float[Array, " s"], Float[Array, "f s"]]:
+    """Returns the short-time Doppler spectrum of a channel: the power density over Doppler shift and time.
+
+    Args:
+        response: the channel at one frequency over time.
+        rate_hz: samples per second.
+        window: samples of a Hann window; neighbouring ones overlap by three quarters.
+
+    Returns:
+        Doppler shifts (f,), hertz, ascending, positive where paths get shorter; times (s,), seconds; decibels (f, s). The mean
+        of the powers over time is the Doppler spectrum (Welch 1967).
+    """
+    hertz, seconds, found = jax.scipy.signal.stft(
+        response, rate_hz, nperseg=window, noverlap=window - window // 4, return_onesided=False, boundary=None, padded=False
+    )
+    power = jnp.fft.fftshift(jnp.abs(found) ** 2, 0)
+    return jnp.fft.fftshift(hertz), seconds, decibels(power)
