@@ -19,10 +19,21 @@ def test_places_are_chosen_where_readings_lack(tmp_path, rng):
     assert done.out.splitlines()[0].lstrip().startswith("1. (")
 
 
+@pytest.mark.heavy
+def test_a_trained_field_expects_errors_where_it_was_not_trained(tmp_path):
+    options = ("--grid=-2,-2,1.5:2,2,1.5:5x5x1", "--count", 3, "--ghz", 28)
+    done = call(main, "--example", *options, "--out", tmp_path / "next.csv")
+    assert done.code == 0, done.err
+    table = np.genfromtxt(tmp_path / "next.csv", delimiter=",", names=True)
+    assert len(np.unique(np.stack([table["x"], table["y"]]), axis=1).T) == 3
+    assert ((table["expected_error"] > 0) & (table["expected_error"] < 0.5)).all()
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ([], "give --run RUN of a trained field, or --data FOLDER"),
+        ([], "no trained field; give --example"),
+        (["--data", "DATA", "--example"], "takes the place of a trained field"),
         (["--data", "DATA"], "give the places that can be measured"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 0], "--count 0 is not a number of places"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 9], "are fewer than --count 9"),

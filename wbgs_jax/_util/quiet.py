@@ -1,9 +1,9 @@
 """Settings of the processes of the library's command lines: silence of XLA, precision, threads; must be imported before JAX.
 
 XLA logs harmless errors about tuning flags of cached programs, and reads its log level only once, when it is loaded. Commands
-compute in single precision, whatever the user has set for other programs (JAX_ENABLE_X64). The matrices that the host factorises
-are small, and on a shared machine the threads of OpenBLAS mostly wait for each other: one thread is up to a hundred times faster
-there. In all other processes nothing is changed.
+compute in single precision, whatever the user has set for other programs (JAX_ENABLE_X64). The host factorises small matrices
+only; on a shared machine the threads of OpenBLAS mostly wait for each other, and one thread is up to a hundred times faster. In
+all other processes nothing is changed.
 """
 
 import itertools

@@ -21,7 +21,7 @@ from wbgs_jax._util.cli import parse_vector, point_words, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import check_writable, write_csv
-from wbgs_jax.commands.options import check_suffixes, load_field, parse_frequencies
+from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
 from wbgs_jax.inference import queries as parsing
 
 MOST = 4000
@@ -33,13 +33,11 @@ LENGTH = 3.0
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(TrainedFieldOptions):
     """Choose where to measure next: the places that reduce the expected error of a field most, in an order to walk them."""
 
-    run: Path | None = None
-    """Run folder of a trained field ..."""
     data: Path | None = None
-    """... or a folder of readings (docs/measured.md), from which a map of received power is fitted first."""
+    """Instead of a trained field: a folder of readings (docs/measured.md), to which a map of received power is fitted first."""
     candidates: Path | None = None
     """CSV file of the places where a transmitter can be, with columns x,y,z in metres, ..."""
     grid: str = ""
@@ -75,8 +73,10 @@ class State(NamedTuple):
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid or incomplete command line."""
     check_suffixes(command, {"out": (".csv",)})
-    if (command.run is None) == (command.data is None):
-        raise UserError("give --run RUN of a trained field, or --data FOLDER with readings")
+    if command.data and (command.run or command.example):
+        raise UserError("--data FOLDER takes the place of a trained field; give one of them")
+    if not command.data:
+        _ = command.folder  # one is named
     if (command.candidates is None) == (not command.grid):
         raise UserError("give the places that can be measured: --candidates places.csv, or --grid FROM:TO:NXxNYxNZ")
     if command.count < 1:
@@ -104,9 +104,8 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     """Returns the state of a trained field: mean expected errors over frequencies, and the places of its data."""
     from wbgs_jax.training.fit_kriging import spacing
 
-    assert command.run is not None, "checked"
     given = parse_frequencies(command.ghz) if command.ghz else None
-    loaded = load_field(command.run, command.rx, None if given is None else float(given.min()))
+    loaded = load_field(command.folder, command.rx, None if given is None else float(given.min()))
     data, trained = loaded.dataset, loaded.trained
     learned = np.unique(data.frequencies_hz[data.train])
     some = np.unique(np.linspace(0, len(learned) - 1, min(FREQUENCIES, len(learned))).round().astype(int))
@@ -119,7 +118,7 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     if trained.power_intervals is not None:
         error_db = loaded.evaluate("power", places, frequencies_hz)["expected_error_db"]
         return State(measured, np.mean(error_db, -1), "dB", length)
-    say(f"{command.run} has no prediction intervals, so that errors count the same everywhere")
+    say(f"{command.folder} has no prediction intervals, so that errors count the same everywhere")
     allowed = np.where(np.asarray(loaded.domain.outside(places)), np.nan, 1.0)
     return State(measured, allowed, "(unknown)", length)
 
@@ -147,7 +146,7 @@ def choose(command: Command) -> None:
     from wbgs_jax.applications.measurement_plan import choose_next_places, walking_order
 
     places = candidates_of(command)
-    state = of_run(command, places) if command.run else of_readings(command, places)
+    state = of_readings(command, places) if command.data else of_run(command, places)
     possible = np.isfinite(state.error)
     if not possible.all():
         say(f"{(~possible).sum()} of {len(places)} candidates are left out: inside bodies, or outside of the room or the band")
