@@ -13,6 +13,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
@@ -43,6 +44,24 @@ class Edges:
     """Outward normal of the n-face."""
     facet: Int[AnyArray, " e"]
     """Index of the 0-face; both faces belong to one body and hence have one material."""
+
+
+def about_edges(point: Float[AnyArray, "3 *#p"], edges: Edges) -> tuple[Float[AnyArray, "*p"], Float[AnyArray, "*p"]]:
+    """Returns where points lie along edges, and their distances from the edges' lines, metres; the distance is not a number
+    within the wedge. Coordinates come first, and the edges are the last axis: on a CPU, loops over it are fast."""
+    xp = np if isinstance(edges.start, np.ndarray) else jnp
+
+    def dot(a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    start, direction, normal_0, normal_n = (
+        xp.moveaxis(a, -1, 0) for a in (edges.start, edges.direction, edges.normal_0, edges.normal_n)
+    )
+    away = [point[axis] - start[axis] for axis in range(3)]
+    along = dot(away, direction)
+    across = [away[axis] - along * direction[axis] for axis in range(3)]
+    free = xp.maximum(dot(away, normal_0), dot(away, normal_n)) > 0
+    return along, xp.where(free, xp.sqrt(xp.maximum(dot(across, across), WELD**2)), np.nan)
 
 
 class _Side(NamedTuple):
