@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from wbgs_jax._util.pytree import pytree, to_device
+from wbgs_jax._util.pytree import AnyArray, pytree, to_device
 from wbgs_jax.mesh.edges import Edges, about_edges, filled
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, HalfPlanes, areas, half_planes_of
+from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes, areas, half_planes_of
 from wbgs_jax.propagation.occlusion import FacetHierarchy, hierarchy_of
 
 SIDE = 1e-4

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from wbgs_jax._util.bits import WORD, Members, first_of, in_chunks, members, packed
-from wbgs_jax._util.pytree import pytree
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, half_planes_of
+from wbgs_jax._util.pytree import AnyArray, pytree
+from wbgs_jax.mesh.facets import CORNERS, Facets, half_planes_of
 
 NEAR = 1e-3
 """Metres: a segment does not cross facets within this distance of its ends (those that reflect it)."""

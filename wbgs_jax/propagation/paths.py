@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.bits import WORD, in_chunks, members, packed
-from wbgs_jax._util.pytree import pytree, static
+from wbgs_jax._util.pytree import AnyArray, pytree, static
 from wbgs_jax.mesh.edges import Edges, about_edges
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, HalfPlanes
+from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes
 from wbgs_jax.propagation.image_method import GROUP, ImageTree, ReflectionSequences
 from wbgs_jax.propagation.occlusion import NEAR, crossing_share, crossings, listed
 from wbgs_jax.radio.array import EXACT
