@@ -1,6 +1,7 @@
 """Measure this machine: renderer, training, queries, memory, time to quality.
 
-    python -m experiments.bench [--only renderer training queries rays memory quality] [--quick] [--gate] [--update]
+    python -m experiments.bench [--only renderer training queries rays facets memory quality]
+        [--quick] [--gate] [--update]
 
 Competitors run interleaved in one process; the figures that compare machines are ratios, absolute times belong to the device
 named in the file. A whole run writes experiments/results/bench_<device>.json, the baseline of the next one. A run of some
@@ -30,12 +31,13 @@ from wbgs_jax.evaluation.report import device_name, environment
 RESULTS = Path(__file__).parents[1] / "results"
 OF_A_PART = ("commit", "version", "jax", "cores", "load", "torch", "repeats")
 """What a part's figures depend on besides the device: others may have been measured another day."""
-Part = Literal["renderer", "training", "queries", "rays", "memory", "quality"]
+Part = Literal["renderer", "training", "queries", "rays", "facets", "memory", "quality"]
 PARTS: dict[Part, Callable[[Report, Effort], None]] = {
     "renderer": renderer.measure,
     "training": training.measure,
     "queries": queries.measure,
     "rays": rays.measure,
+    "facets": rays.measure_facets,
     "memory": renderer.measure_memory,
     "quality": quality.measure,
 }

@@ -22,7 +22,8 @@ EXPECTED = {
     "renderer": {"render_fwd_bwd_n64_b2", "ratio_dense_n64_b2"},
     "training": {"train_step_s_smoke_b4", "step_backward_smoke_b4", "step_optimiser_smoke_b4"},
     "queries": {"queries_per_s", "single_query"},
-    "rays": {"rays_scene2_transmitter", "rays_scene2_query_of_10_frequencies", "rays_500_facets_queries_per_s"},
+    "rays": {"rays_scene2_transmitter", "rays_scene2_query_of_10_frequencies"},
+    "facets": {"facets_300_spectrum_cpu", "facets_300_temporaries"},
     "memory": {"temp_gb_n64_b2", "compile_s_n64_b2"},
     "quality": {"compilations_per_run", "time_to_plateau_s"},
 }

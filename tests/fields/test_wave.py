@@ -374,3 +374,16 @@ def test_a_field_of_data_is_asked_within_jit():
     elsewhere = dataclasses.replace(receiver, position=receiver.position + jnp.array([0.01, 0, 0]))
     unmoved = dataclasses.replace(field, receivers=jnp.zeros((0, 3)))
     np.testing.assert_allclose(unmoved.render(params, unmoved.plan(params, elsewhere), query).pas, expected, atol=1e-3)
+
+
+def test_what_belongs_to_a_receiver_is_kept_for_the_next_plan():
+    """Also if the first plan is made inside `jit`, whose tracers must not be kept; other receivers and fields get their own."""
+    field, *_ = field_of(room(), (1, 1, 1))
+    here, there = make_receiver([1.0, 1.0, 1.0]), make_receiver([2.0, 1.0, 1.0])
+    images = jax.jit(lambda x: x + field.plan(None, here).surfaces.sequences[0].image[0, 0, 0])(0.0)
+    first, again = (field.plan(None, here) for _ in range(2))
+    assert first.surfaces is again.surfaces and first.lag_basis is again.lag_basis
+    assert images == first.surfaces.sequences[0].image[0, 0, 0]
+    np.testing.assert_array_equal(field.plan(None, there).surfaces.receiver_position, [2, 1, 1])
+    other = dataclasses.replace(field, facets=jax.tree.map(lambda leaf: leaf, field.facets))
+    assert other.plan(None, there).surfaces is not field.plan(None, there).surfaces

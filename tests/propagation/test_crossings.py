@@ -1,14 +1,31 @@
 """What legs cross, against double precision and division, one facet at a time."""
 
+import dataclasses
 import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from builders.rooms import box, facets_of, room, search_of, trace
 
+from wbgs_jax._util.bits import WORD, counted, first_of
+from wbgs_jax._util.pytree import to_device
 from wbgs_jax.mesh.facets import Facets, half_planes_of
-from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of, planes_of
+from wbgs_jax.propagation import paths as paths_module
+from wbgs_jax.propagation.mechanisms import trace_paths
+from wbgs_jax.propagation.occlusion import (
+    FEW_BLOCKS,
+    LEAF,
+    NEAR,
+    Crossings,
+    crossed,
+    crossing_share,
+    crossings,
+    hierarchy_of,
+    listed,
+    planes_of,
+)
 from wbgs_jax.propagation.paths import NONE, TRANSMITTED
 
 
@@ -51,7 +68,7 @@ def test_bits_say_what_division_says(rng):
         met += np.isfinite(share).sum()
         for facet in np.flatnonzero(np.isfinite(share)):
             args = (jnp.asarray(x, jnp.float32) for x in (start, end))
-            found = crossing_share(*args, jnp.int32(facet), jnp.asarray(planes_of(facets), jnp.float32))
+            found = crossing_share(*args, jnp.int32(facet), facets)
             np.testing.assert_allclose(found, share[facet], atol=1e-4)
     assert met > 50
     np.testing.assert_array_equal(counted(jnp.asarray(words)), bits.sum(-1))
@@ -111,3 +128,54 @@ def test_paths_cross_what_brute_force_finds_in_that_order(rng):
         if met > 20:
             return
     raise AssertionError(f"{met} crossings in five rooms")
+
+
+def brute_force(points, living, hierarchy, most, near=NEAR):
+    """What `crossings` returns, from tests of all segments with all facets."""
+    planes = hierarchy.planes.reshape(5, 4, -1)
+    words = jax.lax.map(lambda path: crossed(path, planes, near), jax.lax.stop_gradient(points))
+    words = jnp.where(living[:, None, None], words, 0).reshape(len(points), -1)
+    number, there = jax.vmap(lambda bits: first_of(bits, most))(words)  # of facets, in the order of leaves
+    bit = jnp.where(there, jnp.left_shift(jnp.uint32(1), (number % LEAF).astype(jnp.uint32)), 0)
+    return Crossings(counted(words), number // LEAF, bit)
+
+
+def test_boxes_hide_no_crossing(rng):
+    """Facets of all sizes, and segments of all lengths: with one level of boxes and with two, all are found."""
+    most = 64
+    for count in (1, 300, (FEW_BLOCKS + 1) * LEAF * WORD):
+        facets, scale = random_facets(rng, count), rng.uniform(0.001, 1, count)
+        facets = dataclasses.replace(facets, corners=facets.corners * scale[:, None, None], offset=facets.offset * scale)
+        hierarchy = to_device(hierarchy_of(facets))
+        points = jnp.asarray(rng.uniform(-1, 1, (40, 4, 3)) * rng.uniform(0.01, 1, (40, 1, 1)), jnp.float32)
+        points, living = points.at[:, 3].set(points[:, 2]), jnp.arange(40) % 5 > 0  # the last segment has no length
+        found, expected = (find(points, living, hierarchy, most) for find in (crossings, brute_force))
+        np.testing.assert_array_equal(found.total, expected.total)
+        there = (np.arange(most) < np.asarray(expected.total)[:, None]) & (np.asarray(expected.total) <= most)[:, None]
+        assert count == 1 or there.sum() > 50
+        for one, other in zip(listed(found, hierarchy), listed(expected, hierarchy), strict=True):
+            np.testing.assert_array_equal(np.where(there, one, 0), np.where(there, other, 0))
+
+
+@pytest.mark.heavy
+def test_paths_and_gradients_are_those_of_brute_force(rng, monkeypatch):
+    """All sequences and pairs are scored, and all segments tested with all facets."""
+    parts = [*room(), *(box(low, low + rng.uniform(0.02, 0.4, 3)) for low in rng.uniform(0.1, (5.5, 3.5, 2.5), (360, 3)))]
+    tree = search_of(parts, rng.uniform(0.5, (5.5, 3.5, 2.4)), (0.0, 0.0, 2.0))
+    assert len(tree.hierarchy.leaf_low) > FEW_BLOCKS and len(tree.sequences[1].facet) > paths_module.FEW_ROWS
+    tx = jnp.asarray(rng.uniform(0.5, (5.5, 3.5, 2.4)), jnp.float32)
+    weights = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
+
+    def found(tx):
+        return trace_paths(tree, tx, (("specular", 256, 64), ("diffracted", 256, 64)))
+
+    def size(tx):
+        return sum(jnp.sum(jnp.where(some.alive[:, None, None], some.points * weights, 0)) for some in found(tx).sets)
+
+    quick = jax.jit(found)(tx), jax.jit(jax.grad(size))(tx)
+    monkeypatch.setattr(paths_module, "crossings", brute_force)
+    monkeypatch.setattr(paths_module, "FEW_ROWS", 10**9)
+    slow = jax.jit(found)(tx), jax.jit(jax.grad(size))(tx)
+    assert min(int(some.alive.sum()) for some in quick[0].sets) > 10
+    for one, other in zip(*(jax.tree.leaves(every) for every in (quick, slow)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)

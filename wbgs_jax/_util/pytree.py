@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 T = TypeVar("T")
+AnyArray = jax.Array | np.ndarray
+"""Geometry is computed in NumPy in double precision and used in JAX."""
 
 
 def static(**options: Any) -> Any:

@@ -491,7 +491,13 @@ def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity
     Returns:
         Spectra (b, 90, 360), amplitudes with a maximum of 1.
     """
-    return field.render(params, field.plan(params, receiver, None, capacity), query).pas
+    return _spectra(field, params, field.plan(params, receiver, None, capacity), query)
+
+
+@jax.jit
+def _spectra(field: Field, params: Params, plan: Any, query: Query) -> Float[Array, "b 90 360"]:
+    """Returns the spectra of B queries; compiled, since outside of `jit` every operation would be dispatched by itself."""
+    return field.render(params, plan, query).pas
 
 
 _FIELDS: dict[str, type[Field]] = {}

@@ -10,6 +10,7 @@ this model does, as far as path lengths are accurate, and it also predicts the c
 """
 
 import dataclasses
+import functools
 from typing import Any, ClassVar
 
 import jax
@@ -77,6 +78,8 @@ EXACT_PLACE = float(np.log(1e-6))
 """Logarithm of the standard deviation (metres) of a position that is known."""
 SAME_PLACE_M = 1e-3
 """Distance, metres, below which two receiver positions count as the same."""
+_last: list[Any] = []
+"""Facets, edges and settings of the last image tree, and the tree: `fields.pas` plans for the same receiver again and again."""
 
 
 @register
@@ -165,7 +168,13 @@ class WaveField(Calibratable):
                 "be traced or differentiated; close over both, or make the plan outside jax.jit and jax.grad"
             )
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
-        return make_image_tree(self.facets, self.edges, np.asarray(receiver.position), *areas, padded=True)
+        position = np.asarray(receiver.position)
+        made_for = self.facets, self.edges, (position.tobytes(), areas)
+        if not (_last and _last[0] is made_for[0] and _last[1] is made_for[1] and _last[2] == made_for[2]):
+            with jax.ensure_compile_time_eval():  # no tracers, which would outlive the trace
+                _last[:] = *made_for, make_image_tree(self.facets, self.edges, position, *areas, padded=True)
+        tree: ImageTree = _last[3]
+        return tree
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
         """Returns a receiver of the data at its estimated position and orientation, with its array gains; any other receiver is
@@ -407,7 +416,14 @@ def _lag_basis(receiver: Receiver) -> LagBasis | None:
     positions = receiver.element_positions
     if receiver.unit != "wavelengths" or _traced(positions):
         return None
-    return make_lag_basis(np.asarray(positions))
+    return _lag_basis_of(np.asarray(positions).tobytes(), np.asarray(positions).dtype.str)
+
+
+@functools.lru_cache(maxsize=8)
+def _lag_basis_of(positions: bytes, dtype: str) -> LagBasis:
+    """Returns the lag basis of an array from its positions: those of most receivers are the same."""
+    with jax.ensure_compile_time_eval():
+        return make_lag_basis(np.frombuffer(positions, dtype).reshape(-1, 3))
 
 
 def _traced(*trees: Any) -> bool:

@@ -13,16 +13,20 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial import cKDTree
 
-from wbgs_jax._util.pytree import pytree
-from wbgs_jax.mesh.facets import CORNERS, WELD, AnyArray, Facets, half_planes_of
+from wbgs_jax._util.pytree import AnyArray, pytree
+from wbgs_jax.mesh.facets import CORNERS, WELD, Facets, half_planes_of
 
 SHARPEST = 0.05
 """Radians: edges with a smaller angle between their normals are part of a smooth surface."""
 GAP = 0.006
 """Metres: surfaces nearer than this are joined."""
+FACETS_AT_ONCE = 256
+"""Facets whose neighbourhood is searched for edges together."""
 ODD = 0.137
 """Offset added before rounding, so that round coordinates do not lie on a rounding boundary."""
 
@@ -43,6 +47,24 @@ class Edges:
     """Outward normal of the n-face."""
     facet: Int[AnyArray, " e"]
     """Index of the 0-face; both faces belong to one body and hence have one material."""
+
+
+def about_edges(point: Float[AnyArray, "3 *#p"], edges: Edges) -> tuple[Float[AnyArray, "*p"], Float[AnyArray, "*p"]]:
+    """Returns where points lie along edges, and their distances from the edges' lines, metres; the distance is not a number
+    within the wedge. Coordinates come first, and the edges are the last axis: on a CPU, loops over it are fast."""
+    xp = np if isinstance(edges.start, np.ndarray) else jnp
+
+    def dot(a, b):
+        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+    start, direction, normal_0, normal_n = (
+        xp.moveaxis(a, -1, 0) for a in (edges.start, edges.direction, edges.normal_0, edges.normal_n)
+    )
+    away = [point[axis] - start[axis] for axis in range(3)]
+    along = dot(away, direction)
+    across = [away[axis] - along * direction[axis] for axis in range(3)]
+    free = xp.maximum(dot(away, normal_0), dot(away, normal_n)) > 0
+    return along, xp.where(free, xp.sqrt(xp.maximum(dot(across, across), WELD**2)), np.nan)
 
 
 class _Side(NamedTuple):
@@ -118,16 +140,21 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
         np.linalg.norm(out, axis=-1, keepdims=True), WELD
     )  # the outward direction between the two faces of a sheet is zero
     middle = edges.start + edges.direction * edges.length[:, None] / 2
-    normal, half_planes = np.asarray(facets.normal), half_planes_of(facets)
-    covered = np.zeros(len(middle), bool)
-    for i, (point, way) in enumerate(zip(middle, out, strict=True)):
-        height = normal @ point - np.asarray(facets.offset)
-        along = normal @ way
+    corners, half_planes = np.asarray(facets.corners), half_planes_of(facets)
+    centre, covered = corners.mean(1), np.zeros(len(middle), bool)
+    radius = np.linalg.norm(corners - centre[:, None], axis=-1).max(1) + 2 * GAP
+    tree = cKDTree(middle)
+    for first in range(0, len(centre) if len(middle) else 0, FACETS_AT_ONCE):
+        some = np.arange(first, min(first + FACETS_AT_ONCE, len(centre)))
+        near = tree.query_ball_point(centre[some], radius[some], return_sorted=False)
+        facet, edge = np.repeat(some, [len(found) for found in near]), np.concatenate([*near, []]).astype(int)
+        normal, point, way = np.asarray(facets.normal)[facet], middle[edge], out[edge]
+        height, along = np.sum(normal * point, -1) - np.asarray(facets.offset)[facet], np.sum(normal * way, -1)
         distance = -height / np.where(along == 0, 1, along)
-        near = np.flatnonzero((along != 0) & (distance > WELD) & (distance < GAP))
-        there = point + distance[near, None] * way
-        inside = (np.einsum("fed,fd->fe", half_planes.inward[near], there) >= half_planes.offset[near]).all(-1)
-        covered[i] = inside.any()
+        ahead = np.flatnonzero((along != 0) & (distance > WELD) & (distance < GAP))
+        facet, edge, there = facet[ahead], edge[ahead], (point + distance[:, None] * way)[ahead]
+        inside = (np.sum(half_planes.inward[facet] * there[:, None], -1) >= half_planes.offset[facet]).all(-1)
+        covered[edge[inside]] = True
     return covered
 
 

@@ -16,12 +16,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax.mesh.cleaning import components, names, repaired, sides
 from wbgs_jax.types import Mesh
 
-AnyArray = Array | np.ndarray
-"""Geometry is computed in NumPy in double precision and used in JAX."""
 CORNERS = 4
 WELD = 1e-5
 """Metres: corners nearer than this are merged."""

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wbgs_jax.mesh.facets import AnyArray
+from wbgs_jax._util.pytree import AnyArray
 
 CHUNK = 1_000_000
 """Maximum number of pairs of a point and a triangle whose solid angles are computed together; limits memory to about 100 MB."""

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wbgs_jax._util.pytree import pytree
-from wbgs_jax.mesh.facets import AnyArray
+from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax.propagation.transport import SHORTEST
 
 SAMPLES = 64

@@ -24,8 +24,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax._util.pytree import pytree
-from wbgs_jax.mesh.facets import AnyArray, centres
+from wbgs_jax._util.pytree import AnyArray, pytree
+from wbgs_jax.mesh.facets import centres
 from wbgs_jax.propagation.image_method import Surfaces
 from wbgs_jax.propagation.mechanisms import MECHANISMS
 from wbgs_jax.propagation.paths import MAX_ORDER, PathGeometry, TracedPaths, is_vertex, on_edge

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from wbgs_jax._util.pytree import pytree, to_device
-from wbgs_jax.mesh.edges import Edges, filled
-from wbgs_jax.mesh.facets import CORNERS, AnyArray, Facets, HalfPlanes, areas, half_planes_of
-from wbgs_jax.propagation.occlusion import planes_of
+from wbgs_jax._util.pytree import AnyArray, pytree, to_device
+from wbgs_jax.mesh.edges import Edges, about_edges, filled
+from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes, areas, half_planes_of
+from wbgs_jax.propagation.occlusion import FacetHierarchy, hierarchy_of
 
 SIDE = 1e-4
 """Metres: points nearer to a plane than this count as lying on neither side."""
@@ -25,6 +25,8 @@ NO_LENGTH = 1e-12
 """Square metres: lower bound on twice the area of the triangle of an image and a facet side that bounds a beam."""
 BEAMS_AT_ONCE = 64
 """Beams tested together: few enough for a CPU's cache."""
+GROUP = 8
+"""Reflection sequences in a group, which begin with the same facet."""
 MOST_TRIED = 10_000_000
 """Maximum number of pairs of a sequence and a further mirror that are examined per order, ..."""
 MOST_PAIRS = 1_000_000
@@ -55,8 +57,10 @@ class DiffractedPairs:
     """(facet, edge): first diffracted, then reflected."""
     after_image: Float[AnyArray, "a 3"]
     """The receiver mirrored in the facet. World frame, metres."""
+    after_reach: Float[AnyArray, "2 a"]
+    """Where this image lies along the edge, and its distance from the edge's line, metres (`about_edges`)."""
     before: Int[AnyArray, "b 2"]
-    """(facet, edge): first reflected, then diffracted."""
+    """(facet, edge): first reflected, then diffracted. All edges, of one mirror after the other."""
 
 
 @pytree
@@ -75,8 +79,8 @@ class ImageTree(Surfaces):
     """World frame, metres."""
     half_planes: HalfPlanes
     """Half-planes along the sides of the facets."""
-    planes: Float[AnyArray, "5 4 p"]
-    """Planes of the facets and of their sides, for the test of occlusion (`occlusion.planes_of`)."""
+    hierarchy: FacetHierarchy
+    """The facets in boxes, for the test of occlusion."""
     sequences: tuple[ReflectionSequences, ...]
     """Reflection sequences of orders 1, 2, ..."""
     diffracted: DiffractedPairs
@@ -106,17 +110,33 @@ def make_image_tree(
     """
     facets, edges = jax.tree.map(_on_host, (facets, edges))
     rx = np.asarray(receiver_position, np.float64)
-    sequences = reflection_sequences(facets, rx, mirror_areas)
+    sequences = tuple(grouped(one, facets) for one in reflection_sequences(facets, rx, mirror_areas))
     pairs = diffracted_pairs(facets, edges, rx, mirror_area_after_edge, mirror_area_before_edge)
     if padded:
         sequences, pairs = tuple(_padded(one, facets) for one in sequences), _padded_pairs(pairs, facets)
-    found: ImageTree = to_device(ImageTree(facets, edges, rx, half_planes_of(facets), planes_of(facets), sequences, pairs))
+    found: ImageTree = to_device(ImageTree(facets, edges, rx, half_planes_of(facets), hierarchy_of(facets), sequences, pairs))
     return found
 
 
+def grouped(sequences: ReflectionSequences, facets: Facets) -> ReflectionSequences:
+    """Returns sequences of more than one facet in groups of `GROUP` that begin with the same one (host), with padding that
+    reflects nothing: its images lie in the planes of its facets."""
+    if sequences.facet.shape[1] == 1:
+        return sequences
+    count = np.unique(sequences.facet[:, 0], return_counts=True)[1]
+    room = -(-count // GROUP) * GROUP
+    place = np.arange(room.sum()) - np.repeat(np.cumsum(room) - room, room)  # in the groups of one facet
+    order = np.argsort(sequences.facet[:, 0], kind="stable")
+    row = order[np.repeat(np.cumsum(count) - count, room) + np.minimum(place, np.repeat(count, room) - 1)]
+    facet, there = sequences.facet[row], place < np.repeat(count, room)
+    nowhere = np.asarray(facets.corners)[facet, 0]
+    return ReflectionSequences(facet, np.where(there[:, None, None], sequences.image[row], nowhere))
+
+
 def _padded(sequences: ReflectionSequences, facets: Facets) -> ReflectionSequences:
-    """Returns the sequences, followed by padding that reflects nothing."""
-    facet = filled(sequences.facet)
+    """Returns the sequences, followed by padding that reflects nothing; groups stay whole."""
+    group = GROUP if sequences.facet.shape[1] > 1 else 1
+    facet = filled(sequences.facet.reshape(-1, group, sequences.facet.shape[1])).reshape(-1, sequences.facet.shape[1])
     return ReflectionSequences(facet, _in_the_plane(sequences.image, facets, facet))
 
 
@@ -124,7 +144,8 @@ def _padded_pairs(pairs: DiffractedPairs, facets: Facets) -> DiffractedPairs:
     """Returns the pairs; those with a mirror behind the edge are followed by padding that reflects nothing. The number of the
     others already follows from the padded edges."""
     after = filled(pairs.after)
-    return DiffractedPairs(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), pairs.before)
+    reach = np.pad(pairs.after_reach, ((0, 0), (0, len(after) - len(pairs.after))), constant_values=np.nan)
+    return DiffractedPairs(after, _in_the_plane(pairs.after_image, facets, after[:, 0]), reach, pairs.before)
 
 
 def _in_the_plane(image: Float[AnyArray, "*n 3"], facets: Facets, mirror: Int[np.ndarray, "*k"]) -> Float[np.ndarray, "*k 3"]:
@@ -201,7 +222,8 @@ def diffracted_pairs(
     after = np.stack([mirrors[place], edge], 1)
     mirrors = np.sort(largest_first[: min(np.count_nonzero(area >= before_area), most)])
     before = np.stack(np.meshgrid(mirrors, np.arange(len(segment)), indexing="ij"), -1).reshape(-1, 2)
-    return DiffractedPairs(after.astype(np.int32), image[place], before.astype(np.int32))
+    reach = np.stack(about_edges(image[place].T, jax.tree.map(lambda leaf: leaf[edge], edges)))
+    return DiffractedPairs(after.astype(np.int32), image[place], reach, before.astype(np.int32))
 
 
 def _prepend(facet, image, candidates, corners, normal, offset, slack):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wbgs_jax._util.pytree import to_device
-from wbgs_jax.mesh.edges import Edges
+from wbgs_jax.mesh.edges import Edges, about_edges
 from wbgs_jax.mesh.facets import AnyArray, Facets, HalfPlanes, centres, half_planes_of, moved
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.propagation.image_method import (
@@ -24,9 +24,10 @@ from wbgs_jax.propagation.image_method import (
     ImageTree,
     ReflectionSequences,
     diffracted_pairs,
+    grouped,
     reflection_sequences,
 )
-from wbgs_jax.propagation.occlusion import planes_of
+from wbgs_jax.propagation.occlusion import hierarchy_of, moved_hierarchy
 from wbgs_jax.propagation.paths import nearly_valid
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.geometry import rotation_matrix, rotation_quaternion
@@ -34,6 +35,8 @@ from wbgs_jax.radio.geometry import rotation_matrix, rotation_quaternion
 STEP_M = 0.25
 """Metres by which anything moves between instants at which reflection sequences are found; facets and edges are enlarged by as
 much, so that none is missed in between."""
+
+Rows = Int[np.ndarray, "_ _"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,22 +98,34 @@ def tree_over_time(
         sequences.append([one.facet for one in reflection_sequences(there, here, mirror_areas, SLACK + STEP_M)])
         pairs = diffracted_pairs(there, wedges, here, mirror_area_after_edge, mirror_area_before_edge, SLACK + STEP_M)
         after.append(np.asarray(pairs.after))
-    rows = [_united(of_order) for of_order in (*zip(*sequences, strict=True), after)]
-    planes = half_planes_of(facets), planes_of(facets)
+    *reflecting, behind = (_united(rows) for rows in (*zip(*sequences, strict=True), after))
+    in_front = np.asarray(pairs.before)  # the same at all instants
+    half_planes, hierarchy = half_planes_of(facets), hierarchy_of(facets)
 
-    def tree_of(rows: list[Int[np.ndarray, "_ _"]]) -> ImageTree:
-        *facet, after, before = rows
-        places = tuple(ReflectionSequences(one, np.zeros((*one.shape, 3))) for one in facet)  # `tree_at` sets the images
-        diffracted = DiffractedPairs(after, np.zeros((len(after), 3)), before)
-        found: ImageTree = to_device(ImageTree(facets, edges, rx, *planes, places, diffracted))
+    def tree_of(places: list[ReflectionSequences], after: Rows, before: Rows) -> ImageTree:
+        """`tree_at` sets the images."""
+        diffracted = DiffractedPairs(after, np.zeros((len(after), 3)), np.zeros((2, len(after))), before)
+        found: ImageTree = to_device(ImageTree(facets, edges, rx, half_planes, hierarchy, tuple(places), diffracted))
         return found
 
-    rows.append(np.asarray(pairs.before))  # the same at all instants
-    ever = _ever_valid(tree_of(rows), to_device(np.asarray(tx_position)[instants]), to_device(movement))
-    return tree_of([own[np.asarray(mask)] for own, mask in zip(rows, ever, strict=True)])
+    tree = tree_of([ReflectionSequences(one, np.zeros((*one.shape, 3))) for one in reflecting], behind, in_front)
+    ever = _ever_valid(tree, to_device(np.asarray(tx_position)[instants]), to_device(movement))
+    *of_facets, of_behind, of_front = map(np.asarray, ever)
+    count = max(edges.length.size, 1)
+    of_mirror = np.repeat(of_front.reshape(-1, count).any(1), count)  # all edges of one mirror stay together
+    places = [_in_groups(one[mask], facets) for one, mask in zip(reflecting, of_facets, strict=True)]
+    return tree_of(places, behind[of_behind], in_front[of_mirror])
 
 
-def _united(rows: Iterable[Int[np.ndarray, "_ _"]]) -> Int[np.ndarray, "_ _"]:
+def _in_groups(rows: Rows, facets: Facets) -> ReflectionSequences:
+    """Returns sequences in groups (`image_method.grouped`). Padding reflects at one facet again and again, which is never a
+    path, wherever the facet moves."""
+    found = grouped(ReflectionSequences(rows, np.full((*rows.shape, 3), np.nan)), facets)
+    real = np.isnan(found.image[:, :1, 0])
+    return ReflectionSequences(np.where(real, found.facet, found.facet[:, :1]), np.zeros(found.image.shape))
+
+
+def _united(rows: Iterable[Rows]) -> Rows:
     """Returns the different rows of several arrays."""
     return np.unique(np.concatenate(list(rows)), axis=0)
 
@@ -156,22 +171,25 @@ def tree_at(tree: ImageTree, motion: Motion) -> ImageTree:
     there = dataclasses.replace(
         facets, corners=corners, normal=normal, offset=own.offsets(facets.normal, normal, facets.offset)
     )
-    # Facets are the last axis there, padded to whole words with planes that have no normal.
-    padded = rigid.of(jnp.pad(facets.mover, (0, tree.planes.shape[-1] - len(facets.mover))))
-    sides = jnp.moveaxis(tree.planes[:, :3], 1, 2)
-    moved_sides = padded.vectors(sides)
-    offsets = padded.offsets(sides, moved_sides, tree.planes[:, 3])
-    planes = jnp.concatenate([jnp.moveaxis(moved_sides, 2, 1), offsets[:, None]], 1)
+    planes = tree.hierarchy.planes.reshape(*tree.hierarchy.planes.shape[:2], -1)
+    in_leaves = rigid.of(facets.mover[tree.hierarchy.facet.reshape(-1)])
+    sides = jnp.moveaxis(planes[:, :3], 1, 2)
+    moved_sides = in_leaves.vectors(sides)
+    offsets = in_leaves.offsets(sides, moved_sides, planes[:, 3])
+    planes = jnp.concatenate([jnp.moveaxis(moved_sides, 2, 1), offsets[:, None]], 1).reshape(tree.hierarchy.planes.shape)
     rx = jnp.asarray(tree.receiver_position + motion.receiver)
+    edges, after = _moved_edges(tree.edges, facets, motion), tree.diffracted.after
+    image = _mirrored(there, after[:, 0], rx)
+    reach = jnp.stack(about_edges(image.T, jax.tree.map(lambda leaf: leaf[after[:, 1]], edges)))
     return dataclasses.replace(
         tree,
         facets=there,
-        edges=_moved_edges(tree.edges, facets, motion),
+        edges=edges,
         receiver_position=rx,
         half_planes=half_planes,
-        planes=planes,
+        hierarchy=moved_hierarchy(tree.hierarchy, planes, corners),
         sequences=tuple(ReflectionSequences(one.facet, _images(there, one.facet, rx)) for one in tree.sequences),
-        diffracted=dataclasses.replace(tree.diffracted, after_image=_mirrored(there, tree.diffracted.after[:, 0], rx)),
+        diffracted=dataclasses.replace(tree.diffracted, after_image=image, after_reach=reach),
     )
 
 

@@ -16,13 +16,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
-from wbgs_jax._util.pytree import pytree, static
-from wbgs_jax.mesh.edges import Edges
-from wbgs_jax.mesh.facets import AnyArray, HalfPlanes
-from wbgs_jax.propagation.image_method import ImageTree, ReflectionSequences
-from wbgs_jax.propagation.occlusion import NEAR, WORD, counted, crossed, crossing_share, first_of
+from wbgs_jax._util.bits import WORD, in_chunks, members, packed
+from wbgs_jax._util.pytree import AnyArray, pytree, static
+from wbgs_jax.mesh.edges import Edges, about_edges
+from wbgs_jax.mesh.facets import CORNERS, Facets, HalfPlanes
+from wbgs_jax.propagation.image_method import GROUP, ImageTree, ReflectionSequences
+from wbgs_jax.propagation.occlusion import NEAR, crossing_share, crossings, listed
 from wbgs_jax.radio.array import EXACT
 
 MAX_ORDER = 3
@@ -31,8 +32,10 @@ MAX_INTERACTIONS = 5
 """Maximum number of facets and edges that a path interacts with; a wave that has crossed more of them is negligible."""
 BEHIND = 1e-6
 """Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start."""
-CUT_AT_ONCE = 32
-"""Paths tested together: few enough for a CPU's cache."""
+FEW_ROWS, SCORED_AT_ONCE = 4096, 512
+"""Rows up to which all are scored, and candidates scored together where there are more."""
+SLACK = 5e-3
+"""Metres by which facets and edges are enlarged in cheap tests, so that rounding loses no candidate."""
 THROUGH = 0.5
 """Rough amplitude factor of a crossed or reflecting facet, used to rank paths."""
 
@@ -135,18 +138,18 @@ class Candidates(NamedTuple):
 
 def specular_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> PathGeometry:
     """Returns the `kept` strongest paths without diffraction, including the line of sight, of at most `tried` candidates."""
-    mirrored = (promising(lambda some: _mirrored(tx, tree, some), sequences, tried) for sequences in tree.sequences)
-    parts = [_direct(tx, tree.receiver_position), *mirrored]
+    parts = [_direct(tx, tree.receiver_position)]
+    parts += [promising(_mirrored, tx, tree, sequences, tried, _may_reflect) for sequences in tree.sequences]
     return select_paths("specular", parts, tree, tried, kept, MAX_ORDER + 1)
 
 
 def diffracted_paths(tx: Float[Array, "3"], tree: ImageTree, tried: int, kept: int) -> PathGeometry:
     """Returns the `kept` strongest paths with one diffraction and at most one reflection, of at most `tried` candidates."""
-    pairs = tree.diffracted
+    pairs, edge = tree.diffracted, jnp.arange(tree.edges.length.size)
     parts = [
-        _diffracted_only(tx, tree),
-        promising(lambda some: _diffracted_then_mirrored(tx, tree, *some), (pairs.after, pairs.after_image), tried),
-        promising(lambda some: _mirrored_then_diffracted(tx, tree, some), pairs.before, tried),
+        promising(_diffracted_only, tx, tree, edge, tried, _may_diffract),
+        promising(_diffracted_then_mirrored, tx, tree, (pairs.after, pairs.after_image), tried, _may_diffract_first),
+        promising(_mirrored_then_diffracted, tx, tree, pairs.before, tried, _may_diffract_last),
     ]
     return select_paths("diffracted", parts, tree, tried, kept, 3)
 
@@ -166,20 +169,70 @@ def nearly_valid(tx: Float[Array, "3"], tree: ImageTree, slack: float) -> tuple[
     )
     pairs = tree.diffracted
     found = [_mirrored(tx, larger, sequences) for sequences in tree.sequences]
-    found.append(_diffracted_then_mirrored(tx, larger, pairs.after, pairs.after_image))
+    found.append(_diffracted_then_mirrored(tx, larger, (pairs.after, pairs.after_image)))
     found.append(_mirrored_then_diffracted(tx, larger, pairs.before))
     return tuple(one.score > 0 for one in found)
 
 
-def _diffracted_only(tx, tree: ImageTree) -> Candidates:
+def _may_reflect(tx, tree: ImageTree, sequences: ReflectionSequences) -> Bool[Array, " c"]:
+    """Returns which sequences may be those of a path: the line to the first image meets the first facet. Sequences of a group
+    begin with the same one, so that its sides are read once."""
+    group = GROUP if sequences.facet.shape[1] > 1 else 1
+    facet = sequences.facet[::group, 0]
+    x, y, z = (sequences.image[:, 0, axis].reshape(-1, group) for axis in range(3))
+
+    def heights(normal, offset):
+        """Returns the heights of the transmitter (groups, 1) and of the images (groups, size) above planes."""
+        a, b, c = (normal[:, axis, None] for axis in range(3))
+        return a * tx[0] + b * tx[1] + c * tx[2] - offset[:, None], a * x + b * y + c * z - offset[:, None]
+
+    near, beyond = heights(tree.facets.normal[facet], tree.facets.offset[facet])
+    may = near * beyond < 0
+    for side in range(CORNERS):
+        one, other = heights(tree.half_planes.inward[facet, side], tree.half_planes.offset[facet, side] - SLACK)
+        may &= one * jnp.abs(beyond) + other * jnp.abs(near) >= 0
+    return may.reshape(-1)
+
+
+def _may_diffract(tx, tree: ImageTree, edge: Int[Array, " e"]) -> Bool[Array, " e"]:
+    """Returns which edges may be those of a path: Keller's point lies on the edge, and both directions are outside the
+    wedge."""
+    source, goal = (about_edges(point[:, None], tree.edges) for point in (tx, jnp.asarray(tree.receiver_position)))
+    return _on_edge(source, goal, tree.edges.length)
+
+
+def _may_diffract_first(tx, tree: ImageTree, rows) -> Bool[Array, " c"]:
+    """Returns the same for pairs of an edge and a mirror behind it."""
+    edge = rows[0][:, 1]
+    source = tuple(of[edge] for of in about_edges(tx[:, None], tree.edges))
+    return _on_edge(source, tree.diffracted.after_reach, tree.edges.length[edge])
+
+
+def _may_diffract_last(tx, tree: ImageTree, pairs) -> Bool[Array, " c"]:
+    """Returns the same for pairs of an edge and a mirror in front of it."""
+    mirror = pairs[:: tree.edges.length.size, 0]
+    normal, offset = tree.facets.normal[mirror], tree.facets.offset[mirror]
+    images = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
+    source, goal = (about_edges(p, tree.edges) for p in (images.T[:, :, None], tree.receiver_position[:, None]))
+    return _on_edge(source, goal, tree.edges.length).reshape(-1)
+
+
+def _on_edge(source, goal, length: Float[AnyArray, " c"]) -> Bool[Array, "*b c"]:
+    """Returns whether Keller's points lie on edges, from the places and distances of both ends (`about_edges`)."""
+    (t_in, r_in), (t_out, r_out) = source, goal
+    t = t_in + (t_out - t_in) * r_in / (r_in + r_out)  # not a number within the wedge
+    return (t > -SLACK) & (t < length + SLACK) & (length > 0)
+
+
+def _diffracted_only(tx, tree: ImageTree, edge: Int[Array, " c"]) -> Candidates:
     """Returns one candidate per edge."""
-    edge = jnp.arange(tree.edges.length.size)
     point, strength = _diffracted(tx, tree.receiver_position, edge, tree.edges)
     return make_candidates(tx, tree.receiver_position, [(point, edge, DIFFRACTED)], strength, edge.size)
 
 
-def _diffracted_then_mirrored(tx, tree: ImageTree, pairs, image) -> Candidates:
+def _diffracted_then_mirrored(tx, tree: ImageTree, rows) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror behind it."""
+    pairs, image = rows
     facet, edge = jnp.moveaxis(pairs, -1, 0)
     point, strength = _diffracted(tx, image, edge, tree.edges)
     mirror, valid = _on_mirror(point, image, tree.facets.normal[facet], tree.facets.offset[facet])
@@ -296,20 +349,46 @@ def select_paths(
     """
     candidates = Candidates(*(jnp.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     found = _best(candidates, candidates.score, tried)
-    cut = _of_living(lambda c: crossed(c.points[: segments + 1], tree.planes), found)
-    crossings = jnp.sum(counted(cut), -1)
-    whole = crossings + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
-    score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossings, 0), min(kept, found.score.size))
-    found = jax.tree.map(lambda leaf: leaf[best], found)
-    facet, types, segment = jax.vmap(lambda path, words: _in_order(path, words, tree))(found, cut[best])
+    crossed = crossings(found.points[:, : segments + 1], found.score > 0, tree.hierarchy, MAX_INTERACTIONS)
+    whole = crossed.total + jnp.sum(found.interaction_type != NONE, -1) <= MAX_INTERACTIONS
+    score, best = jax.lax.top_k(jnp.where(whole, found.score * THROUGH**crossed.total, 0), min(kept, found.score.size))
+    found, crossed = jax.tree.map(lambda leaf: leaf[best], (found, crossed))
+    facet, types, segment = jax.vmap(lambda path, met: _in_order(path, met, tree.facets))(
+        found, listed(crossed, tree.hierarchy)
+    )
     return PathGeometry(found.points, facet, types, segment, score > 0, mechanism)
 
 
-def promising(build: Callable[[Any], Candidates], rows: Any, most: int) -> Candidates:
-    """Returns the best candidates of a kind. All are scored first and the best built again: the points are most of the work."""
-    score = build(rows).score
-    best = jax.lax.top_k(score, min(most, score.size))[1]
-    return build(jax.tree.map(lambda leaf: leaf[best], rows))
+def promising(
+    build: Callable[..., Candidates], tx, tree: ImageTree, rows: Any, most: int, may: Callable[..., Bool[Array, " c"]]
+) -> Candidates:
+    """Returns the best candidates of a kind.
+
+    Args:
+        build: (transmitter, image tree, rows) -> one candidate per row.
+        tx, tree: the transmitter and the image tree of the receiver.
+        rows: all rows.
+        most: number of candidates.
+        may: with the same arguments, a cheap test. If there are many rows, only those are scored that it leaves over, and only
+            the best of them are built.
+    """
+    fixed, count = jax.lax.stop_gradient(tx), len(jax.tree.leaves(rows)[0])
+
+    def further(word, bit, there, found):
+        row = jnp.minimum(word * WORD + bit, count - 1)
+        score = build(fixed, tree, _rows(rows, row)).score
+        return found.at[jnp.where(there, row, count)].set(score, mode="drop")
+
+    if count > FEW_ROWS:
+        some = members(packed(may(fixed, tree, rows)))
+        score = in_chunks(some, SCORED_AT_ONCE, further, jnp.zeros(count, tx.dtype))
+    else:
+        score = build(fixed, tree, rows).score
+    return build(tx, tree, _rows(rows, jax.lax.top_k(score, min(most, count))[1]))
+
+
+def _rows(tree: Any, row: Int[Array, " k"]) -> Any:
+    return jax.tree.map(lambda leaf: leaf[row], tree)
 
 
 def _best(candidates: Candidates, score: Float[Array, " c"], most: int) -> Candidates:
@@ -318,31 +397,14 @@ def _best(candidates: Candidates, score: Float[Array, " c"], most: int) -> Candi
     return jax.tree.map(lambda leaf: leaf[best], candidates)._replace(score=score)
 
 
-def _of_living(function: Callable[[Candidates], Any], candidates: Candidates) -> Any:
-    """Returns a function of every candidate that may be a path, and zeros for the others; the best ones come first."""
-    count = candidates.score.size
-    blocks = jax.tree.map(lambda leaf: _in_blocks(leaf, -(-count // CUT_AT_ONCE)), candidates)
-    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), blocks)
-    nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(jax.vmap(function), one))
-    of_blocks = jax.lax.map(lambda c: jax.lax.cond(c.score[0] > 0, jax.vmap(function), lambda _: nothing, c), blocks)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], of_blocks)
-
-
-def _in_blocks(leaf: Array, blocks: int) -> Array:
-    """Returns an array in blocks of `CUT_AT_ONCE` rows, padded with zeros."""
-    rows = jnp.zeros((blocks * CUT_AT_ONCE, *leaf.shape[1:]), leaf.dtype).at[: len(leaf)].set(leaf)
-    return rows.reshape(blocks, CUT_AT_ONCE, *leaf.shape[1:])
-
-
-def _in_order(candidate: Candidates, cut: UInt32[Array, "segments words"], tree: ImageTree):
+def _in_order(candidate: Candidates, crossed, facets: Facets):
     """Returns the interactions of one path in order: facet or edge, type, segment."""
-    number, crosses = first_of(cut.reshape(-1), MAX_INTERACTIONS)
-    segment, facet = jnp.divmod(number, cut.shape[1] * WORD)
-    share = crossing_share(candidate.points[segment], candidate.points[segment + 1], facet, tree.planes)
+    segment, facet, crosses = crossed
+    share = crossing_share(candidate.points[segment], candidate.points[segment + 1], facet, facets)
     vertex, types = jnp.arange(MAX_ORDER), candidate.interaction_type
     crossing = jnp.where(crosses, segment + jnp.clip(share, BEHIND, 1), jnp.inf)
     order = jnp.argsort(jnp.concatenate([crossing, jnp.where(types != NONE, vertex + 1.0, jnp.inf)]))[:MAX_INTERACTIONS]
     interactions = jnp.where(crosses, TRANSMITTED, NONE), types
-    facets = jnp.where(crosses, facet, 0), candidate.interaction_facet
-    types, facet, segment = (jnp.concatenate(both)[order] for both in (interactions, facets, (segment, vertex)))
+    met = jnp.where(crosses, facet, 0), candidate.interaction_facet
+    types, facet, segment = (jnp.concatenate(both)[order] for both in (interactions, met, (segment, vertex)))
     return jnp.where(types != NONE, facet, 0), types, jnp.where(types != NONE, segment, 0)
