@@ -9,13 +9,13 @@ from wbgs_jax.applications.measurement_plan import NUGGET
 
 
 def posterior(places, error, measured, length):
-    """The covariance of errors at places, given that others are measured, from the joint normal distribution."""
+    """The covariance of errors at places, with the correlation that the joint normal distribution has, given others."""
     everything = np.concatenate([places, measured])
-    amplitude = np.concatenate([error, np.ones(len(measured))])
-    joint = np.exp(-cdist(everything, everything) / length) * np.outer(amplitude, amplitude)
-    n = len(places)
+    joint, n = np.exp(-cdist(everything, everything) / length), len(places)
     own = joint[n:, n:] + NUGGET * np.eye(len(measured))
-    return joint[:n, :n] - joint[:n, n:] @ np.linalg.inv(own) @ joint[n:, :n]
+    given = joint[:n, :n] - joint[:n, n:] @ np.linalg.inv(own) @ joint[n:, :n]
+    root = np.sqrt(np.diag(given))
+    return given / np.outer(root, root) * np.outer(error, error)
 
 
 def after(covariance, error, one):
@@ -44,7 +44,8 @@ def test_the_first_place_is_the_best_of_all_and_the_error_is_that_of_the_normal_
 def test_a_batch_covers_two_rooms_and_leaves_out_what_is_measured():
     rng = np.random.default_rng(0)
     rooms = [rng.normal(0, 0.3, (20, 3)) + np.array([x, 0, 0]) for x in (0, 10, 20)]
-    found = choose_next_places(np.concatenate(rooms), np.full(60, 0.2), rooms[1], 2.0, 2)
+    error = np.repeat([0.2, 0.05, 0.2], 20)
+    found = choose_next_places(np.concatenate(rooms), error, rooms[1], 2.0, 2)
     assert sorted(found.numbers // 20) == [0, 2]
 
 

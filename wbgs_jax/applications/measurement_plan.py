@@ -1,7 +1,7 @@
 """Where to measure next: the places whose measurement reduces the expected error of a field most, in an order to walk them.
 
-The error of a prediction is modelled as a Gaussian process over places: its amplitude is the error that the field itself
-expects there, its correlation decays with the distance (exponential covariance), and measured places condition it.
+The error of a prediction is modelled as a Gaussian process over places: its standard deviation is the error that the field
+itself expects there, and its correlation that of an exponential covariance, given the measured places.
 Places are chosen one after the other, each as the one that removes most variance from all places of interest given those before
 (active learning of Cohn 1996; greedy A-optimal design). Neighbouring places are thus not chosen together.
 """
@@ -15,6 +15,8 @@ from scipy.spatial.distance import cdist
 
 NUGGET = 0.15
 """Variance of what a measurement does not share with its surroundings, such as fading, relative to the variance of errors."""
+LEAST = 1e-9
+"""Smallest conditional variance that is divided by."""
 SWAPS = 1000
 """Maximum number of reversals that shorten a walk."""
 
@@ -115,13 +117,15 @@ def _given(
     measured: Float[np.ndarray, "m 3"],
     length: float,
 ) -> Float[np.ndarray, "c c"]:
-    """Returns the covariance of errors at candidates, given that measured places have none."""
+    """Returns the covariance of errors at candidates, given what is measured. Its diagonal is that of the expected errors, which
+    already depend on the distance to measured places as far as the data show that."""
     covariance = np.exp(-cdist(candidates, candidates) / length)
     if len(measured):
         between, own = (np.exp(-cdist(measured, places) / length) for places in (candidates, measured))
         own[np.diag_indices(len(measured))] += NUGGET
         covariance -= between.T @ cho_solve(cho_factor(own), between)
-    covariance *= np.outer(expected_error, expected_error)
+    scale = expected_error / np.sqrt(np.maximum(np.diag(covariance), LEAST))
+    covariance *= np.outer(scale, scale)
     return covariance
 
 
