@@ -1,9 +1,9 @@
 """Where to measure next: the places whose measurement reduces the expected error of a field most, in an order to walk them.
 
 The error of a prediction is modelled as a Gaussian process over places: its standard deviation is the error that the field
-itself expects there, and its correlation that of an exponential covariance, given the measured places.
-Places are chosen one after the other, each as the one that removes most variance from all places of interest given those before
-(active learning of Cohn 1996; greedy A-optimal design). Neighbouring places are thus not chosen together.
+itself expects there, and its correlation that of an exponential covariance, given the measured places. Places are chosen one
+after the other, each as the one that removes most variance from all places of interest given those before (active learning of
+Cohn 1996; greedy A-optimal design). Neighbouring places are thus not chosen together.
 """
 
 from typing import NamedTuple
@@ -117,8 +117,8 @@ def _given(
     measured: Float[np.ndarray, "m 3"],
     length: float,
 ) -> Float[np.ndarray, "c c"]:
-    """Returns the covariance of errors at candidates, given what is measured. Its diagonal is that of the expected errors, which
-    already depend on the distance to measured places as far as the data show that."""
+    """Returns the covariance of errors at candidates, given what is measured. Its diagonal holds the squared expected errors,
+    which already depend on the distance to measured places as far as the data show that."""
     covariance = np.exp(-cdist(candidates, candidates) / length)
     if len(measured):
         between, own = (np.exp(-cdist(measured, places) / length) for places in (candidates, measured))

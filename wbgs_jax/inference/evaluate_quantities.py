@@ -17,7 +17,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import Field, field_names, get_field
-from wbgs_jax.fields.base import outputs_of, paths_of
+from wbgs_jax.fields.base import Params, outputs_of, paths_of
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.intervals import expect_many, expected_power
 from wbgs_jax.inference.kriging import for_receiver
@@ -216,7 +216,7 @@ def _from_arrivals(
 
 
 @partial(jax.jit, static_argnames=("function",))
-def _measure(field: Field, params: Any, plan: Any, receiver: Receiver, query: Query, function: OfPaths) -> Any:
+def _measure(field: Field, params: Params, plan: Any, receiver: Receiver, query: Query, function: OfPaths) -> Any:
     arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, frequency_hz: function(one, receiver, frequency_hz))(arrivals, query.frequency_hz)
 
@@ -289,7 +289,7 @@ def mimo_matrices(
 
 
 @jax.jit
-def _matrices(field: Field, params: Any, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
+def _matrices(field: Field, params: Params, plan: Any, query: Query, receiver: Receiver, elements: Any) -> Any:
     arrivals = paths_of(field, params, plan, query)
     return jax.vmap(lambda one, hertz: mimo_matrix(one, receiver, hertz, elements))(arrivals, query.frequency_hz)
 

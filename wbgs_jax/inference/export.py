@@ -33,7 +33,7 @@ from wbgs_jax._util.files import atomic_write
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import portable
+from wbgs_jax.fields.base import Params, portable
 from wbgs_jax.inference.evaluate_quantities import domain_of, known_quantities
 from wbgs_jax.inference.intervals import PowerConfidence, expected_power, expected_ssim
 from wbgs_jax.inference.kriging import correct, for_receiver
@@ -52,7 +52,7 @@ class FrozenField(NamedTuple):
     """Everything needed to predict at one receiver, as a tree of arrays."""
 
     field: Field
-    params: Any
+    params: Params
     plan: Any
     neighbours: Any
     confidence: Any

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import paths_of
+from wbgs_jax.fields.base import Params, paths_of
 from wbgs_jax.propagation.paths import InteractionType
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.radio.channel import Paths, decibels, doppler_hz
@@ -19,7 +19,7 @@ SIGHT = "line of sight"
 
 def path_table(
     field: Field,
-    params: Any,
+    params: Params,
     plan: Any,
     queries: Query,
     tx_positions: Float[np.ndarray, "tx 3"],
@@ -57,7 +57,7 @@ def path_table(
 
 @jax.jit
 def _link(
-    field: Field, params: Any, plan: Any, query: Query, rx_velocity: Float[Array, "3"]
+    field: Field, params: Params, plan: Any, query: Query, rx_velocity: Float[Array, "3"]
 ) -> tuple[Paths, Float[Array, " k"]]:
     """Returns the paths of one query and their Doppler shifts."""
     found: Any = jax.tree.map(lambda leaf: leaf[0], paths_of(field, params, plan, query))

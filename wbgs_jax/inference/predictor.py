@@ -16,7 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation, base
-from wbgs_jax.fields.base import outputs_of
+from wbgs_jax.fields.base import Params, outputs_of
 from wbgs_jax.inference.kriging import Beside, correct, for_receiver
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_SHAPE
@@ -119,23 +119,23 @@ class _Shared:
 
 @partial(jax.jit, static_argnums=(5, 6))
 def _divided(
-    field: Field, params: Any, plan: Any, query: Query, beside: tuple[Any, ...], render: Callable[..., Any], mesh: Mesh
+    field: Field, params: Params, plan: Any, query: Query, beside: tuple[Any, ...], render: Callable[..., Any], mesh: Mesh
 ) -> Any:
-    def own(query: Query, field: Field, params: Any, plan: Any, beside: tuple[Any, ...]) -> Any:
+    def own(query: Query, field: Field, params: Params, plan: Any, beside: tuple[Any, ...]) -> Any:
         return render(field, params, plan, query, *beside)
 
     return spread(own, mesh, divided=0)(query, field, params, plan, beside)
 
 
 @jax.jit
-def _render_power(field: Field, params: Any, plan: Any, query: Query) -> Float[Array, " b"]:
+def _render_power(field: Field, params: Params, plan: Any, query: Query) -> Float[Array, " b"]:
     power = field.render(params, plan, query).power_db
     assert power is not None  # `check_power`
     return power
 
 
 @jax.jit
-def render_pas(field: Field, params: Any, plan: Any, query: Query, neighbours: Beside = None) -> Float[Array, "b 90 360"]:
+def render_pas(field: Field, params: Params, plan: Any, query: Query, neighbours: Beside = None) -> Float[Array, "b 90 360"]:
     """Returns the spectra of B queries; fields of equal shapes share one compilation."""
     return correct(neighbours, field.render(params, plan, query).pas, query)
 
@@ -147,14 +147,14 @@ RENDER: dict[str, Callable[..., Any]] = {"pas": render_pas, "power_db": _render_
 @partial(jax.jit, static_argnames=("quantity", "mesh"))
 def _observe(
     field: Field,
-    params: Any,
+    params: Params,
     plan: Any,
     neighbours: Beside,
     links: Links,
     quantity: str | None,
     mesh: Mesh | None,
 ) -> Any:
-    def own(links: Links, field: Field, params: Any, plan: Any, neighbours: Beside) -> Any:
+    def own(links: Links, field: Field, params: Params, plan: Any, neighbours: Beside) -> Any:
         seen = field.render(params, plan, links)
         seen = seen._replace(pas=correct(neighbours, seen.pas, links), paths=None)
         return getattr(seen, quantity) if quantity else seen
@@ -183,7 +183,7 @@ class OnAnyShape:
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 
 
-def observe_links(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+def observe_links(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
     """Returns the predictions of a field for links of a dataset, as NumPy arrays in their order.
 
     The field prepares the links once (`Field.prepare`); they are rendered in blocks of one shape, receiver by receiver. Every
@@ -277,12 +277,14 @@ def corrected(
 _correct = jax.jit(correct)
 
 
-def predict_spectra(field: Field, params: Any, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
+def predict_spectra(
+    field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 90 360"]:
     """Returns the predicted spectra (float32) of links of a dataset."""
     return np.asarray(observe_links(field, params, dataset, index).pas)
 
 
-def as_observed(field: Field, params: Any, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
+def as_observed(field: Field, params: Params, pas: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns predicted spectra as they would appear in the training data (host), so that noise does not count as an error."""
     seen = [np.asarray(base.as_observed(field, params, jnp.asarray(pas[block]))) for block in _slices(len(pas))]
     return np.concatenate(seen or [pas])

@@ -256,7 +256,7 @@ class Run:
             if found is not None:
                 self._compile_ahead(found[0], self._grown(found[1]))
 
-    def _compile_ahead(self, params: Any, capacity: Any) -> None:
+    def _compile_ahead(self, params: Params, capacity: Any) -> None:
         """Starts compiling the epoch for parameters of these shapes; only with one process and device."""
         if self.devices.mesh is not None or jax.process_count() > 1:
             return

@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float, Int
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields import Field
-from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, outputs_of
+from wbgs_jax.fields.base import Ability, GaussianState, MaterialProperties, Params, outputs_of
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.evaluate_quantities import LoadedField
 from wbgs_jax.inference.intervals import expected_power, expected_ssim
@@ -303,7 +303,7 @@ class Session:
 @partial(jax.jit, static_argnames="with_paths")
 def _predict(
     field: Field,
-    params: Any,
+    params: Params,
     plan: Any,
     query: Query,
     receiver: Receiver,
