@@ -2,8 +2,8 @@
 experiments/results/where_next.json.
 
 A quarter of the places of a measured set is held out; measuring begins at five random ones of the others and continues in
-rounds of ten. The places of a round are random, as far as possible from all earlier ones, or those that reduce the expected
-error most (`applications.measurement_plan`). All draws are common to the three.
+rounds of ten. The places of a round are random, as far as possible from all earlier ones, or the most
+uncertain ones (`applications.measurement_plan`). All draws are common to the three.
 """
 
 from dataclasses import dataclass

@@ -18,27 +18,28 @@ def posterior(places, error, measured, length):
     return given / np.outer(root, root) * np.outer(error, error)
 
 
-def after(covariance, error, one):
-    """The mean variance that a measurement of one place leaves."""
-    column = covariance[:, one]
-    return np.mean(np.diag(covariance) - column**2 / (covariance[one, one] + NUGGET * error[one] ** 2))
-
-
 @pytest.fixture
 def places():
     rng = np.random.default_rng(3)
     return rng.uniform(0, 5, (40, 3)), rng.uniform(0.1, 0.4, 40), rng.uniform(0, 5, (6, 3))
 
 
-def test_the_first_place_is_the_best_of_all_and_the_error_is_that_of_the_normal_distribution(places):
+def test_places_have_the_largest_variance_given_those_before(places):
     candidates, error, measured = places
-    covariance = posterior(candidates, error, measured, 1.5)
-    left = [after(covariance, error, one) for one in range(len(candidates))]
     found = choose_next_places(candidates, error, measured, 1.5, 3)
-    assert found.numbers[0] == np.argmin(left)
-    np.testing.assert_allclose(found.error[:2] ** 2, [np.mean(np.diag(covariance)), min(left)], rtol=1e-9)
+    covariance = posterior(candidates, error, measured, 1.5)
+    for number, one in enumerate(found.numbers):
+        np.testing.assert_allclose(found.error[number] ** 2, np.mean(np.diag(covariance)), rtol=1e-9)
+        assert one == np.argmax(np.diag(covariance))
+        column = covariance[:, one]
+        covariance = covariance - np.outer(column, column) / (covariance[one, one] + NUGGET * error[one] ** 2)
     assert (np.diff(found.error) < 0).all()
-    assert len(set(found.numbers.tolist())) == 3
+
+
+def test_equal_errors_give_places_that_are_far_from_all_others():
+    line = np.column_stack([np.linspace(0, 10, 41), np.zeros((41, 2))])
+    found = choose_next_places(line, np.ones(41), np.zeros((0, 3)), 3.0, 3)
+    np.testing.assert_allclose(np.sort(line[found.numbers, 0]), [0, 5, 10], atol=0.26)
 
 
 def test_a_batch_covers_two_rooms_and_leaves_out_what_is_measured():

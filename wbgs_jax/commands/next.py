@@ -1,4 +1,4 @@
-"""Choose where to measure next, the places that reduce the expected error of a trained field most:
+"""Choose where to measure next, the places about which a trained field is most uncertain:
 
 wbgs-jax next --run RUN --candidates places.csv --count 10 [--out next.csv]
 wbgs-jax next --run RUN --grid -2,-2,1.5:2,2,1.5:9x9x1 --count 10 --ghz 2.4 28
@@ -34,7 +34,7 @@ LENGTH = 3.0
 
 @dataclass(frozen=True)
 class Command(TrainedFieldOptions):
-    """Choose where to measure next: the places that reduce the expected error of a field most, in an order to walk them."""
+    """Choose where to measure next: the places about which a field is most uncertain, in an order to walk them."""
 
     data: Path | None = None
     """Instead of a trained field: a folder of readings (docs/measured.md), to which a map of received power is fitted first."""
@@ -49,7 +49,7 @@ class Command(TrainedFieldOptions):
     rx: str = ""
     """Receiver, by default the first of the data: its index, or x,y,z in metres."""
     start: str = ""
-    """Place x,y,z where the walk begins, by default the chosen place that helps most."""
+    """Place x,y,z where the walk begins, by default the most uncertain place."""
     length: float | None = None
     """Distance over which errors are alike, metres; by default three times that between neighbouring measured places, or that
     of the map of readings."""
