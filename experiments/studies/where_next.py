@@ -29,7 +29,7 @@ SHARED = Path("..") / "shared" / "data"
 SETS = {"ble_flat": 100, "ble_tetam": 40}
 """Measured sets, and the number of random readings whose error the others have to reach."""
 BEGIN, ROUND, MOST = 5, 10, 145
-METHODS = ("random", "farthest", "expected error")
+METHODS = ("random", "farthest", "uncertain")
 _received = jax.jit(received_power)
 
 
@@ -64,7 +64,7 @@ def _farthest(
     return np.array(chosen)
 
 
-def _expected(
+def _uncertain(
     places: Float[np.ndarray, "p 3"],
     error: Float[np.ndarray, " p"],
     known: Int[np.ndarray, " m"],
@@ -74,7 +74,7 @@ def _expected(
     return left[choose_next_places(places[left], error[left], places[known], LENGTH, count).numbers]
 
 
-CHOOSE = dict(zip(METHODS, (_random, _farthest, _expected), strict=True))
+CHOOSE = dict(zip(METHODS, (_random, _farthest, _uncertain), strict=True))
 
 
 def readings_for(error: float, curve: dict[int, float]) -> float:
