@@ -285,7 +285,7 @@ def _name_axes(axes: Iterable[Axes], x: str, y: str) -> None:
 
 def _clipped(values: Float[np.ndarray, "*shape"], vmin: float, vmax: float) -> Any:
     """Returns at which ends a colour bar needs an arrow, because values lie beyond it."""
-    below, above = bool(np.nanmin(values) < vmin), bool(np.nanmax(values) > vmax)
+    below, above = bool((values < vmin).any()), bool((values > vmax).any())
     return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[below, above]
 
 
@@ -487,13 +487,16 @@ def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray,
     figure = Figure(figsize=(1.5 + 6 * columns, 0.8 + rows * (0.5 + 6 * min(ratio, 2.0))), layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     span = {"vmin": -180.0, "vmax": 180.0} if what == "best-beam" else _span(values)
+    colors: Any = quantity.colors
     if what == "best-server":  # a colour of the map for each
-        span = {"vmin": -0.5, "vmax": colormaps[quantity.colors].N - 0.5}
+        colors = colormaps[quantity.colors]
+        colors = colors if len(stars) <= colors.N else colormaps["turbo"].resampled(len(stars))
+        span = {"vmin": -0.5, "vmax": colors.N - 0.5}
     for i, axis in enumerate(axes.flat):
         if i >= len(values):
             axis.axis("off")
             continue
-        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=quantity.colors, aspect="equal", **span)
+        shown = axis.imshow(values[i], extent=extent, origin="lower", cmap=colors, aspect="equal", **span)
         axis.add_collection(LineCollection(list(walls), colors="black", linewidths=0.8))
         axis.plot(*stars[:, :2].T, **STAR | {"label": "transmitters" if network else "receiver"})
         axis.set(xlim=extent[:2], ylim=extent[2:])
@@ -540,7 +543,7 @@ def _drawn(quantity: Quantity, answer: dict[str, np.ndarray]) -> Float[np.ndarra
 
 def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
     """Returns colour limits that exclude the lowest and the highest hundredth of the values."""
-    low, high = np.nanquantile(values, [0.01, 0.99])
+    low, high = np.nanquantile(values, [0.01, 0.99]) if np.isfinite(values).any() else (0.0, 1.0)
     return {"vmin": float(low), "vmax": float(high)}
 
 

@@ -91,7 +91,7 @@ def readings_for(error: float, curve: dict[int, float]) -> float:
 
 
 def account(name: str, seeds: int) -> dict[str, Any]:
-    """Returns the mean curves of a set over seeds, with standard errors, and the readings that each method needs."""
+    """Returns the mean curves of a set over seeds, with standard deviations, and the readings that each method needs."""
     folder = SHARED / name
     cells, _ = measure.means(load_readings(folder, measure.Command.height), measure.Command.cell)
     walls = measure.walls_of(measure.Command(data=folder))

@@ -1,5 +1,7 @@
 """Antennas are placed where closed forms say; powers with the ends exchanged are powers; aims."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
+from wbgs_jax.radio.antenna import upright
 
 HZ = 2.4e9
 BOX = np.array([[0.5, -1.0, 0.9], [3.5, 1.0, 1.1]])
@@ -51,6 +54,15 @@ def test_in_free_space_powers_and_their_slopes_are_those_of_friis(air, rng):
     found, slope = jax.jit(jax.value_and_grad(lambda x: powers(x[None], 0.0)[0, 0]))(jnp.asarray(place))
     assert float(found) == pytest.approx(friis(distance), abs=0.02)
     np.testing.assert_allclose(slope, -20 / np.log(10) * away / distance**2, atol=0.02)
+
+
+@pytest.mark.heavy
+def test_users_are_isotropic_whatever_the_elements_of_the_data_are(air):
+    field, params = air
+    place = np.array([[1.0, 0.5, 1.2], [-1.0, 0.5, 1.2]])
+    directional = dataclasses.replace(params, element=upright(jnp.array([2.0, 1.0])))
+    isotropic = power_at_users(field, params, [0.0, 0.0, 1.0], HZ)(place, 0.0)
+    np.testing.assert_allclose(power_at_users(field, directional, [0.0, 0.0, 1.0], HZ)(place, 0.0), isotropic, atol=1e-4)
 
 
 @pytest.mark.heavy

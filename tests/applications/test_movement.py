@@ -25,6 +25,7 @@ from wbgs_jax.fields.coherent import channels
 from wbgs_jax.fields.coherent_model import moved_plan
 from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.propagation.mechanisms import sizes_of, trace_paths
+from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import make_query, make_receiver
 
 HZ = 60e9
@@ -169,9 +170,23 @@ def test_a_person_is_a_closed_body_with_its_measures():
     np.testing.assert_allclose(corners.mean(0), [1, 2, 0.5 + 0.875], atol=1e-12)
 
 
+def test_a_body_is_as_thick_as_its_smallest_width_however_it_is_turned():
+    field, params, _ = field_of([box((0, 0, 0), (1, 1, 1))], (3, 0, 0), **SMALL)
+    bodies = [add_body(field, params, person([2.0, 2.0, 0.0], azimuth=angle))[0] for angle in (0.0, np.pi / 4, 1.2)]
+    thickness = [float(own.known_thickness[-1]) for own in bodies]
+    np.testing.assert_allclose(thickness, thickness[0], rtol=1e-5)
+
+
+@pytest.mark.heavy
+def test_bodies_of_the_default_field_move_too():
+    field = load_trained().field
+    motion = make_movement(field, 3, {0: np.ones((3, 3))})
+    np.testing.assert_array_equal(motion.shift[:, 0], 1)
+
+
 def test_what_cannot_move():
     field, params, _ = field_of([box((0, 0, 0), (1, 1, 1))], (3, 0, 0), **SMALL)
-    with pytest.raises(ValueError, match="body 1 of 1"):
+    with pytest.raises(ValueError, match="no body 1; the field has 1"):
         make_movement(field, 4, {1: np.zeros((4, 3))})
     with pytest.raises(ValueError, match=r"expected \(4, 3\)"):
         make_movement(field, 4, {0: np.zeros((3, 3))})

@@ -49,6 +49,7 @@ def test_the_truth_scores_one_and_others_what_the_metric_gives(tmp_path, dataset
         ({"spectra": np.zeros(3)}, "has none of the arrays pas, snapshots, power_db"),
         ({"pas": np.zeros((2, 90, 360))}, "pas of {} has shape (2, 90, 360); the 6 test links need (6, 90, 360)"),
         ({"pas": np.full((N, 90, 360), 255.0)}, "lies within 255 to 255; give amplitudes from 0 to 1"),
+        ({"pas": np.full((N, 90, 360), "a")}, "pas of {} has the type <U1; give real numbers"),
         ({"power_db": np.full(N, np.nan)}, "contains NaN or infinity"),
     ],
 )

@@ -36,6 +36,8 @@ def test_a_trained_field_expects_errors_where_it_was_not_trained(tmp_path):
         (["--data", "DATA", "--example"], "takes the place of a trained field"),
         (["--data", "DATA"], "give the places that can be measured"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 0], "--count 0 is not a number of places"),
+        (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--start", "door"], "--start door is not a position"),
+        (["--example", "--grid", "0,0,1:1,1,1:2x2x1", "--ghz", "0.5"], "--ghz 0.5 lies outside of the trained band"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--count", 9], "are fewer than --count 9"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:200x200x1"], "are too many; at most 4,000"),
         (["--data", "DATA", "--grid", "0,0,1:1,1,1:2x2x1", "--length", -1], "--length -1 is not a distance"),

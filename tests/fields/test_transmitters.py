@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.rooms import field_of, room
+from builders.untrained import make_field, make_params
 from scipy.spatial.transform import Rotation
 
-from wbgs_jax.fields.base import received_dbm
+from wbgs_jax.fields.base import pas, received_dbm
 from wbgs_jax.radio.antenna import Antenna, tabulated
-from wbgs_jax.types import Query, Transmitter, check_query, make_query
+from wbgs_jax.types import Query, Transmitter, check_query, make_query, make_receiver
 
 TX = np.array([[4.0, 2.5, 1.4], [2.0, 3.0, 2.0]])
 HZ = 3e9
@@ -87,6 +88,15 @@ def test_wrong_shapes_of_properties_are_named(name, values):
     object.__setattr__(query, "transmitter", transmitter)
     with pytest.raises(ValueError, match=f"transmitter.{name}"):
         check_query(query)
+
+
+def test_frequencies_in_gigahertz_are_refused_outside_of_jit():
+    """Inside, where spectra are compiled, there are no values to check."""
+    query = make_query(TX, HZ)
+    wrong = dataclasses.replace(query, frequency_hz=query.frequency_hz / 1e9)
+    receiver = make_receiver([0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match="are in hertz"):
+        pas(make_field(), make_params(), receiver, wrong)
 
 
 def test_two_polarisations_at_both_ends(setup):

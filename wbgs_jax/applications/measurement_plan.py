@@ -85,6 +85,8 @@ def walking_order(places: Float[np.ndarray, "n 3"], start: Float[np.ndarray, "3"
     Returns:
         Indices of the places, in order.
     """
+    if not len(places):
+        return np.zeros(0, int)
     points = places if start is None else np.concatenate([start[None], places])
     distance = cdist(points, points)
     order, left = [0], set(range(1, len(points)))

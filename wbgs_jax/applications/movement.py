@@ -61,7 +61,7 @@ def add_body(
 ) -> tuple[Field, Params, int]:
     """Returns a field with paths, its parameters and the number of a convex body that is added to it.
 
-    Its two sides are slabs of half its smallest extent each, so that a wave that crosses it crosses all of its material.
+    Its two sides are slabs of half its smallest width each, so that a wave that crosses it crosses all of its material.
 
     Args:
         field, params: a trained field, of which the receiver-independent part is used.
@@ -80,7 +80,7 @@ def add_body(
     if np.linalg.matrix_rank(points - points.mean(0), tol=1e-4) < 3:
         raise UserError("the corners of the body lie in one plane; give at least four corners that span a volume, in metres")
     hull = trimesh.Trimesh(points, process=False).convex_hull
-    one, thickness = np.zeros(len(hull.faces), np.int32), np.array([np.ptp(points, axis=0).min() / 2])
+    one, thickness = np.zeros(len(hull.faces), np.int32), np.array([np.ptp(points @ hull.face_normals.T, axis=0).min() / 2])
     mesh = Mesh(*(jnp.asarray(a) for a in (np.float32(hull.vertices), np.int32(hull.faces), one, one, np.float32(thickness))))
     material = MaterialProperties(np.array([permittivity]), np.array([conductivity]), np.zeros(1), thickness)
     field, params = field.with_body(params, facets_from_mesh(mesh), material)
@@ -119,13 +119,16 @@ def make_movement(
     Raises:
         ValueError: a body that the field does not have, or an array of another shape.
     """
-    bodies = len(field.motion.shift) if isinstance(field, Calibratable) else 0
+    own = field.ability(Calibratable)
+    bodies = 0 if own is None else len(own.field.motion.shift)
 
     def of_all(some: Mapping[int, Any] | None) -> Float[np.ndarray, "t m 3"]:
         rows = np.zeros((instants, bodies, 3), np.float32)
         for number, values in (some or {}).items():
-            if not 0 <= number < bodies or np.shape(values) != (instants, 3):
-                raise ValueError(f"body {number} of {bodies} with an array {np.shape(values)}; expected ({instants}, 3)")
+            if not 0 <= number < bodies:
+                raise ValueError(f"there is no body {number}; the field has {bodies}")
+            if np.shape(values) != (instants, 3):
+                raise ValueError(f"displacements of body {number} have shape {np.shape(values)}; expected ({instants}, 3)")
             rows[:, number] = values
         return rows
 
@@ -179,17 +182,18 @@ def paths_over_time(params: Any, plan: WavePlan, query: Query, motion: Motion) -
 def doppler_spectrogram(
     response: Complex[Array, " t"], rate_hz: float, window: int = 128
 ) -> tuple[Float[Array, " f"], Float[Array, " s"], Float[Array, "f s"]]:
-    """Returns the short-time Doppler spectrum of a channel: the power density over Doppler shift and time.
+    """Returns the short-time Doppler spectrum of a channel: the power over Doppler shift and time.
 
     Args:
         response: the channel at one frequency over time.
         rate_hz: samples per second.
-        window: samples of a Hann window; neighbouring ones overlap by three quarters.
+        window: samples of a Hann window, at most those of the response; neighbouring ones overlap by three quarters.
 
     Returns:
         Doppler shifts (f,), hertz, ascending, positive where paths get shorter; times (s,), seconds; decibels (f, s). The mean
         of the powers over time is the Doppler spectrum (Welch 1967).
     """
+    window = min(window, len(response))
     hertz, seconds, found = jax.scipy.signal.stft(
         response, rate_hz, nperseg=window, noverlap=window - window // 4, return_onesided=False, boundary=None, padded=False
     )

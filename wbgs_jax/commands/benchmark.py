@@ -116,6 +116,9 @@ def read_predictions(path: Path, dataset: "Dataset") -> dict[str, np.ndarray]:
     for name, values in arrays.items():
         if values.shape != shapes[name]:
             raise UserError(f"{name} of {path} has shape {values.shape}; the {n} test links need {shapes[name]}")
+        kinds, numbers = ("fiuc", "complex") if name == "snapshots" else ("fiu", "real")
+        if values.dtype.kind not in kinds:
+            raise UserError(f"{name} of {path} has the type {values.dtype}; give {numbers} numbers")
         if not np.isfinite(values).all():
             raise UserError(f"{name} of {path} contains NaN or infinity; predict every test link")
     pas = arrays.get("pas")

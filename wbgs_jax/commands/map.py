@@ -109,10 +109,12 @@ def _check_network(command: Command) -> None:
     if command.tx and command.rx:
         raise UserError("--tx maps over all receivers of the plane; omit --rx")
     for option, values in {"power-dbm": command.power_dbm, "load": command.load}.items():
-        if len(values) not in (1, max(len(command.tx), 1)) or not np.isfinite(values).all():
+        if len(values) not in (1, max(len(command.tx), 1)):
             raise UserError(
                 f"--{option} has {len(values)} numbers for {len(command.tx)} transmitters; give one each or one for all"
             )
+        if not np.isfinite(values).all():
+            raise UserError(f"--{option} {' '.join(map(str, values))} is not finite; give numbers")
     if not all(0 <= load <= 1 for load in command.load):
         raise UserError(f"--load {' '.join(map(str, command.load))} is not an activity; give numbers from 0 to 1")
     if not (np.isfinite(command.bandwidth_mhz) and command.bandwidth_mhz > 0 and np.isfinite(command.noise_figure)):
@@ -145,11 +147,17 @@ def plane_of(command: Command, dataset: Any) -> Any:
 
 def at_transmitters(positions: Float[np.ndarray, "tx 3"], field: "LoadedField") -> "list[LoadedField]":
     """Returns a trained field at isotropic antennas in the places of transmitters, which receive there."""
+    from wbgs_jax.fields.calibratable import Calibratable
     from wbgs_jax.inference.trained_field import at_receiver
     from wbgs_jax.types import make_receiver
 
-    receivers = [make_receiver(position, element_positions=np.zeros((1, 3))) for position in positions]
-    return [replace(field, trained=at_receiver(field.trained, one, field.dataset), receiver=one) for one in receivers]
+    def at(receiver: Any) -> "LoadedField":
+        trained = at_receiver(field.trained, receiver, field.dataset)
+        if isinstance(trained.field, Calibratable):
+            trained = replace(trained, params=trained.field.with_isotropic_elements(trained.params))
+        return replace(field, trained=trained, receiver=receiver)
+
+    return [at(make_receiver(position, element_positions=np.zeros((1, 3)))) for position in positions]
 
 
 def make_maps(command: Command) -> None:

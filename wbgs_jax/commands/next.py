@@ -26,6 +26,10 @@ from wbgs_jax.inference import queries as parsing
 
 MOST = 4000
 """Maximum number of candidates."""
+MOST_CHOSEN = 200
+"""Maximum number of places that are chosen."""
+AT_ONCE = 128
+"""Candidates whose spectra are in memory together."""
 FREQUENCIES = 4
 """Number of training frequencies at which errors are expected, if none are given."""
 LENGTH = 3.0
@@ -79,8 +83,10 @@ def check(command: Command) -> None:
         _ = command.folder  # one is named
     if (command.candidates is None) == (not command.grid):
         raise UserError("give the places that can be measured: --candidates places.csv, or --grid FROM:TO:NXxNYxNZ")
-    if command.count < 1:
-        raise UserError(f"--count {command.count} is not a number of places; give at least 1")
+    if not 1 <= command.count <= MOST_CHOSEN:
+        raise UserError(f"--count {command.count} is not a number of places; give 1 to {MOST_CHOSEN}")
+    if command.start:
+        parse_vector(command.start, "--start", "position", "metres")
     if command.length is not None and not 0 < command.length < np.inf:
         raise UserError(f"--length {command.length:g} is not a distance; give metres")
     if command.data and (command.ghz or command.rx):
@@ -107,18 +113,21 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     given = parse_frequencies(command.ghz) if command.ghz else None
     loaded = load_field(command.folder, command.rx, None if given is None else float(given.min()))
     data, trained = loaded.dataset, loaded.trained
+    if given is not None and (beyond := given[np.asarray(loaded.domain.out_of_band(given))]).size:
+        raise UserError(f"--ghz {beyond[0] / 1e9:g} lies outside of the trained band, where no error is expected; omit it")
     learned = np.unique(data.frequencies_hz[data.train])
     some = np.unique(np.linspace(0, len(learned) - 1, min(FREQUENCIES, len(learned))).round().astype(int))
     frequencies_hz = learned[some] if given is None else given
     measured = np.unique(data.tx_positions[np.concatenate([data.train, data.validation])], axis=0)
     length = LENGTH * spacing(measured) if len(measured) > 1 else LENGTH
+    blocks = [places[start : start + AT_ONCE] for start in range(0, len(places), AT_ONCE)]
     if trained.intervals is not None:
-        ssim = loaded.evaluate("spectra", places, frequencies_hz)["expected"][..., 0]
-        return State(measured, np.mean(1 - ssim, -1), "SSIM", length)
+        ssim = [loaded.evaluate("spectra", block, frequencies_hz)["expected"][..., 0] for block in blocks]
+        return State(measured, np.mean(1 - np.concatenate(ssim), -1), "SSIM", length)
     if trained.power_intervals is not None:
-        error_db = loaded.evaluate("power", places, frequencies_hz)["expected_error_db"]
-        return State(measured, np.mean(error_db, -1), "dB", length)
-    say(f"{command.folder} has no prediction intervals, so that errors count the same everywhere")
+        error_db = [loaded.evaluate("power", block, frequencies_hz)["expected_error_db"] for block in blocks]
+        return State(measured, np.mean(np.concatenate(error_db), -1), "dB", length)
+    say("there are no prediction intervals at this receiver, so that errors count the same everywhere")
     allowed = np.where(np.asarray(loaded.domain.outside(places)), np.nan, 1.0)
     return State(measured, allowed, "(unknown)", length)
 

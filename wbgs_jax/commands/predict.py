@@ -106,10 +106,10 @@ def check(command: Command) -> None:
     check_suffixes(command, {"out": out, "picture": PICTURES, "export": (".zip",)})
     places = [name for name in ("tx", "line", "grid", "queries") if getattr(command, name)]
     bands = [name for name in ("ghz", "sweep", "queries") if getattr(command, name)]
-    asks, writes = bool(places or bands), bool(command.out or command.picture)
-    if not (asks or writes or command.export):
+    queried, writes = bool(places or bands), bool(command.out or command.picture)
+    if not (queried or writes or command.export):
         raise UserError("nothing to do; give --tx x,y,z --ghz 28 --out spectra.npz, or --export field.zip")
-    if (asks or writes) and not (places and bands and writes):
+    if (queried or writes) and not (places and bands and writes):
         raise UserError("predictions need all of --tx x,y,z, --ghz 28 and --out spectra.npz (or --picture spectra.png)")
     for several in (places, bands):
         if len(several) > 1:

@@ -416,7 +416,7 @@ def outputs_of(field: Field) -> tuple[Output, ...]:
     return tuple(output for output in field.outputs if output in predicted)
 
 
-def heard_alone(batch: Batch, seen: Observation) -> Batch:
+def without_unreceived(batch: Batch, seen: Observation) -> Batch:
     """Returns a batch with its all-zero spectra (nothing received) replaced by the predicted ones, so that they add no loss."""
     if batch.pas is None:
         return batch
@@ -491,6 +491,7 @@ def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity
     Returns:
         Spectra (b, 90, 360), amplitudes with a maximum of 1.
     """
+    check_query(query)
     return _spectra(field, params, field.plan(params, receiver, None, capacity), query)
 
 

@@ -111,5 +111,9 @@ class Calibratable(Field):
         """Returns the learned properties of the materials (host)."""
 
     @abstractmethod
+    def with_isotropic_elements(self, params: WaveParams) -> WaveParams:
+        """Returns parameters without the calibrated pattern of the data's receivers, for other antennas that receive."""
+
+    @abstractmethod
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
         """Returns the regularisation of its loss, which depends on the parameters only."""

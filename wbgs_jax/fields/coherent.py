@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
 from wbgs_jax._util.pytree import pytree, replaced, static, to_device
-from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, heard_alone, register
+from wbgs_jax.fields.base import Aux, Group, Inspection, MaterialProperties, Observation, compare, register, without_unreceived
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import (
     Materials,
@@ -49,6 +49,7 @@ from wbgs_jax.propagation.absorption import Grid, grid_around
 from wbgs_jax.propagation.displacement import Motion, still
 from wbgs_jax.propagation.image_method import ImageTree, make_image_tree
 from wbgs_jax.propagation.moving_tree import tree_over_time
+from wbgs_jax.radio.antenna import upright
 from wbgs_jax.radio.array import LagBasis, make_lag_basis
 from wbgs_jax.radio.channel import Paths
 from wbgs_jax.radio.geometry import turned
@@ -78,7 +79,7 @@ EXACT_PLACE = float(np.log(1e-6))
 """Logarithm of the standard deviation (metres) of a position that is known."""
 SAME_PLACE_M = 1e-3
 """Distance, metres, below which two receiver positions count as the same."""
-_last: list[Any] = []
+_last: list[tuple[Any, ...]] = [()]
 """Facets, edges and settings of the last image tree, and the tree: `fields.pas` plans for the same receiver again and again."""
 
 
@@ -170,10 +171,13 @@ class WaveField(Calibratable):
         areas = (config.mirror_areas, config.mirror_area_after_edge, config.mirror_area_before_edge)
         position = np.asarray(receiver.position)
         made_for = self.facets, self.edges, (position.tobytes(), areas)
-        if not (_last and _last[0] is made_for[0] and _last[1] is made_for[1] and _last[2] == made_for[2]):
-            with jax.ensure_compile_time_eval():  # no tracers, which would outlive the trace
-                _last[:] = *made_for, make_image_tree(self.facets, self.edges, position, *areas, padded=True)
-        tree: ImageTree = _last[3]
+        last = _last[0]
+        if last and last[0] is made_for[0] and last[1] is made_for[1] and last[2] == made_for[2]:
+            known: ImageTree = last[3]
+            return known
+        with jax.ensure_compile_time_eval():  # no tracers, which would outlive the trace
+            tree = make_image_tree(self.facets, self.edges, position, *areas, padded=True)
+        _last[0] = *made_for, tree
         return tree
 
     def _as_found(self, receiver: Receiver) -> tuple[Receiver, Float[Array, "elements 2"] | None]:
@@ -223,7 +227,7 @@ class WaveField(Calibratable):
     def compared(self, params: WaveParams, seen: Observation, batch: Batch) -> tuple[Float[Array, ""], Aux]:
         """Returns the loss of predictions on a batch."""
         config = self.config
-        loss, aux = compare(seen, heard_alone(batch, seen), config.ssim_weight, config.ssim_stride)
+        loss, aux = compare(seen, without_unreceived(batch, seen), config.ssim_weight, config.ssim_stride)
         if seen.snapshots is not None and batch.snapshots is not None:
             correlation_loss, power_loss = snapshot_losses(seen.snapshots, batch.snapshots)
             loss += config.correlation_weight * correlation_loss + config.power_weight * power_loss
@@ -322,6 +326,10 @@ class WaveField(Calibratable):
         around = np.concatenate([np.asarray(self.facets.corners).reshape(-1, 3), np.asarray(self.receivers)])
         grid, shape = grid_around(around, self.config.clutter_cell, self.config.clutter_cells)
         return dataclasses.replace(self, grid=to_device(grid), first_clutter=transparent_grid(shape))
+
+    def with_isotropic_elements(self, params: WaveParams) -> WaveParams:
+        """Returns parameters without the calibrated pattern of the data's receivers, for other antennas that receive."""
+        return dataclasses.replace(params, element=upright(jnp.zeros(2, jnp.float32)))
 
     def material_properties(self, params: WaveParams) -> MaterialProperties:
         """Returns the learned properties of the materials (host)."""

@@ -136,7 +136,7 @@ class HybridField(Field):
         if self.wave is None:
             return self.wideband.render(params.wideband, plan.wideband, links)
         coherent = self.wave.render(params.wave, plan.wave, links)
-        pas, power_db, inputs = self._said(params, plan, links, coherent)
+        pas, power_db, inputs = self._predicted(params, plan, links, coherent)
         spectra, power = mixed(params.trust.spectra, inputs, pas), mixed(params.trust.power, inputs, power_db)
         return coherent._replace(pas=spectra, power_db=power, covariance=None)  # the covariance is of the coherent field only
 
@@ -145,7 +145,7 @@ class HybridField(Field):
     ) -> tuple[ExpertPredictions, ExpertPredictions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B links, and the features that their weights depend on; the
         scene must have a mesh."""
-        return self._said(params, plan, links, self.wave.render(params.wave, plan.wave, links))
+        return self._predicted(params, plan, links, self.wave.render(params.wave, plan.wave, links))
 
     def with_shares(
         self, params: HybridParams, spectra: Shares | None = None, power: Shares | None = None, floor: float = 0.0
@@ -154,7 +154,7 @@ class HybridField(Field):
         trust = Trust(spectra or params.trust.spectra, power or params.trust.power, jnp.asarray(floor, jnp.float32))
         return dataclasses.replace(params, trust=trust)
 
-    def _said(
+    def _predicted(
         self, params: HybridParams, plan: HybridPlan, query: Query, coherent: Observation
     ) -> tuple[ExpertPredictions, ExpertPredictions, Float[Array, "b features"]]:
         """Returns the experts' spectra and received powers (dB) of B queries, and the features that their weights depend on."""

@@ -334,7 +334,7 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
     field, which are free of noise, are significantly more similar to the observed ones with it.
 
     Args:
-        said: predictions of the experts; those of the splatting field include the floor.
+        predicted: predictions of the experts; those of the splatting field include the floor.
         observed: observed spectra.
         tx_index: their transmitters, which are the independent samples.
     """

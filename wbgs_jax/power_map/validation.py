@@ -49,7 +49,8 @@ class Score:
     controls_db: dict[str, float]
     """Mean absolute errors with the floor plan turned and mirrored; empty without one."""
     plan_helps: bool | None
-    """Whether the plan is better than all controls and than none, by more than `SURE` standard errors; None without one."""
+    """Whether the plan is better than all controls and than none, by more than `SURE` standard errors; None without a plan, and
+    for one that is the same turned and mirrored."""
 
 
 def scores(cells: Readings, walls: Walls) -> list[Score]:

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax.fields.base import compare, heard_alone
+from wbgs_jax.fields.base import compare, without_unreceived
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import centres
@@ -95,7 +95,7 @@ def _steps(
         seen_from = motion.of_receiver(batch.links.receiver_index[0])
         plan = field.displaced(field.plan(params, batch.receiver, prepared), seen_from)
         seen = field.render(params, plan, batch.links)
-        loss, _ = compare(seen, heard_alone(batch, seen))
+        loss, _ = compare(seen, without_unreceived(batch, seen))
         total = jax.tree.map(jnp.add, field.motion, motion)
         pulled = jax.tree.map(lambda stiffness, far: 0.5 * jnp.sum(stiffness * far**2), prior, total)
         return loss + field.penalty(params) + sum(jax.tree.leaves(pulled))

@@ -47,7 +47,7 @@ MOST = 512
 """Maximum number of rigid bodies that are tested, those with the largest facets."""
 CLOSELY = 32
 """Number of rigid bodies that are tested on all spectra: those without which the first few fit best."""
-BELIEVED = 0.1
+ACCURATE = 0.1
 """Displacement, in wavelengths, up to which a body fits better than none."""
 LEAST = 1e-3
 """Minimum gain (natural logarithm of the decorrelation) for the removal of a body."""
@@ -113,7 +113,7 @@ def _explained(params: WaveParams, problem: CalibrationProblem, config: Calibrat
 def absent_movers(params: WaveParams, problem: CalibrationProblem, config: CalibrationConfig) -> Int[np.ndarray, " k"]:
     """Returns the rigid bodies without which snapshots fit significantly better, each tested without the previous ones; never
     all bodies."""
-    highest = BELIEVED * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
+    highest = ACCURATE * SPEED_OF_LIGHT / max(config.geometry_width, 1e-9)
     low = problem.frequency_hz() <= highest
     if not low.any():
         return np.zeros(0, int)

@@ -37,7 +37,7 @@ MOST = 40
 """Maximum number of thicknesses per entry at the first frequency, in addition to sheets."""
 APART = 1.25
 """Minimum ratio of two successive frequencies."""
-BELIEVED = 0.1
+ACCURATE = 0.1
 """position_std, in wavelengths, beyond which phases contain no information about thicknesses."""
 FEWER = 3
 """A third of the first spectra (`thickness_glance`) is used to select the third of many slabs scored on all of them."""
@@ -109,7 +109,7 @@ def _sized(
 ) -> tuple[WaveParams, Likely]:
     """Returns parameters with materials and thicknesses estimated at successively higher frequencies, and the likely slabs."""
     materials, spread = np.flatnonzero(unknown).tolist(), float(jnp.exp(jnp.median(params.placement)))
-    first, *others = frequencies_to_look_at(problem.frequency_hz(), BELIEVED * SPEED_OF_LIGHT / spread)
+    first, *others = frequencies_to_look_at(problem.frequency_hz(), ACCURATE * SPEED_OF_LIGHT / spread)
     likely = dict(likely or {m: _all_slabs(first) for m in materials})
     score = problem.scores(config.thickness_spectra, compared, first)
     for _ in range(2):
