@@ -20,11 +20,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Key, PyTree
 
 from wbgs_jax._util.devices import is_first
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.fields import Field
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
 MARGIN = 2**16
@@ -70,7 +69,7 @@ def checkpoint_steps(folder: Path) -> list[int]:
     return sorted(int(entry.name) for entry in folder.iterdir() if entry.name.isdigit())
 
 
-def save(folder: Path, step: int, state: Any, field: Field, metadata: dict[str, Any], keep: int) -> None:
+def save(folder: Path, step: int, state: Any, field: PyTree, metadata: dict[str, Any], keep: int) -> None:
     """Writes a checkpoint, replacing one of the same step, and removes all but the newest `keep`. All processes call this with
     the same state; the first process writes.
 
