@@ -159,6 +159,7 @@ def test_maps_of_several_transmitters_are_those_of_each(runs, tmp_path):
     ("field", "arguments", "words"),
     [
         ("wave", ["--ghz", "28", "--what", "sinr", "--out", "OUT/a.npz"], ["--what sinr needs --tx"]),
+        ("wave", ["--ghz", "28", "--load", "0.5", "--out", "OUT/a.npz"], ["--load has no effect on --what power"]),
         ("wave", ["--ghz", "28", "--tx", "0,0,1", "--out", "OUT/a.npz"], ["--what power takes no --tx", "throughput"]),
         ("wave", ["--ghz", "28", *map(str, NETWORK), "--what", "rsrp", "--rx", "0", "--out", "OUT/a.npz"], ["omit --rx"]),
         ("wave", ["--ghz", "28", "--what", "sinr", "--tx", "0,0,1", "--load", "2", "--out", "OUT/a.npz"], ["--load 2"]),

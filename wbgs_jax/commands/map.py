@@ -106,6 +106,11 @@ def _check_network(command: Command) -> None:
         raise UserError(
             f"--what {command.what} {'needs' if not command.tx else 'takes no'} --tx x,y,z; it belongs to {several}"
         )
+    for name in ("power_dbm", "load", "bandwidth_mhz", "noise_figure"):
+        if not command.tx and getattr(command, name) != getattr(Command, name):
+            raise UserError(
+                f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {', '.join(NETWORK)}"
+            )
     if command.tx and command.rx:
         raise UserError("--tx maps over all receivers of the plane; omit --rx")
     for option, values in {"power-dbm": command.power_dbm, "load": command.load}.items():
