@@ -491,8 +491,9 @@ def pas(field: Field, params: Params, receiver: Receiver, query: Query, capacity
     Returns:
         Spectra (b, 90, 360), amplitudes with a maximum of 1.
     """
-    check_query(query)
-    return _spectra(field, params, field.plan(params, receiver, None, capacity), query)
+    plan, query = field.plan(params, receiver, None, capacity), jax.tree.map(jnp.asarray, query)
+    check_query(query)  # here: under `jit` there are no values to check
+    return _spectra(field, params, plan, query)
 
 
 @jax.jit
