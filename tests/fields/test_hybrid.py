@@ -132,7 +132,7 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
         assert float(given.trust.floor) == 0  # or it would be found in what is left of it
         return said
 
-    monkeypatch.setattr(expert_weights, "opinions_on", opinions_without_floor)
+    monkeypatch.setattr(expert_weights, "expert_predictions_of", opinions_without_floor)
     monkeypatch.setattr(noise, "FEWEST_TX", 5)
     found, report = weighted(run, params, [batch])
     assert report["noise_floor"] == pytest.approx(float(found.trust.floor))
@@ -142,7 +142,7 @@ def test_noise_does_not_speak_against_the_coherent_field_and_is_not_said(run, rn
     assert float(again.trust.floor) == float(found.trust.floor)
     monkeypatch.setattr(expert_weights, "floor_of", lambda *_: 0.0)
     without, _ = weighted(run, params, [batch])
-    trusted, less = (report_of(p, said.told)["coherent"] for p in (found, without))
+    trusted, less = (report_of(p, said.features)["coherent"] for p in (found, without))
     assert trusted > less + 0.1  # the splatting one is as right here, but for the noise
 
 
@@ -181,7 +181,7 @@ def test_where_no_path_arrives_the_coherent_field_has_no_opinion(run):
     plan, query = run.field.plan(params, run.dataset.receiver()), run.dataset.query(index)
     coherent = run.field.wave.render(params.wave, plan.wave, query)
     silent = coherent._replace(power_db=coherent.power_db.at[0].set(-300.0), pas=coherent.pas.at[0].set(0))
-    spectra, powers, _ = run.field._said(params, plan, query, silent)
+    spectra, powers, _ = run.field._predicted(params, plan, query, silent)
     np.testing.assert_array_equal(powers.coherent[0], powers.own[0])
     np.testing.assert_array_equal(powers.coherent[1:], coherent.power_db[1:])
     np.testing.assert_array_equal(spectra.coherent[0], spectra.own[0])

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from wbgs_jax._util.checks import concrete
 from wbgs_jax._util.complex_math import phasor
 from wbgs_jax._util.pytree import pytree
 
@@ -303,9 +304,11 @@ def peak_direction_error(
     directions = jnp.asarray(_pas_directions().reshape(-1, 3))
     a, b = (directions[jnp.argmax(pas.reshape(*pas.shape[:-2], -1), -1)] for pas in (predicted, truth))
     if element_positions is not None:
-        centred = jnp.asarray(element_positions, a.dtype)
-        _, sizes, axes = jnp.linalg.svd(centred - centred.mean(0), full_matrices=True)
-        sizes = jnp.pad(sizes, (0, 3))[:3]
+        known = concrete(element_positions)  # then the host finds the axes: a compiled SVD differs from device to device
+        xp = jnp if known is None else np
+        centred = xp.asarray(element_positions if known is None else known, a.dtype)
+        _, sizes, axes = xp.linalg.svd(centred - centred.mean(0), full_matrices=True)
+        sizes = xp.pad(sizes, (0, 3))[:3]
         across = jnp.where((sizes <= FLAT * sizes[0])[:, None], axes, 0)  # the array does not resolve these components
         (p, q) = (jnp.matmul(direction, across.T, precision=EXACT) for direction in (a, b))
         length = jnp.linalg.norm(q, axis=-1, keepdims=True)
