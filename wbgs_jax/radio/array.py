@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from wbgs_jax._util.checks import concrete
 from wbgs_jax._util.complex_math import phasor
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import AnyArray, pytree
 
 PAS_HEIGHT, PAS_WIDTH = 90, 360
 PAS_SHAPE = (PAS_HEIGHT, PAS_WIDTH)
@@ -275,11 +275,10 @@ FLAT = 1e-4
 """Largest extent of an array across its plane or line, relative to its size."""
 
 
-@jax.jit
 def peak_direction_error(
-    predicted: Float[Array, "*b 90 360"],
-    truth: Float[Array, "*b 90 360"],
-    element_positions: Float[Array, "elements 3"] | None = None,
+    predicted: Float[AnyArray, "*b 90 360"],
+    truth: Float[AnyArray, "*b 90 360"],
+    element_positions: Float[AnyArray, "elements 3"] | None = None,
 ) -> Float[Array, "*b"]:
     """Returns the angle (degrees) between the strongest directions of predicted and true spectra.
 
@@ -301,15 +300,30 @@ def peak_direction_error(
         >>> [round(float(wb.radio.peak_direction_error(front, back, array))) for array in (None, wb.radio.planar_array())]
         [48, 0]
     """
+    across = None if element_positions is None else _not_resolved(element_positions)
+    return _peak_angle(predicted, truth, across)
+
+
+def _not_resolved(element_positions: Float[AnyArray, "elements 3"]) -> Float[AnyArray, "3 3"]:
+    """Returns the unit vectors, as rows, of the components of directions that an array does not resolve; zeros for the others.
+    The host finds them where positions are known, since a compiled SVD differs from device to device."""
+    known = concrete(element_positions)
+    xp, positions = (jnp, element_positions) if known is None else (np, known)
+    centred = positions - positions.mean(0)
+    _, sizes, axes = xp.linalg.svd(centred, full_matrices=True)
+    sizes = xp.pad(sizes, (0, 3))[:3]
+    return xp.where((sizes <= FLAT * sizes[0])[:, None], axes, 0)
+
+
+@jax.jit
+def _peak_angle(
+    predicted: Float[AnyArray, "*b 90 360"], truth: Float[AnyArray, "*b 90 360"], across: Float[AnyArray, "3 3"] | None
+) -> Float[Array, "*b"]:
+    """Returns the angle between strongest directions (degrees), up to the components that an array does not resolve."""
     directions = jnp.asarray(_pas_directions().reshape(-1, 3))
     a, b = (directions[jnp.argmax(pas.reshape(*pas.shape[:-2], -1), -1)] for pas in (predicted, truth))
-    if element_positions is not None:
-        known = concrete(element_positions)  # then the host finds the axes: a compiled SVD differs from device to device
-        xp = jnp if known is None else np
-        centred = xp.asarray(element_positions if known is None else known, a.dtype)
-        _, sizes, axes = xp.linalg.svd(centred - centred.mean(0), full_matrices=True)
-        sizes = xp.pad(sizes, (0, 3))[:3]
-        across = jnp.where((sizes <= FLAT * sizes[0])[:, None], axes, 0)  # the array does not resolve these components
+    if across is not None:
+        across = jnp.asarray(across, a.dtype)
         (p, q) = (jnp.matmul(direction, across.T, precision=EXACT) for direction in (a, b))
         length = jnp.linalg.norm(q, axis=-1, keepdims=True)
         turned = jnp.where(length > 0, q / jnp.where(length > 0, length, 1) * jnp.linalg.norm(p, axis=-1, keepdims=True), p)
