@@ -11,6 +11,8 @@ from builders.untrained import make_field, make_params
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.antenna_placement import mean_power, place_antenna, power_at_users, soft_minimum, tenth_percentile
+from wbgs_jax.applications.array_orientation import predict_isotropic_paths
+from wbgs_jax.applications.reflector import straight_powers
 from wbgs_jax.radio.antenna import upright
 
 HZ = 2.4e9
@@ -63,6 +65,10 @@ def test_users_are_isotropic_whatever_the_elements_of_the_data_are(air):
     directional = dataclasses.replace(params, element=upright(jnp.array([2.0, 1.0])))
     isotropic = power_at_users(field, params, [0.0, 0.0, 1.0], HZ)(place, 0.0)
     np.testing.assert_allclose(power_at_users(field, directional, [0.0, 0.0, 1.0], HZ)(place, 0.0), isotropic, atol=1e-4)
+    straight = [straight_powers(field, one, [[0.0, 0.0, 1.0]], HZ)(place) for one in (params, directional)]
+    np.testing.assert_allclose(straight[1], straight[0], atol=1e-4)
+    paths = [predict_isotropic_paths(field, one, [0.0, 0.0, 1.0], place, HZ) for one in (params, directional)]
+    np.testing.assert_allclose(paths[1].amplitude, paths[0].amplitude, atol=1e-9)
 
 
 @pytest.mark.heavy

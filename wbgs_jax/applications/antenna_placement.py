@@ -19,7 +19,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of
-from wbgs_jax.fields.calibratable import Calibratable
+from wbgs_jax.fields.calibratable import at_isotropic_antennas
 from wbgs_jax.types import Query, Transmitter, make_receiver
 
 Powers = Callable[[Any, Any], Float[Array, "k users"]]
@@ -95,11 +95,9 @@ def power_at_users(field: Field, params: Params, users: Any, frequencies_hz: Any
     Raises:
         UserError: the field predicts no power, or only at the receivers it was trained for.
     """
-    field, params = field.receiver_independent(params)
+    field, params = at_isotropic_antennas(field, params)
     if "power" not in outputs_of(field):
         raise UserError(f"the {field.name} field predicts only spectra, no power; train another field")
-    if isinstance(field, Calibratable):
-        params = field.with_isotropic_elements(params)
     one = np.zeros((1, 3))  # a single antenna
     places = np.atleast_2d(np.asarray(users, np.float32))
     plans = [field.plan(params, make_receiver(user, element_positions=one)) for user in places]

@@ -17,6 +17,7 @@ from wbgs_jax.applications.antenna_placement import soft_minimum
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
+from wbgs_jax.fields.calibratable import at_isotropic_antennas
 from wbgs_jax.radio.antenna import Antenna, pattern_exponents, zenith_vector
 from wbgs_jax.radio.array import squared_magnitude
 from wbgs_jax.radio.channel import Paths, decibels
@@ -65,7 +66,7 @@ def predict_isotropic_paths(field: Field, params: Params, receiver: Any, transmi
     """
     if "paths" not in outputs_of(field):
         raise UserError(f"the {field.name} field predicts no paths; train the default one on data with a mesh")
-    field, params = field.receiver_independent(params)
+    field, params = at_isotropic_antennas(field, params)
     plan = field.plan(params, make_receiver(receiver, element_positions=np.zeros((1, 3))))
     places = jnp.atleast_2d(jnp.asarray(transmitters, jnp.float32))
     return paths_of(field, params, plan, make_query(places, frequency_hz))

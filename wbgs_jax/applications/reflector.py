@@ -20,6 +20,7 @@ from wbgs_jax.applications.antenna_placement import NARROWEST_M, Powers, soft_mi
 from wbgs_jax.applications.multistart import Descended, best_apart, descend, grid_over, in_blocks, shrinking
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params, outputs_of, paths_of
+from wbgs_jax.fields.calibratable import at_isotropic_antennas
 from wbgs_jax.propagation.paths import is_vertex
 from wbgs_jax.radio.antenna import zenith_vector
 from wbgs_jax.radio.array import EXACT, SPEED_OF_LIGHT, squared_magnitude
@@ -168,7 +169,7 @@ def straight_powers(field: Field, params: Params, ends: Any, frequencies_hz: Any
     """
     if "paths" not in outputs_of(field):
         raise UserError(f"the {field.name} field predicts no paths; train the default one on data with a mesh")
-    field, params = field.receiver_independent(params)
+    field, params = at_isotropic_antennas(field, params)
     one = np.zeros((1, 3))  # a single antenna
     plans = [field.plan(params, make_receiver(end, element_positions=one)) for end in np.atleast_2d(ends)]
     frequencies = jnp.atleast_1d(jnp.asarray(frequencies_hz, jnp.float32))

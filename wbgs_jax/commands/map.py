@@ -101,16 +101,14 @@ def check(command: Command) -> None:
 
 
 def _check_network(command: Command) -> None:
+    several = ", ".join(NETWORK)
     if (command.what in NETWORK) != bool(command.tx):
-        several = ", ".join(NETWORK)
         raise UserError(
             f"--what {command.what} {'needs' if not command.tx else 'takes no'} --tx x,y,z; it belongs to {several}"
         )
     for name in ("power_dbm", "load", "bandwidth_mhz", "noise_figure"):
         if not command.tx and getattr(command, name) != getattr(Command, name):
-            raise UserError(
-                f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {', '.join(NETWORK)}"
-            )
+            raise UserError(f"--{name.replace('_', '-')} has no effect on --what {command.what}; it belongs to {several}")
     if command.tx and command.rx:
         raise UserError("--tx maps over all receivers of the plane; omit --rx")
     for option, values in {"power-dbm": command.power_dbm, "load": command.load}.items():
@@ -152,15 +150,14 @@ def plane_of(command: Command, dataset: Any) -> Any:
 
 def at_transmitters(positions: Float[np.ndarray, "tx 3"], field: "LoadedField") -> "list[LoadedField]":
     """Returns a trained field at isotropic antennas in the places of transmitters, which receive there."""
-    from wbgs_jax.fields.calibratable import Calibratable
+    from wbgs_jax.fields.calibratable import at_isotropic_antennas
     from wbgs_jax.inference.trained_field import at_receiver
     from wbgs_jax.types import make_receiver
 
     def at(receiver: Any) -> "LoadedField":
         trained = at_receiver(field.trained, receiver, field.dataset)
-        if isinstance(trained.field, Calibratable):
-            trained = replace(trained, params=trained.field.with_isotropic_elements(trained.params))
-        return replace(field, trained=trained, receiver=receiver)
+        own, params = at_isotropic_antennas(trained.field, trained.params)
+        return replace(field, trained=replace(trained, field=own, params=params), receiver=receiver)
 
     return [at(make_receiver(position, element_positions=np.zeros((1, 3)))) for position in positions]
 

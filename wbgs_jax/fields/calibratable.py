@@ -10,7 +10,7 @@ from abc import abstractmethod
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int, Key
 
-from wbgs_jax.fields.base import Field, MaterialProperties
+from wbgs_jax.fields.base import Field, MaterialProperties, Params
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams, WavePlan
 from wbgs_jax.fields.coherent_settings import WaveConfig
 from wbgs_jax.mesh.facets import AnyArray, Facets
@@ -117,3 +117,14 @@ class Calibratable(Field):
     @abstractmethod
     def penalty(self, params: WaveParams) -> Float[Array, ""]:
         """Returns the regularisation of its loss, which depends on the parameters only."""
+
+
+def at_isotropic_antennas(field: Field, params: Params) -> tuple[Field, Params]:
+    """Returns the receiver-independent part of a field, and its parameters for isotropic antennas that receive anywhere: those
+    without the calibrated pattern of the data's receivers.
+
+    Raises:
+        UserError: the field predicts only the receivers that it was trained with.
+    """
+    field, params = field.receiver_independent(params)
+    return field, field.with_isotropic_elements(params) if isinstance(field, Calibratable) else params
