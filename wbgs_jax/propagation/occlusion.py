@@ -83,22 +83,14 @@ def planes_of(facets: Facets) -> Float[np.ndarray, "5 4 f"]:
 def hierarchy_of(facets: Facets) -> FacetHierarchy:
     """Returns the hierarchy of facets (float64 and int32 NumPy arrays)."""
     corners = np.asarray(facets.corners, np.float64)
-    margin = MARGIN[0] + MARGIN[1] * np.abs(corners).max(initial=0)
-    lowest, highest = corners.min(1) - margin, corners.max(1) + margin
-    order = _clustered(np.concatenate([lowest, highest], 1), np.arange(len(corners)))
+    order = _clustered(np.concatenate([corners.min(1), corners.max(1)], 1), np.arange(len(corners)))
     blocks = max(-(-len(order) // (LEAF * WORD)), 1)
     there = np.arange(blocks * WORD * LEAF) < len(order)
     facet = np.append(order, np.zeros(len(there) - len(order), int)).astype(np.int32)
-
-    def boxes(size: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        own, some = facet.reshape(-1, size), there.reshape(-1, size, 1)
-        low, high = lowest[own].min(1, where=some, initial=FAR), highest[own].max(1, where=some, initial=-FAR)
-        return low, np.where(high < low, FAR, high)
-
     planes = np.where(there, planes_of(facets)[..., facet], np.array([0, 0, 0, NOWHERE])[:, None])
-    low, high = (np.pad(box, ((0, -blocks % WORD), (0, 0)), constant_values=FAR).T for box in boxes(WORD * LEAF))
-    leaf_low, leaf_high = (box.reshape(blocks, WORD, 3).swapaxes(1, 2) for box in boxes(LEAF))
-    return FacetHierarchy(low, high, leaf_low, leaf_high, planes.reshape(CORNERS + 1, 4, -1, LEAF), facet.reshape(-1, LEAF))
+    leaves = facet.reshape(-1, LEAF)
+    boxes = _boxes(corners, leaves, there.reshape(-1, LEAF), np)
+    return FacetHierarchy(*boxes, planes.reshape(CORNERS + 1, 4, -1, LEAF), leaves)
 
 
 def moved_hierarchy(
@@ -111,18 +103,26 @@ def moved_hierarchy(
         planes: where they are, in the order of `FacetHierarchy.planes`.
         corners: where they are, in the order of the facets.
     """
-    margin = MARGIN[0] + MARGIN[1] * jnp.max(jnp.abs(corners))
-    there = jnp.any(planes[0, :3] != 0, 0)[..., None]
-    own = corners[hierarchy.facet]
-    low = jnp.min(jnp.where(there, own.min(2) - margin, FAR), 1)
-    high = jnp.where(there.any(1), jnp.max(jnp.where(there, own.max(2) + margin, -FAR), 1), FAR)
-    leaf_low, leaf_high = (box.reshape(-1, WORD, 3).swapaxes(1, 2) for box in (low, high))
-    some = jnp.any(there.reshape(len(leaf_low), -1), 1)
-    beyond = jnp.where(there.any(1), high, -FAR).reshape(-1, WORD, 3).max(1)
-    blocks = low.reshape(-1, WORD, 3).min(1), jnp.where(some[:, None], beyond, FAR)
-    words = hierarchy.block_low.shape[1] - len(leaf_low)
-    block_low, block_high = (jnp.pad(box, ((0, words), (0, 0)), constant_values=FAR).T for box in blocks)
-    return FacetHierarchy(block_low, block_high, leaf_low, leaf_high, planes, hierarchy.facet)
+    there = jnp.any(planes[0, :3] != 0, 0)  # padding has no normal
+    return FacetHierarchy(*_boxes(corners, hierarchy.facet, there, jnp), planes, hierarchy.facet)
+
+
+def _boxes(
+    corners: Float[AnyArray, "f 4 3"], facet: Int[AnyArray, "leaves 8"], there: Bool[AnyArray, "leaves 8"], xp: Any
+) -> tuple[
+    Float[AnyArray, "3 words"], Float[AnyArray, "3 words"], Float[AnyArray, "blocks 3 32"], Float[AnyArray, "blocks 3 32"]
+]:
+    """Returns lowest and highest corners of blocks, then of leaves (`FacetHierarchy`). `there` excludes padding; `xp` is the
+    module of the arrays."""
+    margin, own, real = MARGIN[0] + MARGIN[1] * xp.max(xp.abs(corners)), corners[facet], there[..., None]
+    low = xp.where(real, own.min(2) - margin, FAR).min(1).reshape(-1, WORD, 3)
+    high = xp.where(real, own.max(2) + margin, -FAR).max(1).reshape(-1, WORD, 3)
+    both = (low.min(1), high.max(1)), (low, high)
+    of_blocks, of_leaves = ((lowest, xp.where(highest < lowest, FAR, highest)) for lowest, highest in both)  # padding: nowhere
+    missing = (0, -len(low) % WORD), (0, 0)
+    block_low, block_high = (xp.pad(box, missing, constant_values=FAR).T for box in of_blocks)
+    leaf_low, leaf_high = (box.swapaxes(1, 2) for box in of_leaves)
+    return block_low, block_high, leaf_low, leaf_high
 
 
 def _clustered(box: Float[np.ndarray, "f 6"], facet: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:

@@ -210,9 +210,7 @@ def _may_diffract_first(tx, tree: ImageTree, rows) -> Bool[Array, " c"]:
 
 def _may_diffract_last(tx, tree: ImageTree, pairs) -> Bool[Array, " c"]:
     """Returns the same for pairs of an edge and a mirror in front of it."""
-    mirror = pairs[:: tree.edges.length.size, 0]
-    normal, offset = tree.facets.normal[mirror], tree.facets.offset[mirror]
-    images = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
+    images = _images(tx, tree.facets, pairs[:: tree.edges.length.size, 0])
     source, goal = (about_edges(p, tree.edges) for p in (images.T[:, :, None], tree.receiver_position[:, None]))
     return _on_edge(source, goal, tree.edges.length).reshape(-1)
 
@@ -244,8 +242,7 @@ def _diffracted_then_mirrored(tx, tree: ImageTree, rows) -> Candidates:
 def _mirrored_then_diffracted(tx, tree: ImageTree, pairs) -> Candidates:
     """Returns one candidate per pair of an edge and a mirror in front of it."""
     facet, edge = jnp.moveaxis(pairs, -1, 0)
-    normal, offset = tree.facets.normal[facet], tree.facets.offset[facet]
-    image = tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - offset)[:, None] * normal
+    normal, offset, image = tree.facets.normal[facet], tree.facets.offset[facet], _images(tx, tree.facets, facet)
     point, strength = _diffracted(image, tree.receiver_position, edge, tree.edges)
     # Relative to the image, the point must lie behind the mirror: the wave runs from the transmitter to the point of
     # reflection.
@@ -253,6 +250,12 @@ def _mirrored_then_diffracted(tx, tree: ImageTree, pairs) -> Candidates:
     strength = jnp.where(valid & _inside(mirror, tree.half_planes, facet), strength * THROUGH, 0)
     vertices = [(mirror, facet, REFLECTED), (point, edge, DIFFRACTED)]
     return make_candidates(tx, tree.receiver_position, vertices, strength, edge.size)
+
+
+def _images(tx, facets: Facets, mirror: Int[Array, " c"]) -> Float[Array, "c 3"]:
+    """Returns the transmitter mirrored in the planes of facets."""
+    normal = facets.normal[mirror]
+    return tx - 2 * (jnp.matmul(normal, tx, precision=EXACT) - facets.offset[mirror])[:, None] * normal
 
 
 def make_candidates(tx, rx, vertices, score, count: int) -> Candidates:
