@@ -11,7 +11,7 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 # isort: split
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +100,7 @@ def score_scene(path: Path, dataset: "Dataset") -> dict[str, Any]:
         report |= score_snapshots(arrays["snapshots"], dataset.observations["snapshots"][index])
     pas = arrays["pas"] if "pas" in arrays else spectra(arrays["snapshots"], dataset, index) if "snapshots" in arrays else None
     if pas is not None:
-        report |= score_spectra(pas, dataset, index, reference)[0]
+        report |= score_spectra(pas, np.asarray(dataset.pas(index)), dataset, index, reference)[0]
     if "power_db" in arrays and (power := power_figures(arrays["power_db"], reference, index)):
         report |= {"power": power}
     return report
@@ -132,11 +132,9 @@ def read_predictions(path: Path, dataset: "Dataset") -> dict[str, np.ndarray]:
 
 def spectra(snapshots: np.ndarray, dataset: "Dataset", index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 90 360"]:
     """Returns the spectra of predicted snapshots, computed like those of the data."""
-    import dataclasses
-
     observed = np.array(dataset.observations["snapshots"])
     observed[index] = snapshots
-    predicted = dataclasses.replace(dataset, observations=dataset.observations | {"snapshots": observed})
+    predicted = replace(dataset, observations=dataset.observations | {"snapshots": observed})
     return np.asarray(predicted.pas(index))
 
 

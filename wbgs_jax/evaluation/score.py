@@ -237,11 +237,12 @@ def evaluate(
     own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
         return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
-    spectra, ssim = score_spectra(np.asarray(predictions.pas), dataset, index, reference)
+    truth = np.asarray(dataset.pas(index))
+    spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index, reference)
     report |= spectra
     noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
     if not np.array_equal(noisy, predictions.pas):
-        ssim = metrics.ssim(noisy, np.asarray(dataset.pas(index)))
+        ssim = metrics.ssim(noisy, truth)
         report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
     report |= own | ({"power": power} if power else {})
     intervals = trained.intervals
@@ -256,13 +257,18 @@ def evaluate(
 
 
 def score_spectra(
-    pas: Float[np.ndarray, "n 90 360"], dataset: Dataset, index: Int[np.ndarray, " n"], reference: Dataset
+    pas: Float[np.ndarray, "n 90 360"],
+    truth: Float[np.ndarray, "n 90 360"],
+    dataset: Dataset,
+    index: Int[np.ndarray, " n"],
+    reference: Dataset,
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """Returns the report of spectra predicted for links, with the baselines and the repeatability of the scene beside them, and
     the SSIM of each.
 
     Args:
         pas: predicted spectra.
+        truth: observed spectra.
         dataset: the data.
         index: indices of the links.
         reference: the same data, whose training links the baselines use.
@@ -270,7 +276,7 @@ def score_spectra(
     Raises:
         UserError: a prediction is NaN or infinite.
     """
-    truth, groups = np.asarray(dataset.pas(index)), (dataset.frequencies_hz[index], in_sight(dataset, index))
+    groups = dataset.frequencies_hz[index], in_sight(dataset, index)
     elements = dataset.receiver().element_positions
     figures = metrics.figures(pas, truth, elements)
     report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
