@@ -183,7 +183,17 @@ class OnAnyShape:
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 
 
-def observe_links(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+Advance = Callable[[int], None]
+"""Called with the number of links of every finished block."""
+
+
+def _unwatched(count: int) -> None:
+    """Ignores the progress."""
+
+
+def observe_links(
+    field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"], advance: Advance = _unwatched
+) -> Observation:
     """Returns the predictions of a field for links of a dataset, as NumPy arrays in their order.
 
     The field prepares the links once (`Field.prepare`); they are rendered in blocks of one shape, receiver by receiver. Every
@@ -199,6 +209,7 @@ def observe_links(field: Field, params: Params, dataset: Dataset, index: Int[np.
             known = devices.replicated((field, params, plan))
             for block, filled in _blocks(of_receiver, BLOCK * devices.count):
                 yield block, _observe(*known, None, _taken(links, filled), None, devices.mesh)
+                advance(len(block))
 
     return _gathered(answers(), len(index))
 
@@ -256,9 +267,11 @@ def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.
         yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
-def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+def observe(
+    trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"], advance: Advance = _unwatched
+) -> Observation:
     """Returns the same as `observe_links`, with spectra corrected by residual kriging or a mixture (one receiver only)."""
-    seen = observe_links(trained.field, trained.params, dataset, index)
+    seen = observe_links(trained.field, trained.params, dataset, index, advance)
     if dataset.n_receivers > 1:
         return seen
     neighbours = for_receiver(trained.correction, dataset.receiver())
