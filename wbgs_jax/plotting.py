@@ -472,6 +472,26 @@ SHOWN_MAPS = 6
 """Maximum number of frequencies in a plot."""
 
 
+def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], frequency_hz: float) -> Figure:
+    """Returns a figure of a channel over time (`applications.movement.channel_over_time`, with `time_s`): its power, and its
+    Doppler spectrogram from the strongest part down to `FADED_DB` below it."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    power = _amplitude_db(found["response"])
+    above.plot(found["time_s"], power, linewidth=1)
+    above.set_ylabel("received power [dB]", fontsize=9)
+    above.grid(alpha=0.3)
+    doppler = found["doppler_db"]
+    top = float(doppler.max())
+    bars = {"vmin": top - FADED_DB, "vmax": top}
+    shown = below.pcolormesh(found["doppler_time_s"], found["doppler_hz"], doppler, cmap=COLORS, shading="nearest", **bars)
+    below.set_xlabel("time [s]", fontsize=9)
+    below.set_ylabel("Doppler shift [Hz]", fontsize=9)
+    figure.colorbar(shown, ax=below, label="power [dB]", extend=_clipped(doppler, **bars))
+    figure.suptitle(f"{origin_words(source)}, {frequency_hz / 1e9:g} GHz", fontsize=9)
+    return figure
+
+
 def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
     """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts. Stars are the receiver
     or, for quantities of several transmitters, these. `source` is the provenance (`LoadedField.source`)."""
