@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from wbgs_jax import metrics
+from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
@@ -477,16 +478,12 @@ def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], fre
     Doppler spectrogram from the strongest part down to `FADED_DB` below it."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
-    power = _amplitude_db(found["response"])
-    above.plot(found["time_s"], power, linewidth=1)
-    above.set_ylabel("received power [dB]", fontsize=9)
-    above.grid(alpha=0.3)
+    above.plot(found["time_s"], _amplitude_db(found["response"]), linewidth=1)
+    above.set(ylabel="received power [dB]")
     doppler = found["doppler_db"]
-    top = float(doppler.max())
-    bars = {"vmin": top - FADED_DB, "vmax": top}
+    bars = {"vmin": float(doppler.max()) - FADED_DB, "vmax": float(doppler.max())}
     shown = below.pcolormesh(found["doppler_time_s"], found["doppler_hz"], doppler, cmap=COLORS, shading="nearest", **bars)
-    below.set_xlabel("time [s]", fontsize=9)
-    below.set_ylabel("Doppler shift [Hz]", fontsize=9)
+    below.set(xlabel="time [s]", ylabel="Doppler shift [Hz]")
     figure.colorbar(shown, ax=below, label="power [dB]", extend=_clipped(doppler, **bars))
     figure.suptitle(f"{origin_words(source)}, {frequency_hz / 1e9:g} GHz", fontsize=9)
     return figure
@@ -579,39 +576,25 @@ COLUMNS = 3
 
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
-    height = float(np.median(cells.places[:, 2]))
-    outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
+    height, places = float(np.median(cells.places[:, 2])), cells.places
+    outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), places[:, :2], cells.receivers[:, :2]])
     low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
     spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / PIXELS)))
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
-    powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
-    shown = min(SHOWN_RECEIVERS, len(cells.receivers))
-    columns, rows = min(COLUMNS, shown), -(-shown // COLUMNS)
-    size = (high - low) / max(high - low)
-    figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    span = {"vmin": float(powers[:, :shown].min()), "vmax": float(powers[:, :shown].max())}
-    for r, axis in enumerate(axes.flat):
-        if r >= shown:
-            axis.axis("off")
-            continue
-        extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
-        image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap="viridis", **span)
-        _plan(axis, walls, cells.places)
+    pixels = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1)
+    powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, AT_ONCE)
+    titles = [f"receiver {r + 1}" for r in range(min(SHOWN_RECEIVERS, len(cells.receivers)))]
+    width, depth = 4.1 * (high - low) / max(high - low)
+    figure, axes = _panels(titles, COLUMNS, (width, depth), sharex=True, sharey=True)
+    norm = Normalize(*np.quantile(powers[:, : len(axes)], (0, 1)))
+    extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
+    for r, axis in enumerate(axes):
+        image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap=COLORS, norm=norm)
+        for wall in np.asarray(walls.ends):
+            axis.plot(wall[:, 0], wall[:, 1], color="black", linewidth=1.2)
+        axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
         axis.plot(*cells.receivers[r, :2], **STAR)
-        axis.set_title(f"receiver {r + 1}", fontsize=10)
-    axes[0, 0].legend(fontsize=8, loc="upper right")
-    _name_axes(axes.flat, "x [m]", "y [m]")
+    axes[0].legend(fontsize=8, loc="upper right")
+    _name_axes(axes, "x [m]", "y [m]")
     figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
     return figure
-
-
-def _plan(axis: Axes, walls: Walls, places: Float[np.ndarray, "n 3"]) -> None:
-    for wall in np.asarray(walls.ends):
-        axis.plot(wall[:, 0], wall[:, 1], color="black", linewidth=1.2)
-    axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
-
-
-def _powers(learned: PowerMap, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n r"]:
-    blocks = np.array_split(places, -(-len(places) // AT_ONCE))
-    return np.concatenate([np.asarray(received_power(learned, jnp.asarray(block, jnp.float32))[0]) for block in blocks])
