@@ -173,6 +173,7 @@ def channels() -> list[Case]:
     return [
         of_paths("Paths.cfr", lambda own: own.cfr(offsets)),
         of_paths("Paths.taps", lambda own: own.taps(4e8, 0, 40)),
+        of_paths("cir_of_paths", lambda own: wb.interchange.cir_of_paths(own, wb.make_receiver([0.0, 0.0, 1.0]), 28e9)),
         of_paths("angular_spread_deg", wb.radio.angular_spread_deg),
         of_paths("delay_spread_s", wb.radio.delay_spread_s),
         of_paths("k_factor_db", wb.radio.k_factor_db),

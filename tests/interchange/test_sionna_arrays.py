@@ -3,14 +3,19 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.interchange.ray_paths import read_paths
-from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
+from wbgs_jax.interchange.sionna_arrays import cir_of_paths, scene_of_sionna
+from wbgs_jax.propagation.transport import snapshots_from_paths
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
+from wbgs_jax.radio.channel import Paths
+from wbgs_jax.types import make_receiver
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 FREQUENCY = 3.5e9
@@ -172,3 +177,27 @@ def test_against_sionnas_own_channels(mode):
     for ours, theirs in zip(scene.snapshots[:, 0, 0], own, strict=True):
         assert alike(ours, theirs) > 0.99999
     assert np.abs(np.angle(np.vdot(own, scene.snapshots[:, 0, 0]))) < 1e-3
+
+
+def test_impulse_responses_have_the_form_of_sionna_phy(rng):
+    """Axes are batch, receiver, antenna, transmitter, antenna, path, time; the sum over paths is the snapshot at the carrier,
+    and over a band the response is Sionna's sum of a exp(-2 pi j f tau)."""
+    towards = rng.normal(size=(2, 5, 3))
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    gain = rng.normal(size=(2, 5)) + 1j * rng.normal(size=(2, 5))
+    gain[1, 3:] = 0  # padding
+    arrays = np.complex64(gain), np.float32(towards), np.float32(rng.uniform(3, 30, (2, 5)))
+    paths, receiver = Paths(*map(jnp.asarray, arrays)), make_receiver(RX)
+    a, tau = (np.asarray(part) for part in cir_of_paths(paths, receiver, FREQUENCY))
+    elements = len(np.asarray(receiver.element_positions))
+    assert a.shape == (2, 1, elements, 1, 1, 5, 1) and tau.shape == (2, 1, 1, 5)
+    for link in range(2):
+        one = jax.tree.map(lambda leaf, link=link: leaf[link], paths)
+        snapshot = snapshots_from_paths(one, receiver, jnp.asarray(FREQUENCY))
+        np.testing.assert_allclose(a[link].sum(-2).ravel(), snapshot, atol=1e-5)
+    offsets = np.linspace(-1e7, 1e7, 9)
+    waves = np.exp(-2j * np.pi * offsets * tau[:, 0, 0, :, None])
+    steered = np.exp(2j * np.pi * towards @ np.asarray(receiver.element_positions)[0])
+    seen = np.einsum("bp,bpf->bf", a[:, 0, 0, 0, 0, :, 0], waves)
+    np.testing.assert_allclose(seen, np.einsum("bp,bpf->bf", gain * steered, waves), atol=2e-4)
+    assert (tau >= 0).all() and (tau[0].min() == 0) and (a[1, ..., 3:, :] == 0).all()

@@ -12,4 +12,5 @@ from .ray_paths import load_paths as load_paths
 from .ray_paths import save_paths as save_paths
 from .scenes import scene_of_paths as scene_of_paths
 from .scenes import scene_of_snapshots as scene_of_snapshots
+from .sionna_arrays import cir_of_paths as cir_of_paths
 from .sionna_arrays import scene_of_sionna as scene_of_sionna

@@ -1,4 +1,5 @@
-"""Array snapshots from paths of Sionna RT (`sionna.rt.Paths`), computed from Sionna's own coefficients.
+"""Array snapshots from paths of Sionna RT (`sionna.rt.Paths`), computed from Sionna's own coefficients, and impulse responses
+in the form of Sionna PHY.
 
 `a` has axes receivers, their antennas, transmitters, their antennas, paths. With a synthetic array all antennas of a device
 share its paths, and the coefficients contain the phases of the antenna positions; otherwise each antenna has paths of its own.
@@ -8,8 +9,10 @@ Antennas of two polarisations are ordered by polarisation.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Array, Complex, Float
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
@@ -27,7 +30,10 @@ from wbgs_jax.interchange.ray_paths import (
     places_of,
 )
 from wbgs_jax.interchange.scenes import scene_of_paths, scene_of_snapshots
+from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
+from wbgs_jax.radio.channel import Paths
+from wbgs_jax.types import Receiver
 
 DEFAULT = 4, 4
 """Rows and columns of the default array."""
@@ -50,6 +56,33 @@ class _Device(NamedTuple):
     place: Float[np.ndarray, "3"]
     orientation: Float[np.ndarray, "4"]
     elements: Float[np.ndarray, "e 3"]
+
+
+@jax.jit
+def cir_of_paths(
+    paths: Paths, receiver: Receiver, frequency_hz: Float[Array, ""] | float
+) -> tuple[Complex[Array, "b 1 elements 1 1 k 1"], Float[Array, "b 1 1 k"]]:
+    """Returns impulse responses as Sionna PHY's channel models and its `CIRDataset` have them, for one receiver with all of its
+    elements, one transmitter with one antenna, and one instant.
+
+    The coefficients contain the phase of the carrier over the whole length of a path, and delays count from the first path of a
+    link, as those of Sionna RT's `Paths.cir(normalize_delays=True)`.
+
+    Args:
+        paths: of B links at one receiver and one frequency (`predict_paths`).
+        receiver: the receiver.
+        frequency_hz: of the carrier.
+
+    Returns:
+        Coefficients `a` (B, 1, elements, 1, 1, k, 1), and 0 for padding; delays `tau` (B, 1, 1, k), seconds, and 0 for padding.
+
+    Example:
+        >>> a, tau = cir_of_paths(predict_paths(trained, receiver, places, 28e9), receiver, 28e9)  # doctest: +SKIP
+    """
+    hertz = jnp.asarray(frequency_hz, jnp.float32)
+    voltages = jax.vmap(lambda one: element_voltages(one, receiver, hertz))(jax.tree.map(jnp.asarray, paths))
+    _, delays = paths.cir()
+    return voltages.swapaxes(1, 2)[:, None, :, None, None, :, None], jnp.maximum(delays, 0)[:, None, None]
 
 
 def scene_of_sionna(
