@@ -67,6 +67,15 @@ def test_small_data_sets_get_fewer_steps():
     assert some == SETTINGS.optim.max_epochs * 1000 / SETTINGS.optim.batch and some % SETTINGS.loop.epoch_steps == 0
 
 
+def test_fields_with_paths_converge_sooner():
+    """Their share of the steps counts unless they predict no paths, the data are few, or more steps are demanded."""
+    own = get_field("hybrid").presets["cpu"]
+    assert [limit_steps(own, 10**6, no_paths).optim.steps for no_paths in (False, True)] == [1400, 2400]
+    assert limit_steps(own, 8).optim.steps == 1000
+    assert limit_steps(changed(own, {"optim": {"min_steps": 2400}}), 10**6).optim.steps == 2400
+    assert limit_steps(changed(own, {"optim": {"steps": 500}}), 10**6).optim.steps == 500
+
+
 @pytest.mark.parametrize(
     ("field", "section", "change", "message"),
     [

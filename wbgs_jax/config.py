@@ -60,6 +60,8 @@ class OptimConfig:
     """Maximum number of steps; see also `max_epochs`."""
     max_epochs: float = 16.0
     """Maximum number of passes over the training data, which limits the steps on small data sets (against overfitting) ..."""
+    share_with_paths: float = setting(1.0, before=1.0)
+    """... and the fraction of the steps that a field takes if it predicts paths, with which it converges sooner ..."""
     min_steps: int = 1000
     """... but at least this many steps are taken."""
     batch: int = 8
@@ -260,10 +262,11 @@ def changed(settings: Settings, changes: Mapping[str, Mapping[str, Any]]) -> Set
 
 def limit_steps(settings: Settings, n_train: int, no_paths: bool = False) -> Settings:
     """Returns settings with `optim.steps` limited for a data set of `n_train` spectra, a multiple of the epoch block. A field
-    that predicts no paths (`no_paths`) overfits to few spectra, and gets fewer steps for them."""
+    that predicts no paths (`no_paths`) needs all steps for many spectra, but overfits to few, and gets fewer steps for them."""
     optim, block = settings.optim, settings.loop.epoch_steps
     fewest = min(optim.min_steps, max(FEWEST_STEPS, STEPS_A_SPECTRUM * n_train)) if no_paths else optim.min_steps
-    wanted = max(fewest, optim.max_epochs * n_train / optim.batch)
+    most = optim.steps if no_paths else optim.share_with_paths * optim.steps
+    wanted = max(fewest, min(optim.max_epochs * n_train / optim.batch, most))
     steps = min(optim.steps, round(wanted / block) * block)
     return dataclasses.replace(settings, optim=dataclasses.replace(optim, steps=max(steps, block)))
 
@@ -280,6 +283,7 @@ def check(settings: Settings) -> None:
         "loop.keep-checkpoints": loop.keep_checkpoints,
     }
     check_positive(positive | ({"calibration.spectra": settings.calibration.spectra} if settings.calibration else {}))
+    check_share("optim.share-with-paths", optim.share_with_paths)
     if optim.steps % loop.epoch_steps:
         raise UserError(
             f"--optim.steps {optim.steps} is not a multiple of --loop.epoch-steps {loop.epoch_steps}; change one of them"

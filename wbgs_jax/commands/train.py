@@ -269,7 +269,8 @@ def _nothing(line: str) -> None:
 def opening_lines(folder: Path, config: RunConfig, steps: int, done: int) -> list[str]:
     """Returns lines with the expected duration of the remaining steps, `done` being complete, and the results folder."""
     field = get_field(config.field)
-    share = max(steps - done, 0) / field.presets[config.preset].optim.steps
+    usual = field.presets[config.preset].optim
+    share = max(steps - done, 0) / (usual.steps * usual.share_with_paths)
     seconds = expected_seconds(field, config.preset, share)
     lasts = "the lines below show the remaining time" if seconds is None else f"{duration_words(seconds)} on this machine"
     return [

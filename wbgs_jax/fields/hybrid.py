@@ -85,9 +85,15 @@ class HybridPlan:
     wideband: WidebandPlan
 
 
+SHARE_WITH_PATHS = {"cpu": 0.58}
+"""Fractions of the steps of the splatting field (`OptimConfig.share_with_paths`) that were found to suffice."""
+
+
 def _preset(name: str) -> Settings:
     wave, wideband = WaveField.presets[name], WidebandField.presets[name]
-    return dataclasses.replace(wideband, field=HybridConfig(wave.field, wideband.field), calibration=wave.calibration)
+    optim = dataclasses.replace(wideband.optim, share_with_paths=SHARE_WITH_PATHS.get(name, 1.0))
+    config = HybridConfig(wave.field, wideband.field)
+    return dataclasses.replace(wideband, field=config, optim=optim, calibration=wave.calibration)
 
 
 @register
