@@ -5,12 +5,15 @@ Files are written under a temporary name in the same folder and then renamed, so
 Array archives (.npz) may be damaged or not archives at all. Every error of NumPy, zipfile, zlib and Python's tokenizer about
 them becomes one `UserError`. Python objects are never unpickled, as this would run code from the file.
 
+A pytree of arrays is one archive of a run folder.
+
 YAML files are small and written by hand. Anything but plain data is rejected, such as aliases that expand to gigabytes or very
 deep nesting.
 """
 
 import contextlib
 import csv
+import dataclasses
 import errno
 import glob
 import io
@@ -20,14 +23,16 @@ import re
 import tempfile
 import time
 import zipfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import yaml
 
 from wbgs_jax._util.errors import UserError
+
+T = TypeVar("T")
 
 try:
     import fcntl
@@ -274,3 +279,41 @@ def read_yaml(path: Path) -> Any:
         return yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:  # ValueError: an invalid date
         raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); correct it") from error
+
+
+def write_tree(path: Path, tree: Any) -> None:
+    """Writes the arrays of a pytree under the names of its fields; None removes the file."""
+    if tree is None:
+        path.unlink(missing_ok=True)
+        return
+    arrays: dict[str, Any] = {f.name: np.asarray(getattr(tree, f.name)) for f in dataclasses.fields(tree)}
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def read_tree(path: Path, classes: Sequence[type[T]], without: str, before: Mapping[str, Any] | None = None) -> T | None:
+    """Returns the pytree stored in a file, in single precision or in the smaller type it was written in; None if there is no
+    file.
+
+    Args:
+        path: of the file.
+        classes: possible classes; the first one with the file's fields is used.
+        without: what removing the file means, for the message.
+        before: values of arrays that older files lack.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    advice = f"remove it to {without}, or train again"
+    arrays = {name: np.asarray(value) for name, value in (before or {}).items()} | read_arrays(path, "", advice)
+    fits = (cls for cls in classes if {f.name for f in dataclasses.fields(cls)} == arrays.keys())  # type: ignore[arg-type]
+    with told(str(path), advice):
+        return next(fits, classes[-1])(**{name: _in_memory(value) for name, value in arrays.items()})
+
+
+def _in_memory(value: np.ndarray) -> Any:
+    import jax.numpy as jnp  # imported here because commands read files without JAX
+
+    return jnp.asarray(value, value.dtype if value.dtype in (np.uint8, np.float16) else jnp.float32)  # images as stored

@@ -182,7 +182,7 @@ def take_in(command: Command) -> str:
 
 def take_room(command: Command) -> str:
     """Writes a room file from a model, lists its objects, and returns a line for the user."""
-    from wbgs_jax.data.room_file import save_room
+    from wbgs_jax.data.scene_file import save_room
     from wbgs_jax.interchange.rooms import describe_room, read_room, room_of
 
     assert command.model is not None, "checked"

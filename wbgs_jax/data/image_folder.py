@@ -37,8 +37,7 @@ from wbgs_jax._util.files import read_text, read_yaml, safe_name
 from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import materials_of, scene_dataset
-from wbgs_jax.data.room_file import Room, load_room
-from wbgs_jax.data.scene_file import SceneFile
+from wbgs_jax.data.scene_file import Room, SceneFile, load_room
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH

@@ -17,8 +17,7 @@ from jaxtyping import Bool, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
-from wbgs_jax.data.room_file import Room
-from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
+from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, Room, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers

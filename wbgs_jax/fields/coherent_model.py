@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.complex_math import phasor
-from wbgs_jax._util.pytree import pytree, same, static
+from wbgs_jax._util.pytree import map_blocks, pytree, same, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.coherent_settings import WaveConfig
 from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed

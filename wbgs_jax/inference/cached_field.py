@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.compilation import cache_folder, load_program, source_digest, trace_program
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, opened_archive
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.queries import Product, flatten

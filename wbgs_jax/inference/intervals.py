@@ -19,10 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from wbgs_jax._util.arrays import read_tree, write_tree
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.files import read_tree, write_tree
+from wbgs_jax._util.pytree import map_blocks, pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query, Transmitter

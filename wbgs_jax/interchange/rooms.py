@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.room_file import Room, load_room
+from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
 from wbgs_jax.mesh.importers import FileObject, read_objects
 from wbgs_jax.mesh.walls import walls_as_sheets

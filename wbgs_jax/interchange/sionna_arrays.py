@@ -13,8 +13,7 @@ from jaxtyping import Complex, Float
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.room_file import Room
-from wbgs_jax.data.scene_file import SceneFile
+from wbgs_jax.data.scene_file import Room, SceneFile
 from wbgs_jax.interchange.ray_paths import (
     ARRAYS,
     OF_PATHS,

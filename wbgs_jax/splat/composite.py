@@ -24,9 +24,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax._util.per_platform import per_platform
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
+from wbgs_jax.splat.per_platform import per_platform
 from wbgs_jax.splat.projection import footprint, mahalanobis2, windowed_exponential
 from wbgs_jax.splat.tiles import CHUNK, TileJobs, Tiling
 

@@ -3,7 +3,7 @@ batch; and the check that a field can be trained on it.
 
 Virtual links keep a field without paths from overfitting a few spectra (host). Between a small number of transmitters the
 predictions of such a field are arbitrary. Half of every batch are therefore links of virtual transmitters between and around
-the measured ones, with spectra from ordinary kriging (`inference.mixture`): the field starts from the kriged spectra, and
+the measured ones, with spectra from ordinary kriging (`inference.kriging`): the field starts from the kriged spectra, and
 varies as smoothly with the transmitter's position as they do.
 """
 

@@ -28,7 +28,7 @@ from wbgs_jax.data.splits import training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features
-from wbgs_jax.inference.mixture import Mixture
+from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.inference.predictor import as_observed, predict_spectra
 from wbgs_jax.training.batches import knows_no_paths
 from wbgs_jax.training.fit_intervals import confidence_of

@@ -125,7 +125,7 @@ def control_density(params: Params, statistics: DensityStatistics, config: Densi
     statistics = jax.tree.map(np.asarray, statistics)
     keep, clone, split = choose(gaussians, statistics, config)
     source, fresh = _sources(keep, clone, split)
-    edited = _edit(gaussians, statistics, source, clone, split, int(keep.sum()), rng)
+    edited = _edit(gaussians, statistics, source, clone, int(keep.sum()), rng)
     slots = len(gaussians.means)
     pad = grown_slots(slots, len(source), config.max_gaussians) - len(source)
     source, fresh = np.pad(source, (0, pad)), np.pad(fresh, (0, pad), constant_values=True)
@@ -190,7 +190,7 @@ def _sources(keep, clone, split) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray
 
 
 def _edit(
-    gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator
+    gaussians: Gaussians, statistics: DensityStatistics, source, clone, n_kept: int, rng: np.random.Generator
 ) -> Gaussians:
     """Returns the resulting Gaussians, without empty slots: clones are displaced downhill, and the halves of a split are drawn
     from the Gaussian that they replace."""

@@ -23,7 +23,7 @@ from scipy.special import expit, logit
 from wbgs_jax._util.statistics import by_transmitter, standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields.mixture import SHARES, score_at, similarity
-from wbgs_jax.inference.mixture import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled
+from wbgs_jax.inference.kriging import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled_distance
 from wbgs_jax.training.fit_kriging import spacing
 
 STRIDE = 8
@@ -195,7 +195,7 @@ def share_scores(
     """Returns the SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`), and the scaled logarithms of
     their distances to measured transmitters; `simple` and `distance` are results of `simple_answers`."""
     truth = np.asarray(dataset.pas(held.links))
-    return similarity(truth, held.pas, simple), np.asarray(scaled(mixture, jnp.asarray(distance)))
+    return similarity(truth, held.pas, simple), np.asarray(scaled_distance(mixture, jnp.asarray(distance)))
 
 
 def simple_answers(
@@ -227,7 +227,7 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
     mixture = dataclasses.replace(chosen, log_distance=range_)
     prior = jnp.asarray([[bias, 0.0] for bias in PRIOR], jnp.float32)
     ridge = jnp.asarray([[penalty, RIDGE_SLOPE] for penalty in RIDGE], jnp.float32) / len(np.unique(dataset.tx_index[index]))
-    logits = fit_weights(moments_of(spectra, truth), scaled(mixture, jnp.asarray(distance)), prior, ridge)
+    logits = fit_weights(moments_of(spectra, truth), scaled_distance(mixture, jnp.asarray(distance)), prior, ridge)
     mixture = dataclasses.replace(mixture, members=logits)
     used = np.asarray(member_weights(mixture, jnp.asarray(distance)))[:, MEMBERS.index("line_of_sight")]
     if used.max() < UNUSED:
@@ -363,7 +363,7 @@ def choose_share(
 
     Args:
         scores: SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`).
-        u: scaled logarithm of the distance to the nearest measured transmitter.
+        u: scaled_distance logarithm of the distance to the nearest measured transmitter.
         group: groups of links with correlated errors.
         errors: distance of the bound below the mean gain, in standard errors.
     """
