@@ -32,10 +32,6 @@ from wbgs_jax.radio.channel import NO_PATH_DB
 
 SHOWN = 6
 """Maximum number of spectra in a plot."""
-LONGEST_ARROW = 0.1
-"""Length of the longest arrow, relative to the scene's size."""
-DOTS = 110
-"""Pixels per inch."""
 SIZES = ("gaussians",)
 """Counts of a field that change during training."""
 
@@ -156,7 +152,8 @@ def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[
     colours = colormaps["viridis"](size / max(size.max(), 1e-9))
     different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # equal shifts: one rigid body
     centre = np.array([corners[body.reshape(-1) == k].mean((0, 1)) for k in range(len(different))])
-    longest = LONGEST_ARROW * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
+    longest_arrow = 0.1  # length of the longest arrow, relative to the scene's size
+    longest = longest_arrow * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
     for axis, (i, j), name in zip(axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         outlines = np.concatenate([corners, corners[:, :1]], 1)[..., [i, j]]
         axis.add_collection(LineCollection(list(outlines), colors=colours, linewidths=0.8))
@@ -192,13 +189,13 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure in the format that the suffix of the file names; returns the file."""
+    dots = 110  # pixels per inch
     with atomic_write(path) as stream:
-        figure.savefig(stream, format=path.suffix[1:], dpi=DOTS)
+        figure.savefig(stream, format=path.suffix[1:], dpi=dots)
     return path
 
 
 COLORS = "viridis"
-PATH_COLORS = "plasma"
 FADED_DB = 40.0
 """Paths and taps of impulse responses are drawn that are less than this below the strongest one."""
 STAR: dict[str, Any] = {
@@ -208,14 +205,6 @@ STAR: dict[str, Any] = {
     "markersize": 14,
     "linestyle": "none",
     "label": "receiver",
-}
-DISC: dict[str, Any] = {
-    "marker": "o",
-    "color": "white",
-    "markeredgecolor": "black",
-    "markersize": 7,
-    "linestyle": "none",
-    "label": "transmitter",
 }
 
 
@@ -323,8 +312,16 @@ def draw_paths(
     positions, frequencies = queries.flat()
     figure, axes = _panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
     figure.set_layout_engine("compressed")  # panels keep their aspect
-    shown = ScalarMappable(Normalize(-FADED_DB, 0), PATH_COLORS)
+    shown = ScalarMappable(Normalize(-FADED_DB, 0), "plasma")
     link = np.stack([found[name] for name in ("x", "y", "z", "frequency_ghz")], -1)
+    disc = {
+        "marker": "o",
+        "color": "white",
+        "markeredgecolor": "black",
+        "markersize": 7,
+        "linestyle": "none",
+        "label": "transmitter",
+    }
     for axis, place, hertz in zip(axes, positions, frequencies, strict=True):
         own = np.flatnonzero(np.isclose(link, [*place, hertz / 1e9]).all(-1))
         top = found["power_db"][own].max(initial=NO_PATH_DB)
@@ -334,7 +331,7 @@ def draw_paths(
         lines = list(found["points_m"][own[strong]][..., :2])
         axis.add_collection(LineCollection(lines, colors=shown.to_rgba(power[strong]), linewidths=1.0))
         axis.plot(*rx[:2], **STAR)
-        axis.plot(*place[:2], **DISC)
+        axis.plot(*place[:2], **disc)
         axis.set_aspect("equal")
         words = f"{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted" if len(own) else "no paths"
         axis.set_title(f"{axis.get_title()}\n{words}", fontsize=8)
@@ -549,11 +546,6 @@ def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
 
 SPACING, MARGIN = 0.1, 0.3
 """Pixel spacing and margin around the plan, metres."""
-PIXELS = 40_000
-"""Maximum number of pixels; the spacing grows for larger plans."""
-AT_ONCE = 2048
-SHOWN_RECEIVERS = 12
-"""Maximum number of receivers in a plot."""
 COLUMNS = 3
 
 
@@ -562,10 +554,12 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     height = float(np.median(cells.places[:, 2]))
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
     low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
-    spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / PIXELS)))
+    pixels = 40_000  # maximum number of pixels; the spacing grows for larger plans
+    spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / pixels)))
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
     powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
-    shown = min(SHOWN_RECEIVERS, len(cells.receivers))
+    shown_receivers = 12  # maximum number of receivers in a plot
+    shown = min(shown_receivers, len(cells.receivers))
     columns, rows = min(COLUMNS, shown), -(-shown // COLUMNS)
     size = (high - low) / max(high - low)
     figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
@@ -593,5 +587,5 @@ def _plan(axis: Axes, walls: Walls, places: Float[np.ndarray, "n 3"]) -> None:
 
 
 def _powers(learned: PowerMap, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n r"]:
-    blocks = np.array_split(places, -(-len(places) // AT_ONCE))
+    blocks = np.array_split(places, -(-len(places) // 2048))
     return np.concatenate([np.asarray(received_power(learned, jnp.asarray(block, jnp.float32))[0]) for block in blocks])

@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 
-FURTHEST = 1e5
-"""Metres, or metres per second: larger values are mistakes, and soon exceed single precision."""
 _default_format = warnings.formatwarning
 
 
@@ -84,8 +82,9 @@ def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "me
         values = np.array([float(part) for part in word.split(",")])
     except ValueError:
         values = np.zeros(0)
-    if len(values) != 3 or not (np.abs(values) <= FURTHEST).all():
-        raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
+    furthest = 1e5  # metres, or metres per second: larger values are mistakes, and soon exceed single precision
+    if len(values) != 3 or not (np.abs(values) <= furthest).all():
+        raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {furthest:g}")
     return values
 
 

@@ -20,8 +20,6 @@ MIN_SECONDS = 0.5
 MOST_BYTES = 2e9
 """Maximum size of the cache; beyond it the least recently used files are removed."""
 SOURCES = Path(__file__).parents[1]
-KERNEL_CALL = "__gpu$xla.gpu.triton"
-"""Custom call of the renderer's GPU kernels, whose stability JAX does not guarantee."""
 PROGRAMS = "programs"
 """Subfolder of the cache for traced programs."""
 
@@ -92,8 +90,9 @@ def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[A
     words = [source_digest(), jax.__version__, jax.default_backend(), structure, *(f"{s.dtype} {s.shape}" for s in shapes)]
     name = hashlib.sha256("\n".join(words).encode()).hexdigest()[:32]
     path = folder / PROGRAMS / f"{name}.bin"
+    kernel_call = "__gpu$xla.gpu.triton"  # custom call of the renderer's GPU kernels, whose stability JAX does not guarantee
     if not path.exists():
-        kernels = jax.export.DisabledSafetyCheck.custom_call(KERNEL_CALL)  # the file is used by one version of JAX only
+        kernels = jax.export.DisabledSafetyCheck.custom_call(kernel_call)  # the file is used by one version of JAX only
         exported = jax.export.export(jax.jit(function), disabled_checks=[kernels])(*shapes)
         with atomic_write(path) as stream:
             stream.write(exported.serialize())

@@ -41,8 +41,6 @@ except ImportError:  # on Windows, where stale files are not removed
 
 STALE_S = 5.0
 """Age in seconds from which temporary files may be left over from a killed process."""
-LONGEST_NAME = 100
-"""Characters: file systems allow 255, and endings are appended."""
 
 
 @contextlib.contextmanager
@@ -124,7 +122,8 @@ def read_text(path: Path) -> str:
 
 def safe_name(name: str) -> str:
     """Returns a name from data as a safe file name: only letters, digits, blanks and -+._, without dots at the ends."""
-    return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:LONGEST_NAME] or "data"
+    longest_name = 100  # characters: file systems allow 255, and endings are appended
+    return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:longest_name] or "data"
 
 
 def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:

@@ -34,8 +34,6 @@ SCENES = ("1", "2", "3", "4", "5", "6")
 """Released scenes of the benchmark; `python -m wbgs_jax` reads them as data sets of these names."""
 KINDS = ("pas", "snapshots", "power_db")
 """Arrays of which a file of predictions contains at least one."""
-ROUNDING = 1e-3
-"""Spectra are at most 1 up to this."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,8 @@ def read_predictions(path: Path, dataset: "Dataset") -> dict[str, np.ndarray]:
         if not np.isfinite(values).all():
             raise UserError(f"{name} of {path} contains NaN or infinity; predict every test link")
     pas = arrays.get("pas")
-    if pas is not None and not (pas.min() >= 0 and pas.max() <= 1 + ROUNDING):
+    rounding = 1e-3  # spectra are at most 1 up to this
+    if pas is not None and not (pas.min() >= 0 and pas.max() <= 1 + rounding):
         raise UserError(
             f"pas of {path} lies within {pas.min():.3g} to {pas.max():.3g}; give amplitudes from 0 to 1, divided by the "
             "maximum of each spectrum"

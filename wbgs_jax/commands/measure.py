@@ -39,9 +39,6 @@ from wbgs_jax.plotting import draw_power_maps, save
 from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_power
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
-BEYOND_M = 2.0
-"""Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
-the next building."""
 SUFFIXES = {"out": (".json",), "picture": PICTURES, "answers": (".csv",), "mesh": (".ply",)}
 
 
@@ -141,7 +138,10 @@ def measured_domain(cells: Readings, walls: Walls) -> Domain:
     ends = np.asarray(walls.ends).reshape(-1, 2)
     if len(ends):
         low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
-    return Domain("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
+    # Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room,
+    # not the next building.
+    beyond_m = 2.0
+    return Domain("the readings", np.stack([low, high]), (0.0, np.inf), beyond_m)
 
 
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:

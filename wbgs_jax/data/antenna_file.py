@@ -22,14 +22,8 @@ SUFFIXES = (".csv", ".msi", ".pln", ".npz")
 """Endings of pattern files."""
 COMPONENTS = ("theta_re", "theta_im", "phi_re", "phi_im")
 """Columns of a CSV file with fields instead of gains."""
-DIPOLE_DBI = 2.15
-"""Gain of a half-wave dipole, the reference of dBd."""
-LARGEST_DBI = 80.0
-"""Larger gains (dBi) are mistakes, such as powers instead of decibels."""
 REGULAR = 1e-3
 """Largest deviation of an angle from its regular grid, degrees."""
-MOST_ROWS = 1_000_000
-"""Largest number of directions: finer than half a degree."""
 CUT = 360
 """Angles of a cut in an MSI file, one per degree."""
 
@@ -72,6 +66,7 @@ def _read_csv(path: Path) -> Antenna:
     optional = ("phase_deg",) if "phase_deg" in names and "gain_dbi" in names else ()
     columns = [names.index(name) for name in (*needed, *optional)]
     table = []
+    most_rows = 1_000_000  # largest number of directions: finer than half a degree
     for row in rows:
         if not any(cell.strip() for cell in row):
             continue
@@ -79,8 +74,8 @@ def _read_csv(path: Path) -> Antenna:
             table.append([float(row[column]) for column in columns])
         except (ValueError, IndexError):
             raise UserError(f"line {rows.line_num} of {path} lacks a number; fill {', '.join(needed)}") from None
-        if len(table) > MOST_ROWS:
-            raise UserError(f"{path} has more than {MOST_ROWS:,} directions; give a coarser grid")
+        if len(table) > most_rows:
+            raise UserError(f"{path} has more than {most_rows:,} directions; give a coarser grid")
     found = np.array(table, np.float64).reshape(-1, len(columns))
     zenith = found[:, 1] if vertical == "zenith_deg" else 90 - found[:, 1]
     if "gain_dbi" in names:
@@ -112,8 +107,9 @@ def _read_archive(path: Path) -> Antenna:
 def _read_msi(path: Path) -> Antenna:
     lines = [line.split() for line in read_text(path).splitlines()]
     head = {words[0].upper(): words[1:] for words in lines if words and re.match("[A-Za-z]", words[0])}
+    dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
     try:
-        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else DIPOLE_DBI)
+        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else dipole_dbi)
         horizontal, vertical = (_cut(lines, name) for name in ("HORIZONTAL", "VERTICAL"))
     except (KeyError, IndexError, ValueError):
         raise UserError(
@@ -140,8 +136,9 @@ def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
 
 
 def _check_decibels(path: Path, values: Float[np.ndarray, " n"]) -> None:
-    if not (values < LARGEST_DBI).all():
-        raise UserError(f"{path} has gains beyond {LARGEST_DBI:g} dBi; give decibels relative to an isotropic antenna")
+    largest_dbi = 80.0  # larger gains (dBi) are mistakes, such as powers instead of decibels
+    if not (values < largest_dbi).all():
+        raise UserError(f"{path} has gains beyond {largest_dbi:g} dBi; give decibels relative to an isotropic antenna")
 
 
 def on_grid(

@@ -22,8 +22,6 @@ from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
 
-SURFACES = ("vertices", "faces", "face_part")
-
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
     """Returns the links of all datasets in order.
@@ -73,7 +71,8 @@ def _check_compatible(first: Dataset, other: Dataset) -> None:
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
         raise UserError(f"{where}: their arrays differ in the number or unit of their elements")
-    if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in SURFACES):
+    surfaces = ("vertices", "faces", "face_part")
+    if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in surfaces):
         raise UserError(f"{where}: their surfaces differ; give datasets of one scene")
 
 
@@ -112,8 +111,6 @@ KINDS = {
     **dict.fromkeys(MODELS, ("a model", "export it as glTF or OBJ; then " + ROOM)),
 }
 """Descriptions of other kinds of files by suffix, and how to use their content."""
-COLMAP = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
-"""Files in a folder of RF-3DGS with the cameras of its images."""
 
 
 def check_kind(path: Path) -> None:
@@ -123,7 +120,9 @@ def check_kind(path: Path) -> None:
         raise UserError(f"{path} is {kind[0]}, not a scene file; {kind[1]}")
     if not path.is_dir() or (path / "spectrum").exists():
         return
-    if any((path / name).exists() for name in COLMAP):
+    # Files in a folder of RF-3DGS with the cameras of its images.
+    colmap = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
+    if any((path / name).exists() for name in colmap):
         raise UserError(
             f"{path} is a folder of RF-3DGS: images from COLMAP cameras, without positions of transmitters; give "
             "spectrum/, tx_pos.csv and gateway_info.yml (docs/formats.md)"
@@ -135,8 +134,6 @@ def check_kind(path: Path) -> None:
         )
 
 
-DATA_VARIABLE = "WBGS_DATA"
-"""Environment variable: folder of scene files that replaces those released with the package."""
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
 
@@ -251,7 +248,8 @@ def _label(part: Any, number: int, name: str) -> tuple[str, float]:
 
 
 def _scene_folder() -> Path:
-    folder = os.environ.get(DATA_VARIABLE)
+    data_variable = "WBGS_DATA"  # environment variable: folder of scene files that replaces those released with the package
+    folder = os.environ.get(data_variable)
     return Path(folder) if folder else RELEASED
 
 

@@ -48,7 +48,6 @@ from wbgs_jax.data.tables import (
 
 RSSI, CSI = "gateway_rssi.csv", "csidata.npy"
 TRANSMITTERS, GATEWAYS = ("tx_pos.csv",), ("gateway_position.yml",)
-ANTENNAS = ("base-station.yml", "rx_positions.yml")
 NOT_RECEIVED = -100.0
 
 Powers = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n r"], Float[np.ndarray, "r 3"]]
@@ -66,12 +65,13 @@ def load_nerf2(folder: Path) -> Powers:
     Raises:
         UserError: a file is missing or damaged.
     """
+    antennas = ("base-station.yml", "rx_positions.yml")
     if (folder / RSSI).exists():
         source, listed = folder / RSSI, found(folder, GATEWAYS)
         names, receivers = _positions(listed)
         values = _rssi(source, names if names else len(receivers))
     else:
-        source, listed = folder / CSI, found(folder, ANTENNAS)
+        source, listed = folder / CSI, found(folder, antennas)
         (_, receivers), values = _positions(listed), _csi(source)
         if not (folder / TRANSMITTERS[0]).exists():
             raise UserError(
@@ -145,8 +145,6 @@ NAMES = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
 """Names of columns that may identify a receiver."""
 ROOMS = ("room", "floor", "storey", "level")
 """Names of columns that divide readings; those of floors require heights."""
-IGNORED = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
-"""Names of columns that are ignored."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +194,9 @@ def _load_tables(folder: Path, height: float) -> Readings:
     names, entries = read_table(of_receivers)
     receivers = numbers(of_receivers, names, entries, ["x", "y", "z"])
     header, rows = read_table(path)
-    powers = [name for name in header if name not in ("x", "y", "z", *ROOMS, *IGNORED)]
+    # Names of columns that are ignored.
+    ignored = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
+    powers = [name for name in header if name not in ("x", "y", "z", *ROOMS, *ignored)]
     if len(powers) != len(receivers):
         raise UserError(
             f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} has {len(receivers)} receivers; "

@@ -140,33 +140,6 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
     return values
 
 
-POWERS_DBM = (-200.0, 50.0)
-"""Range of plausible powers."""
-SENTINELS = (
-    0.0,
-    1.0,
-    100.0,
-    127.0,
-    255.0,
-    -100.0,
-    -110.0,
-    -120.0,
-    -127.0,
-    -128.0,
-    -140.0,
-    -150.0,
-    -174.0,
-    -199.0,
-    -200.0,
-    -999.0,
-)
-"""Numbers that devices write if they received nothing ..."""
-APART_DB = 8.0
-"""... if all other values are at least this far to one side of them ..."""
-OFTEN = 0.2
-"""... or if at least this fraction of the readings equals the lowest value."""
-FURTHEST = 1e4
-"""Largest coordinate, metres."""
 DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
 """Largest longitude and latitude; largest extent of a site in degrees; and minimum ratio of its distance from the origin to its
 extent."""
@@ -178,13 +151,34 @@ the distance to the nearest receiver (in metres) to the extent of such positions
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
     """Returns powers with NaN in place of numbers that mean "not received"; a warning names these numbers."""
     powers = np.where(np.isneginf(powers), np.nan, powers)
-    for number in SENTINELS:
+    # Numbers that devices write if they received nothing ...
+    sentinels = (
+        0.0,
+        1.0,
+        100.0,
+        127.0,
+        255.0,
+        -100.0,
+        -110.0,
+        -120.0,
+        -127.0,
+        -128.0,
+        -140.0,
+        -150.0,
+        -174.0,
+        -199.0,
+        -200.0,
+        -999.0,
+    )
+    apart_db = 8.0  # ... if all other values are at least this far to one side of them ...
+    often = 0.2  # ... or if at least this fraction of the readings equals the lowest value.
+    for number in sentinels:
         is_it = powers == number
         others = powers[~np.isnan(powers) & ~is_it]
         if not is_it.any() or not len(others):
             continue
-        apart = number > others.max() + APART_DB or number < others.min() - APART_DB
-        floor = number < others.min() and is_it.sum() >= OFTEN * len(others)
+        apart = number > others.max() + apart_db or number < others.min() - apart_db
+        floor = number < others.min() and is_it.sum() >= often * len(others)
         if apart or floor:
             share = is_it.sum() / powers.size
             warnings.warn(f"{where}: {number:g} is taken as not received ({100 * share:.0f} % of the powers)", stacklevel=2)
@@ -206,15 +200,17 @@ def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
         own = column[~np.isnan(column)]
         if len(own) >= FEWEST and own.min() >= 0:
             raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
-    if not ((received >= POWERS_DBM[0]) & (received <= POWERS_DBM[1])).all():
-        span = " to ".join(f"{power:g}" for power in POWERS_DBM)
+    powers_dbm = (-200.0, 50.0)  # range of plausible powers
+    if not ((received >= powers_dbm[0]) & (received <= powers_dbm[1])).all():
+        span = " to ".join(f"{power:g}" for power in powers_dbm)
         raise UserError(f"{where}: powers must be dBm, {span}; leave cells empty where nothing was received")
 
 
 def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
     """Raises a `UserError` for invalid positions."""
-    if not (np.abs(positions) < FURTHEST).all():
-        raise UserError(f"{what} must be coordinates in metres, each less than {FURTHEST:g} m from the origin")
+    furthest = 1e4  # largest coordinate, metres
+    if not (np.abs(positions) < furthest).all():
+        raise UserError(f"{what} must be coordinates in metres, each less than {furthest:g} m from the origin")
 
 
 def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:

@@ -43,9 +43,6 @@ from wbgs_jax.radio.channel import FAINTEST, Paths, added_powers, decibels
 from wbgs_jax.radio.geometry import quaternion_product, rotation_quaternion
 from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
-FAINTEST_SUM = 1e-12
-"""Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
-there is no spectrum."""
 DENSITIES_HZ = 1e9, 1e11
 """Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
 between, constant beyond."""
@@ -237,6 +234,10 @@ def path_covariances(
     transmitters (`WaveParams.placement`), scaled to a trace of 1, and the mean power received by an element."""
     spread = jnp.exp(params.placement)
 
+    # Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
+    # there is no spectrum.
+    faintest_sum = 1e-12
+
     def one(paths: TracedPaths, arrived: Paths, f: Float[Array, ""]) -> Any:
         strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude)))
         strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # no paths: 1 / FAINTEST^2 would overflow
@@ -247,7 +248,7 @@ def path_covariances(
             gains = element_gains(plan.array_gains)
             covariance = covariance * gains[:, None] * gains.conj()
         trace = jnp.trace(covariance).real
-        return covariance / jnp.maximum(trace, FAINTEST_SUM), trace / len(covariance) * strongest**2
+        return covariance / jnp.maximum(trace, faintest_sum), trace / len(covariance) * strongest**2
 
     found: Any = jax.vmap(one)(paths, arrived, frequency_hz)
     return found
@@ -335,10 +336,6 @@ def _corrections(params: WaveParams, paths: PathGeometry) -> Complex[Array, " k"
     return jnp.exp(total[:, 0] - losses + 1j * total[:, 1])
 
 
-TRACED_AT_ONCE = 16
-"""Number of transmitters that are traced together."""
-
-
 def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedPaths:
     """Returns the paths between the transmitters and receivers of links (host).
 
@@ -368,7 +365,8 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
 
 
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:
-    return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, TRACED_AT_ONCE)
+    traced_at_once = 16  # number of transmitters that are traced together
+    return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, traced_at_once)
 
 
 def _stacked(some: list[PathGeometry]) -> PathGeometry:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 MOST = 16
 """Maximum number of queries per call."""
-LARGEST = 200e6
-"""Maximum size of the stored arrays, bytes; reading more takes as long as preparing the receiver."""
 FOLDER = "ready"
 META = "meta"
 
@@ -117,7 +115,8 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
     names = frozen_outputs(trained, loaded.dataset)
     leaves, structure = jax.tree.flatten(freeze(trained, loaded.receiver))
     arrays = tuple(np.asarray(leaf) for leaf in leaves)
-    if sum(array.nbytes for array in arrays) > LARGEST:
+    largest = 200e6  # maximum size of the stored arrays, bytes; reading more takes as long as preparing the receiver
+    if sum(array.nbytes for array in arrays) > largest:
         return None
 
     def answer(*arrays: Any) -> dict[str, Any]:

@@ -30,8 +30,6 @@ MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
 LEVEL = 0.9
 """Nominal coverage of the intervals."""
-AT_ONCE = 16
-"""Number of predictions evaluated at a time."""
 AT_RECEIVER_M = 0.1
 """Distance up to which a transmitter counts as being at the receiver, where none can be measured and intervals do not hold."""
 POWER_MARGIN_DB = 0.1
@@ -217,7 +215,8 @@ def expect_many(
 
     rows = (pas, tx_position, frequency_hz, power_db)
     rows = jax.tree.map(lambda values: np.asarray(values, np.float32), rows)
-    found: Expected = map_blocks(of_block, rows, AT_ONCE, full=True)
+    at_once = 16  # number of predictions evaluated at a time
+    found: Expected = map_blocks(of_block, rows, at_once, full=True)
     return found
 
 

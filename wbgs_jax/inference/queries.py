@@ -24,8 +24,6 @@ AXES = "xyz"
 UNIT = "metres"
 SHOWN = 12
 """Maximum number of queries in a figure."""
-MOST_ELEMENTS = 1024
-"""Maximum number of elements of an array."""
 
 
 class Product(NamedTuple):
@@ -160,8 +158,9 @@ def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
     """Returns the numbers of rows and columns, parsed from "4x2"; anything else is a `UserError`."""
     found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
     rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
-    if not 0 < rows * columns <= MOST_ELEMENTS:
-        raise UserError(f"{option} {word} is not an array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
+    most_elements = 1024  # maximum number of elements of an array
+    if not 0 < rows * columns <= most_elements:
+        raise UserError(f"{option} {word} is not an array; give ROWSxCOLUMNS, such as 4x2, at most {most_elements} elements")
     return rows, columns
 
 

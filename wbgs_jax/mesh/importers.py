@@ -22,8 +22,6 @@ from wbgs_jax.types import LARGEST_COORDINATE_M
 
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 """Transform of a y-up file: (x, y, z) becomes (x, -z, y), as in Blender."""
-MERGE_DIGITS = 5
-"""Vertices that agree to this many decimal places, in metres, are merged."""
 OTHERS = {
     ".ifc": "a building model: export it as glTF, OBJ or scene.xml",
     ".dxf": "a drawing: export meshes, as OBJ",
@@ -114,7 +112,8 @@ def _clean(body: Body, turn: Float[np.ndarray, "4 4"], file: Path) -> trimesh.Tr
     if not np.isfinite(vertices).all():
         raise UserError(f"object {body.name!r} of {file} has vertex coordinates that are not finite; export it again")
     mesh = trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
-    mesh.merge_vertices(digits_vertex=MERGE_DIGITS)
+    merge_digits = 5  # vertices that agree to this many decimal places, in metres, are merged
+    mesh.merge_vertices(digits_vertex=merge_digits)
     mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
     return mesh

@@ -18,8 +18,6 @@ THICKNESS = 0.1
 """Metres: Sionna RT's default."""
 SECTIONS = 64
 """Number of segments that approximate a circle."""
-POINTS = ("point", "vector")
-"""Tags of positions: common usage, and Mitsuba's own."""
 MOVED = ("to_world", "toWorld")
 """Names of a shape's transform, since version 2 and before."""
 
@@ -136,7 +134,8 @@ def _value(shape: ET.Element, name: str, missing: float) -> float:
 
 
 def _point(shape: ET.Element, name: str, missing: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
-    found = next((one for one in shape if one.tag in POINTS and one.get("name") == name), None)
+    points = ("point", "vector")  # tags of positions: common usage, and Mitsuba's own
+    found = next((one for one in shape if one.tag in points and one.get("name") == name), None)
     return np.array(missing, np.float64) if found is None else np.array(_vector(found, 0.0))
 
 

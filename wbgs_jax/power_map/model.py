@@ -44,10 +44,6 @@ MIN_POWERS = 10
 LENGTH = 1.0
 """Correlation length of u and v, metres. It is not learned: the maximum-likelihood value in one room is longer and gives wrong
 predictions in the next."""
-LOOKED_AT = 400
-"""Positions of every receiver that are used to learn the scales."""
-WIDTH, STEPS = 0.5, 15
-"""Prior standard deviation of the logarithms of all scales, and the number of optimisation steps."""
 
 
 @dataclass(frozen=True)
@@ -195,15 +191,18 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
     received = np.isfinite(readings.powers)
     outwards = np.argsort(np.linalg.norm(readings.places - readings.places[0], axis=-1), kind="stable")
     chosen = []
+    looked_at = 400  # positions of every receiver that are used to learn the scales
     for r in range(len(readings.receivers)):
-        own = outwards[received[outwards, r]][:LOOKED_AT]
+        own = outwards[received[outwards, r]][:looked_at]
         close = alike(readings.places[own], readings.places[own])
         by_walls = close * np.outer(root_walls[own, r], root_walls[own, r])
         chosen.append((close, by_walls, 1 / readings.counts[own, r], left[own, r]))
 
+    width, steps = 0.5, 15  # prior standard deviation of the logarithms of all scales, and the number of optimisation steps
+
     def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        away = (logs - first) / WIDTH
-        total, gradient = 0.5 * np.sum(away**2), away / WIDTH
+        away = (logs - first) / width
+        total, gradient = 0.5 * np.sum(away**2), away / width
         room, wall, place, reading = np.exp(2 * logs)
         for close, by_walls, shares, values in chosen:
             k = room * close + wall * by_walls
@@ -217,6 +216,6 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
         return float(total), gradient
 
     bounds = [(x - 2, x + 2) for x in first]
-    options = {"maxiter": STEPS}
+    options = {"maxiter": steps}
     found = minimize(negative_log_posterior, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return Scales(*(float(x) for x in np.exp(found.x)))

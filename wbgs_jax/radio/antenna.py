@@ -31,17 +31,17 @@ PATTERN_EXPONENTS = {
     "hw_dipole": (0.0, 1.2),  # within 0.41 dB wherever the half-wave dipole is above -10 dB
 }
 """Exponents of the directional element and of the dipole, by pattern name."""
-SPELLINGS = {"isotropic": "iso", "tr38901": "tr38901", "38901": "tr38901", "3gpp38901": "tr38901"}
-SPELLINGS |= {
+SPELLINGS = {
+    "isotropic": "iso",
+    "tr38901": "tr38901",
+    "38901": "tr38901",
+    "3gpp38901": "tr38901",
     "3gpptr38901": "tr38901",
     "shortdipole": "dipole",
     "halfwavedipole": "hw_dipole",
     "halfwavelengthdipole": "hw_dipole",
-}
-SPELLINGS |= {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
+} | {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
 """Pattern names by their spellings in lower case without separators."""
-SMALLEST_TABLE = 4, 4
-"""Smallest number of zenith angles and azimuths of a tabulated pattern."""
 POLE = 1e-12
 """Squared sine of the zenith angle below which a direction counts as vertical."""
 
@@ -164,7 +164,8 @@ def tabulated(e_theta: Inexact[np.ndarray, "zenith azimuth"], e_phi: Inexact[np.
         ValueError: the table is too small, or has an odd number of azimuths.
     """
     rows, columns = e_theta.shape
-    if rows < SMALLEST_TABLE[0] or columns < SMALLEST_TABLE[1] or columns % 2:
+    smallest_table = 4, 4  # smallest number of zenith angles and azimuths of a tabulated pattern
+    if rows < smallest_table[0] or columns < smallest_table[1] or columns % 2:
         raise ValueError(f"{rows} zenith angles and {columns} azimuths; give at least 4 of both, azimuths in even number")
     if e_phi is None:
         values = np.array(e_theta)[..., None]

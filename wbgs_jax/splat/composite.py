@@ -30,14 +30,12 @@ from wbgs_jax.splat.per_platform import per_platform
 from wbgs_jax.splat.projection import footprint, mahalanobis2, windowed_exponential
 from wbgs_jax.splat.tiles import CHUNK, TileJobs, Tiling
 
-MESSAGE = (
-    "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, jax.jacfwd or "
-    "jax.linearize, and no second derivatives"
-)
-
 
 def _refuse(*_: Any, **__: Any) -> NoReturn:
-    raise TypeError(MESSAGE)
+    raise TypeError(
+        "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, jax.jacfwd "
+        "or jax.linearize, and no second derivatives"
+    )
 
 
 _tangent = Primitive("reverse_mode_only")

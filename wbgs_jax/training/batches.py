@@ -25,10 +25,6 @@ from wbgs_jax.observation_kinds import KINDS, Observations, Observed, spectra_of
 from wbgs_jax.radio.array import pas_directions, steering_vector
 from wbgs_jax.types import Batch, Links, Receiver, Transmitter
 
-FAR_M = 500.0
-"""Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a wavelength
-at 100 GHz."""
-
 
 @pytree
 class TrainingData(Observed):
@@ -118,7 +114,10 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
     far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
-    if far > FAR_M:
+    # Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a
+    # wavelength at 100 GHz.
+    far_m = 500.0
+    if far > far_m:
         warnings.warn(
             f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
             "mesh, transmitters and receivers",
@@ -136,8 +135,6 @@ COUNT = 4, 256
 BEYOND, BESIDE = 0.3, 0.1
 """Range of virtual transmitters beyond two measured ones, relative to the distance between these, and r.m.s. displacement from
 the line through them, relative to the extent of all transmitters."""
-LENGTH, NUGGET = 0.5, 0.01
-"""Correlation length of the kriging, relative to the extent of all transmitters, and its nugget."""
 
 
 class VirtualLinks(NamedTuple):
@@ -167,9 +164,10 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
     places += rng.normal(0, BESIDE * extent / np.sqrt(3), places.shape)
     spectra, images = np.asarray(dataset.pas(train)), np.empty((count, 90, 360), np.uint8)
     frequency, receiver = dataset.frequencies_hz[train], dataset.receiver_index[train]
+    length, nugget = 0.5, 0.01  # correlation length of the kriging, relative to the extent of all transmitters, and its nugget
     for i in range(count):
         alike = np.flatnonzero((frequency == frequency[first[i]]) & (receiver == receiver[first[i]]))
-        weights = kriging_weights(positions[alike], places[i], LENGTH * extent, NUGGET)
+        weights = kriging_weights(positions[alike], places[i], length * extent, nugget)
         images[i] = (255 * np.clip(np.tensordot(weights, spectra[alike], 1), 0, 1)).round()
     return VirtualLinks(places, frequency[first], receiver[first], images)
 

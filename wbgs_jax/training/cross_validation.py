@@ -40,8 +40,6 @@ FOLDS = 4
 """Number of blocks; if there are fewer transmitters, each is a block."""
 SHARE = 0.25
 """Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse."""
-ANSWERED = 60
-"""Maximum number of links per block for which predictions are made."""
 FOLDER = "folds"
 
 
@@ -105,7 +103,8 @@ def _answers(
     devices: int,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 90 360"]]:
     """Returns links of a block, and their spectra predicted by a field that was trained without this block."""
-    index = np.sort(np.random.default_rng(4).permutation(known[left_out])[:ANSWERED])
+    answered = 60  # maximum number of links per block for which predictions are made
+    index = np.sort(np.random.default_rng(4).permutation(known[left_out])[:answered])
     done = place.with_suffix(".npz")
     if done.exists():
         return index, read_arrays(done, "cross-validation", "remove it; --resume creates it again")["pas"].astype(np.float32)

@@ -28,9 +28,6 @@ from wbgs_jax.training.fit_kriging import spacing
 
 STRIDE = 8
 """Stride, in pixels, of the SSIM windows with which mixtures are compared."""
-STEPS, RATE = 200, 0.1
-"""Steps and learning rate of Adam, which fits the weights."""
-_C1, _C2 = 0.01**2, 0.03**2
 
 
 class Moments(NamedTuple):
@@ -62,8 +59,9 @@ def ssim_of(moments: Moments, weights: Float[Array, "n k"]) -> Float[Array, " n"
     cross = moments.products[..., :-1, :]
     own = jnp.einsum("nwkl,nk,nl->nw", cross[..., :-1], weights, weights)
     both = jnp.einsum("nwk,nk->nw", cross[..., -1], weights)
-    luminance = (2 * mean * truth + _C1) / (mean**2 + truth**2 + _C1)
-    structure = (2 * both + _C2) / (own + moments.products[..., -1, -1] + _C2)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean * truth + c1) / (mean**2 + truth**2 + c1)
+    structure = (2 * both + c2) / (own + moments.products[..., -1, -1] + c2)
     return jnp.mean(luminance * structure, -1)
 
 
@@ -79,7 +77,8 @@ def fit_weights(
         prior: prior bias and slope of every logit.
         ridge: penalties, in SSIM, on their squared distances from the prior.
     """
-    optimizer = optax.adam(RATE)
+    steps, rate = 200, 0.1  # steps and learning rate of Adam, which fits the weights
+    optimizer = optax.adam(rate)
 
     def loss(logits: Float[Array, "k 2"]) -> Float[Array, ""]:
         weights = jax.nn.softmax(logits[:, 0] + logits[:, 1] * u[:, None], -1)
@@ -90,14 +89,12 @@ def fit_weights(
         updates, state = optimizer.update(jax.grad(loss)(logits), state)
         return (optax.apply_updates(logits, updates), state), None
 
-    (logits, _), _ = jax.lax.scan(step, (prior, optimizer.init(prior)), None, STEPS)
+    (logits, _), _ = jax.lax.scan(step, (prior, optimizer.init(prior)), None, steps)
     return logits
 
 
 LEFT_OUT = 160
 """Maximum number of cases in which a spectrum is left out, together with different numbers of other transmitters."""
-SHARES_LEFT_OUT = (0.0, 0.12, 0.25, 0.5)
-"""Fractions of the other transmitters, the nearest ones, that are left out together with a spectrum."""
 LENGTHS, NUGGETS = 7, (1e-2, 0.1, 1.0)
 """Number of correlation lengths of the kriging that are tried, from the spacing of transmitters to their largest distance, and
 nuggets that are tried."""
@@ -114,12 +111,8 @@ ERRORS, ERRORS_WITH_PATHS = 2.0, 1.0
 than the spectra."""
 USUAL_SPREAD, USUAL_WEIGHT = 0.1, 2.0
 """Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as."""
-SLOPES = (0.0, -1.0, 1.0)
-"""Slopes of the logit of the field's weight that are tried."""
 WORTH = 0.005
 """Minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone."""
-UNUSED = 0.02
-"""Largest weight of the line of sight at which it is left out."""
 
 
 class Known(NamedTuple):
@@ -230,7 +223,8 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
     logits = fit_weights(moments_of(spectra, truth), scaled_distance(mixture, jnp.asarray(distance)), prior, ridge)
     mixture = dataclasses.replace(mixture, members=logits)
     used = np.asarray(member_weights(mixture, jnp.asarray(distance)))[:, MEMBERS.index("line_of_sight")]
-    if used.max() < UNUSED:
+    unused = 0.02  # largest weight of the line of sight at which it is left out
+    if used.max() < unused:
         nothing = logits.at[MEMBERS.index("line_of_sight")].set(jnp.array([-30.0, 0.0]))
         mixture = dataclasses.replace(mixture, members=nothing, elements=mixture.elements[:0])
     return mixture
@@ -261,10 +255,12 @@ def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Boo
     positions, tx = dataset.tx_positions[known.links], dataset.tx_index[known.links]
     places = {number: positions[tx == number][0] for number in np.unique(tx)}
     chosen, kept = [], []
+    # Fractions of the other transmitters, the nearest ones, that are left out together with a spectrum.
+    shares_left_out = (0.0, 0.12, 0.25, 0.5)
     for place in _in_turn(tx, rng):
         others = sorted(places.keys() - {tx[place]}, key=lambda own: float(np.linalg.norm(places[own] - positions[place])))
         same = np.isclose(dataset.frequencies_hz[known.links], dataset.frequencies_hz[known.links[place]], rtol=1e-4)
-        for count in sorted({int(share * len(others)) for share in SHARES_LEFT_OUT}):
+        for count in sorted({int(share * len(others)) for share in shares_left_out}):
             use = np.isin(tx, others[count:])
             if (use & same).any():
                 chosen.append(known.links[place])
@@ -369,7 +365,8 @@ def choose_share(
     """
     bound = functools.partial(lower_bound, group=group, errors=errors)
     best, found = 0.0, (-30.0, 0.0)
-    for slope in SLOPES:
+    slopes = (0.0, -1.0, 1.0)  # slopes of the logit of the field's weight that are tried
+    for slope in slopes:
         for middle in SHARES[1:]:
             bias = float(logit(np.clip(middle, 1e-4, 1 - 1e-4)))
             share = expit(bias + slope * u) if slope else np.full(len(u), middle)

@@ -37,8 +37,6 @@ from wbgs_jax.inference.kriging import read_neighbours
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training import EXAMPLE, checkpoint
 
-FIRST_PRESET = "cpu"
-
 MANIFEST = "manifest.json"
 """File that is written last, when a training is finished."""
 
@@ -73,7 +71,7 @@ def read_config(folder: Path) -> RunConfig:
     if values["field"] not in field_names():
         raise UserError(f"{path} names an unknown field {str(values['field'])[:40]!r}; correct it, or train again")
     kind = get_field(values["field"])
-    settings = from_dict(values.pop("settings"), kind.presets[FIRST_PRESET], kind.name)
+    settings = from_dict(values.pop("settings"), kind.presets["cpu"], kind.name)
     for section, part in sections(settings, kind.name).items():
         _demand_types(path, part, f"{section}.")
     check(settings)

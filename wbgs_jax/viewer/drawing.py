@@ -11,8 +11,6 @@ from wbgs_jax.radio.array import pas_directions
 
 COLORS, GAUSSIAN_COLORS = "viridis", "inferno"
 """Colormaps of spectra and maps, and of Gaussians."""
-DOME_STRIDE = 4
-"""Stride of the directions that are drawn at the receiver, along both axes."""
 PATH_RANGE_DB = 40.0
 """Range of the colours of paths below the strongest one; weaker paths fade ..."""
 FADED_DB, FADED = 20.0, 0.85
@@ -21,9 +19,6 @@ BACKGROUND = np.array([255, 255, 255], np.uint8)
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
 BOUNCE_WORDS = "none", "one", "two", "three"
-MATERIAL_COLORS = "tab20"
-MAP_MARGIN = 0.01
-"""Fraction of the values at either end that lie beyond the colours of a map."""
 OPAQUE, DIM = 230, 70
 """Opacity of a map, and of an outdated one, of 255."""
 
@@ -45,8 +40,9 @@ def dome(
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Returns points around the receiver (offsets in the world frame, metres), whose distance and brightness grow with the
     amplitude from their direction, and their colours. `rotation` rotates the local frame into the world frame."""
-    amplitude = pas[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1)
-    directions = pas_directions()[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1, 3) @ rotation.T
+    dome_stride = 4  # stride of the directions that are drawn at the receiver, along both axes
+    amplitude = pas[::dome_stride, ::dome_stride].reshape(-1)
+    directions = pas_directions()[::dome_stride, ::dome_stride].reshape(-1, 3) @ rotation.T
     return (radius * (0.35 + 0.65 * amplitude))[:, None] * directions, colored(amplitude, 0.0, 1.0)
 
 
@@ -89,7 +85,8 @@ def path_handles(points: Float[np.ndarray, "k 5 3"]) -> Float[np.ndarray, "k 3"]
 def map_range(values: Float[np.ndarray, "ny nx"]) -> tuple[float, float]:
     """Returns the values of the first and the last colour of a map (NaN where nothing is received)."""
     known = values[np.isfinite(values)]
-    low, high = np.quantile(known, [MAP_MARGIN, 1 - MAP_MARGIN]) if len(known) else (-100.0, 0.0)
+    map_margin = 0.01  # fraction of the values at either end that lie beyond the colours of a map
+    low, high = np.quantile(known, [map_margin, 1 - map_margin]) if len(known) else (-100.0, 0.0)
     return float(low), float(high)
 
 
@@ -104,5 +101,5 @@ def map_picture(values: Float[np.ndarray, "ny nx"], low: float, high: float, dim
 
 def material_color(number: int) -> tuple[int, int, int]:
     """Returns the colour of a material's surfaces."""
-    red, green, blue = (int(255 * part) for part in colormaps[MATERIAL_COLORS](number % 20)[:3])
+    red, green, blue = (int(255 * part) for part in colormaps["tab20"](number % 20)[:3])
     return red, green, blue

@@ -26,9 +26,6 @@ KNOTS = 33
 """Colours of a filter, between which the browser interpolates."""
 TICKS = 4
 """Approximate number of ticks of an axis."""
-STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-LEVELS = 255
-"""Grey levels of an image."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,8 @@ def axis_over(low: float, high: float, label: str, count: int = TICKS) -> Axis:
     high = high if high > low else low + 1.0
     rough = (high - low) / count
     power = 10 ** np.floor(np.log10(rough))
-    step = power * next(s for s in STEPS if s * power >= rough * (1 - 1e-9))
+    steps = (1.0, 2.0, 2.5, 5.0, 10.0)
+    step = power * next(s for s in steps if s * power >= rough * (1 - 1e-9))
     ticks = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
     return Axis(low, high, label, tuple((ticks + 0.0).tolist()))  # -0 becomes 0
 
@@ -217,12 +215,13 @@ def _place(points: Float[np.ndarray, "n 2"], box: tuple[float, ...], x: Axis, y:
 def _image(values: Float[np.ndarray, "h w"], box: tuple[float, ...], axis: Axis, name: str) -> str:
     """Returns an image of values, the first row at the top, transparent where they are NaN, with its filter of colours."""
     known = np.isfinite(values)
-    grey = (LEVELS * np.clip(axis.share(np.where(known, values, axis.low)), 0, 1)).round().astype(np.uint8)
+    levels = 255  # grey levels of an image
+    grey = (levels * np.clip(axis.share(np.where(known, values, axis.low)), 0, 1)).round().astype(np.uint8)
     stream = io.BytesIO()
     if known.all():
         picture = Image.fromarray(grey)
     else:
-        picture = Image.fromarray(np.stack([grey, LEVELS * known.astype(np.uint8)], -1), "LA")
+        picture = Image.fromarray(np.stack([grey, levels * known.astype(np.uint8)], -1), "LA")
     picture.save(stream, "png", compress_level=1)
     table = color_table(COLORS)[np.linspace(0, 255, KNOTS).astype(int)]
     channels = "".join(
