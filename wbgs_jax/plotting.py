@@ -32,8 +32,6 @@ from wbgs_jax.radio.channel import NO_PATH_DB
 
 SHOWN = 6
 """Maximum number of spectra in a plot."""
-SIZES = ("gaussians",)
-"""Counts of a field that change during training."""
 
 
 def draw_all(
@@ -122,7 +120,8 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
     """Returns the loss, metrics of the batches and of held-out links, and counts that change, over the steps."""
     steps = [e for e in entries if "loss" in e]
     held_out = sorted({name for e in steps for name in e if name.startswith("held_out")})
-    sizes = [name for name in SIZES if any(name in e for e in steps)]
+    counts = ("gaussians",)  # counts of a field that change during training
+    sizes = [name for name in counts if any(name in e for e in steps)]
     figure = Figure(figsize=(13 if sizes else 9, 3.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, 3 if sizes else 2))
     axes[0].plot([e["step"] for e in steps], [e["loss"] for e in steps], color="C0")
@@ -314,7 +313,7 @@ def draw_paths(
     figure.set_layout_engine("compressed")  # panels keep their aspect
     shown = ScalarMappable(Normalize(-FADED_DB, 0), "plasma")
     link = np.stack([found[name] for name in ("x", "y", "z", "frequency_ghz")], -1)
-    disc = {
+    disc: dict[str, Any] = {
         "marker": "o",
         "color": "white",
         "markeredgecolor": "black",
@@ -465,17 +464,13 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
 
 
-SHOWN_MAPS = 6
-"""Maximum number of frequencies in a plot."""
-
-
 def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
-    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts. Stars are the receiver
+    """Returns a figure of the first six maps with the walls that the plane cuts. Stars are the receiver
     or, for quantities of several transmitters, these. `source` is the provenance (`LoadedField.source`)."""
     quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
     network = what in NETWORK
     stars = answer["tx_positions"] if network else np.array([source["receiver"]["position"]])
-    values = _drawn(quantity, answer)[:SHOWN_MAPS]
+    values = _drawn(quantity, answer)[:6]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
     extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
     wide = extent[1] - extent[0] > extent[3] - extent[2]
@@ -544,23 +539,19 @@ def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
     return {"vmin": float(low), "vmax": float(high)}
 
 
-SPACING, MARGIN = 0.1, 0.3
-"""Pixel spacing and margin around the plan, metres."""
-COLUMNS = 3
-
-
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
     height = float(np.median(cells.places[:, 2]))
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
-    low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
+    finest, margin = 0.1, 0.3  # pixel spacing and margin around the plan, metres
+    low, high = outline.min(0) - margin, outline.max(0) + margin
     pixels = 40_000  # maximum number of pixels; the spacing grows for larger plans
-    spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / pixels)))
+    spacing = max(finest, float(np.sqrt(np.prod(high - low) / pixels)))
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
     powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
     shown_receivers = 12  # maximum number of receivers in a plot
     shown = min(shown_receivers, len(cells.receivers))
-    columns, rows = min(COLUMNS, shown), -(-shown // COLUMNS)
+    columns, rows = min(3, shown), -(-shown // 3)
     size = (high - low) / max(high - low)
     figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)

@@ -24,9 +24,6 @@ from wbgs_jax._util.files import check_writable, write_csv
 from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
 from wbgs_jax.inference import queries as parsing
 
-LENGTH = 3.0
-"""Default of the distance over which errors are alike, in median distances between neighbouring measured places."""
-
 
 @dataclass(frozen=True)
 class Command(TrainedFieldOptions):
@@ -114,7 +111,9 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     some = np.unique(np.linspace(0, len(learned) - 1, min(frequencies, len(learned))).round().astype(int))
     frequencies_hz = learned[some] if given is None else given
     measured = np.unique(data.tx_positions[np.concatenate([data.train, data.validation])], axis=0)
-    length = LENGTH * spacing(measured) if len(measured) > 1 else LENGTH
+    # Default of the distance over which errors are alike, in median distances between neighbouring measured places.
+    default_spacings = 3.0
+    length = default_spacings * spacing(measured) if len(measured) > 1 else default_spacings
     at_once = 128  # candidates whose spectra are in memory together
     blocks = [places[start : start + at_once] for start in range(0, len(places), at_once)]
     if trained.intervals is not None:

@@ -29,10 +29,6 @@ ConventionName = Literal["zenith", "elevation"]
 """Name of a pixel order."""
 CONVENTIONS: tuple[ConventionName, ...] = get_args(ConventionName)
 
-POLE, APART = 0.5, 2.0
-"""Maximum variation of the row at the zenith relative to that of the inner row; and minimum factor by which this ratio is
-larger at the other end."""
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -102,8 +98,11 @@ def _by_the_zenith(images: UInt8[np.ndarray, "n 90 360"]) -> Evidence | None:
     outer, inner = (images[:, rows].std(2).mean(0) for rows in ([0, PAS_HEIGHT - 1], [inward, PAS_HEIGHT - 1 - inward]))
     share = outer / np.maximum(inner, 1e-9)
     visible = 0.3  # minimum variation of inner pixels in grey levels (of 255): an image without content is not conclusive
+    # Maximum variation of the row at the zenith relative to that of the inner row; and minimum factor by which this ratio is
+    # larger at the other end.
+    uniform, apart = 0.5, 2.0
     for pole, convention, row in ((0, CONVENTIONS[0], "first"), (1, CONVENTIONS[1], "last")):
-        if inner.min() >= visible and share[pole] <= POLE and share[1 - pole] >= APART * share[pole]:
+        if inner.min() >= visible and share[pole] <= uniform and share[1 - pole] >= apart * share[pole]:
             spread = f"grey levels vary by {outer[pole]:.1f}, {inward} rows further by {inner[pole]:.1f}"
             return Evidence(convention, f"the {row} row shows a single direction ({spread}), like the zenith")
     return None

@@ -18,8 +18,6 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.tables import check_positions, numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
-OUTLINES = "room"
-"""Column that separates outlines."""
 ON_WALL = 1e-2
 """Metres: a point this near to a wall counts as lying on it, and the wall as no obstacle."""
 
@@ -64,15 +62,16 @@ def load_walls(path: Path) -> Walls:
     check_positions(f"{path}: corners", values)
     # Names of columns that are ignored: the path loss law treats all walls equally.
     ignored = ("id", "name", "material", "thickness", "comment", "note")
-    allowed = (*form.columns, *ignored, *([] if form is SEGMENTS else [OUTLINES]))
+    outline_column = "room"  # column that separates outlines
+    allowed = (*form.columns, *ignored, *([] if form is SEGMENTS else [outline_column]))
     if other := [name for name in header if name not in allowed]:
         raise UserError(
             f"{path} has an unknown column {other[0]!r}; the columns of a floor plan are {', '.join(form.columns)}"
-            + (f" and, for several outlines, {OUTLINES}" if form is OUTLINE else "")
+            + (f" and, for several outlines, {outline_column}" if form is OUTLINE else "")
         )
     if form is SEGMENTS:
         return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
-    room = np.array([row[header.index(OUTLINES)] if OUTLINES in header else "" for row in rows])
+    room = np.array([row[header.index(outline_column)] if outline_column in header else "" for row in rows])
     outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
     ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
     return Walls(ends, np.full(len(ends), form.share))

@@ -137,8 +137,6 @@ def check_kind(path: Path) -> None:
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
 
-MOST_MATERIALS, REST = 64, "others"
-"""Maximum number of distinct materials of a scene, and the label of the others."""
 PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 """Values of `split` in scene files by part."""
 
@@ -263,17 +261,18 @@ def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tupl
     """Returns the labels of parts with at most `MOST_MATERIALS` distinct ones, those of the largest area; the others are
     combined by thickness. If every object has a material of its own, the calibration of all of them would take hours."""
     kinds = sorted(set(labels))
-    if len(kinds) <= MOST_MATERIALS:
+    most, rest = 64, "others"  # maximum number of distinct materials of a scene, and the label of the others
+    if len(kinds) <= most:
         return labels
     a, b, c = np.moveaxis(room.vertices[room.faces].astype(np.float64), 1, 0)
     of_face = np.array([kinds.index(label) for label in labels])[room.face_part]
     area = np.bincount(of_face, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(kinds))
-    largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:MOST_MATERIALS]}
+    largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:most]}
     warnings.warn(
-        f"{name} has {len(kinds)} materials: all except the {MOST_MATERIALS} of the largest area are treated as one",
+        f"{name} has {len(kinds)} materials: all except the {most} of the largest area are treated as one",
         stacklevel=3,
     )
-    return [label if label in largest else (REST, label[1]) for label in labels]
+    return [label if label in largest else (rest, label[1]) for label in labels]
 
 
 def _receivers(scene: SceneFile) -> list[Receiver]:

@@ -46,8 +46,6 @@ from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 DENSITIES_HZ = 1e9, 1e11
 """Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
 between, constant beyond."""
-THIN = 1e-3
-"""Initial density of the absorption grid, nepers per metre: a tenth of a decibel across a room."""
 LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
 """Logarithm of the largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows."""
 
@@ -302,8 +300,9 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
 
 
 def transparent_grid(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
-    """Returns the initial `WaveParams.clutter`, which is nearly transparent (`THIN`)."""
-    return stored(jnp.full((*shape, len(DENSITIES_HZ)), THIN, jnp.float32))
+    """Returns the initial `WaveParams.clutter`, which is nearly transparent."""
+    thin = 1e-3  # initial density of the absorption grid, nepers per metre: a tenth of a decibel across a room
+    return stored(jnp.full((*shape, len(DENSITIES_HZ)), thin, jnp.float32))
 
 
 def densities(stored_density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:

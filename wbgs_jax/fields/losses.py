@@ -13,7 +13,6 @@ from jaxtyping import Array, Complex, Float
 from wbgs_jax.radio.array import EXACT, squared_magnitude
 from wbgs_jax.radio.channel import unit_snapshots
 
-_WINDOW, _SIGMA = 11, 1.5
 GOOD_MATCH = 2e-3
 """One minus the squared correlation below which calibration treats two snapshots as equal."""
 UNEXPLAINED = 0.1
@@ -23,12 +22,13 @@ UNEXPLAINED = 0.1
 @functools.lru_cache
 def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
     """Returns the banded matrix that blurs one axis, for the valid region only."""
-    offset = np.arange(_WINDOW) - _WINDOW // 2
-    window = np.exp(-(offset**2) / (2 * _SIGMA**2))
+    width, sigma = 11, 1.5
+    offset = np.arange(width) - width // 2
+    window = np.exp(-(offset**2) / (2 * sigma**2))
     window /= window.sum()
-    matrix = np.zeros((size - _WINDOW + 1, size))
+    matrix = np.zeros((size - width + 1, size))
     for row in range(len(matrix)):
-        matrix[row, row : row + _WINDOW] = window
+        matrix[row, row : row + width] = window
     return matrix
 
 

@@ -47,10 +47,6 @@ SHARES = np.linspace(0, 1, 21)
 """Weights of the first of two experts at which links are scored."""
 FEATURES = 7
 """Number of features z of a query."""
-FOLDS = 5
-"""Folds of the cross-validation over transmitters."""
-BLOCK = 48
-"""Number of spectra that are compared at once."""
 
 
 @pytree
@@ -206,7 +202,8 @@ def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Fl
 def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
     """Returns the values of a function of N spectra, evaluated in blocks to limit device memory; several arrays of spectra are
     passed together."""
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(spectra[0]), BLOCK)]
+    block_size = 48  # number of spectra that are compared at once
+    blocks = [slice(start, start + block_size) for start in range(0, len(spectra[0]), block_size)]
     return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
 
 
@@ -226,11 +223,12 @@ def learn_share(known: Scored) -> Share:
     """Returns the weight that fits links best (host): the same for all, unless the features improve on it by more than a
     standard error in cross-validation."""
     common = constant(_best(known.scores))
-    folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
-    if len(np.unique(known.tx_index)) < 2 * FOLDS:
+    number_of_folds = 5  # folds of the cross-validation over transmitters
+    folds = np.unique(known.tx_index, return_inverse=True)[1] % number_of_folds
+    if len(np.unique(known.tx_index)) < 2 * number_of_folds:
         return common
     gains = np.zeros(len(folds))
-    for fold in range(FOLDS):
+    for fold in range(number_of_folds):
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
         by_features, by_all = _fit(rest), constant(_best(rest.scores))
         gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
@@ -300,8 +298,6 @@ LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
 """Floors that are tried, relative to the largest square of a spectrum; lower ones are hardly visible in spectra."""
 SURE = 2.0
 """Improvement of the similarity by a floor that is significant, in standard errors over transmitters."""
-HARMLESS = 1.0
-"""Loss of similarity that is accepted when learned spectra are raised to the floor, in standard errors over transmitters."""
 FEWEST_TX = 10
 """Minimum number of transmitters for an estimate."""
 COMPARED = 240
@@ -351,7 +347,9 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
         return 0.0
     raised = in_blocks(_raised, learned, observed)
     losses = [standard_error(raised[:, 0] - with_level, tx_index) for with_level in raised.T]
-    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= HARMLESS * error)
+    # Loss of similarity that is accepted when learned spectra are raised to the floor, in standard errors over transmitters.
+    accepted = 1.0
+    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= accepted * error)
     darkest = 0.05  # fraction of the pixels of learned spectra that may be darker than the floor
     return float(min(LEVELS[best], harmless, np.quantile(learned**2, darkest)))
 

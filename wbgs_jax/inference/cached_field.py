@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 MOST = 16
 """Maximum number of queries per call."""
-FOLDER = "ready"
-META = "meta"
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
         return None
     try:
         with opened_archive(path, "", "") as archive:
-            meta = json.loads(str(archive[META]))
+            meta = json.loads(str(archive["meta"]))
             if what not in meta["what"] or lowest_hz < meta["lowest_hz"] or meta["state"] != _state(meta["watched"]):
                 return None
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
@@ -147,7 +145,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
 def _place(run: Path, rx: str, count: int) -> Path | None:
     folder = cache_folder()
     words = os.fsencode(run.resolve()) + f"\n{rx}\n{size_for(count)}".encode()
-    return None if folder is None else folder / FOLDER / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
+    return None if folder is None else folder / "ready" / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
 
 
 def _state(watched: Sequence[Path | str]) -> str:

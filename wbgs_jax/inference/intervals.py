@@ -36,8 +36,6 @@ POWER_MARGIN_DB = 0.1
 """Keeps the logarithm of a zero error finite."""
 FILE, POWER_FILE = "confidence.npz", "power_confidence.npz"
 FEATURES, POWER_FEATURES = 6, 4
-BEYOND_FREE_SPACE_DB = -100.0, 30.0
-"""Limits of the received power relative to free space: without any path, the depth of the shadow is undefined."""
 
 
 @pytree
@@ -141,7 +139,9 @@ def _octave(query: Query) -> Float[Array, " b"]:
 
 
 def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]) -> Float[Array, " b"]:
-    return jnp.clip(beyond_free_space_db(power_db, query.tx_position, rx_position, query.frequency_hz), *BEYOND_FREE_SPACE_DB)
+    # Limits of the received power relative to free space: without any path, the depth of the shadow is undefined.
+    limits_db = -100.0, 30.0
+    return jnp.clip(beyond_free_space_db(power_db, query.tx_position, rx_position, query.frequency_hz), *limits_db)
 
 
 def expected_ssim(

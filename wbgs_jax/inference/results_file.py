@@ -20,7 +20,6 @@ from wbgs_jax._util.files import atomic_write, opened_archive, read_json, told, 
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
 
-QUESTION = "question.json"
 SHARED = ("offsets_hz", "delays_s", "tx_elements")
 """Arrays common to all queries; all others have one row per query (or several: tables of paths)."""
 
@@ -122,19 +121,19 @@ def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFile
         UserError: there are blocks without `resume`, or the blocks belong to other queries.
     """
     folder = part_folder(target)
-    done = 0
+    asked, done = folder / "question.json", 0
     while _file(folder, done).exists():
         done += 1
     if done and not resume:
         raise UserError(
             f"{folder} contains results of an interrupted command; add --resume to continue it, or remove the folder"
         )
-    if done and (changed := _difference(read_json(folder / QUESTION), question)):
+    if done and (changed := _difference(read_json(asked), question)):
         raise UserError(
             f"{folder} contains results of another command ({changed} changed); remove the folder, or choose another --out"
         )
     if not done:
-        write_json(folder / QUESTION, question)
+        write_json(asked, question)
     return PartFiles(folder, done)
 
 

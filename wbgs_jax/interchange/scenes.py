@@ -113,7 +113,7 @@ def scene_of_snapshots(
     if (places := len(np.unique(transmitter))) < FEWEST:
         raise UserError(f"{name} has {places} transmitters, but training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
-    split[tx_disjoint_split(transmitter, 0.2, seed)[1]] = TEST
+    split[tx_disjoint_split(transmitter, test_fraction=0.2, seed=seed)[1]] = TEST
     surfaces = room or _one_surface(vertices, faces)
     return SceneFile(
         name=name,

@@ -30,8 +30,6 @@ from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 
 DEFAULT = 4, 4
 """Rows and columns of the default array."""
-FITS = 0.995
-"""Minimum correlation of a path's coefficients with the steering vector of an array."""
 
 Shape = tuple[int, int]
 
@@ -216,12 +214,14 @@ def _orientation(
     turn = _turn(measured, towards, np.abs(own[0, 0]))
     candidates = [Rotation.identity(), *([] if turn is None else [turn])]
     fits = [_fit(own.reshape(rows * columns, -1), towards, one.apply(planar_array(rows, columns))) for one in candidates]
-    if max(fits) < FITS:
+    least_fit = 0.995  # minimum correlation of a path's coefficients with the steering vector of an array
+    if max(fits) < least_fit:
         raise UserError(
             f"the phases of {name} do not fit a {rows}x{columns} array of half a wavelength (correlation {max(fits):.3f}); "
             "give its shape, --array ROWSxCOLUMNS, or trace with synthetic_array=False"
         )
-    return _quaternion(candidates[0] if fits[0] >= FITS and fits[0] >= max(fits) - 1e-4 else candidates[int(np.argmax(fits))])
+    unrotated = fits[0] >= least_fit and fits[0] >= max(fits) - 1e-4
+    return _quaternion(candidates[0 if unrotated else int(np.argmax(fits))])
 
 
 def _turn(

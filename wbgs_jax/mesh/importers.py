@@ -74,7 +74,7 @@ def read_objects(file: Path, up: str | None = None, scale: float = 1.0) -> list[
         raise UserError(f"--up is {up!r}; give y or z, the axis that points up in {file}")
     if not 0 < scale < float("inf"):
         raise UserError(f"--scale is {scale}; give the metres per unit of {file}, such as 0.001 for millimetres")
-    turn = Y_UP if (up or _UP.get(suffix, "z")) == "y" else np.eye(4)
+    turn = Y_UP if (up or ("y" if suffix in (".glb", ".gltf") else "z")) == "y" else np.eye(4)
     turn = trimesh.transformations.scale_matrix(scale) @ turn
     objects = [FileObject(body.name, _clean(body, turn, file), body.material) for body in _read(file, READERS[suffix])]
     objects = sorted((o for o in objects if len(o.mesh.faces)), key=lambda o: o.name)
@@ -129,4 +129,3 @@ def _read_ply(file: Path) -> list[Body]:
 READERS: dict[str, Callable[[Path], list[Body]]] = {
     ".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj, ".ply": _read_ply, ".xml": read_mitsuba
 }  # fmt: skip
-_UP = {".glb": "y", ".gltf": "y"}

@@ -241,8 +241,6 @@ def _varying_rows(element: _Element, body: _Body, start: int, rows: int) -> Walk
 
 CORNERS = ("vertex_indices", "vertex_index")
 """Names that exporters use for the corners of faces."""
-STRIPS = "tristrips"
-"""Element whose lists are triangle strips: each corner makes a triangle with the two before it; -1 begins a new strip."""
 
 
 def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
@@ -280,7 +278,8 @@ def read_mesh(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np
     faces = np.zeros((0, 3), np.int64)
     if corners is not None:
         faces = triangulate(vertices, np.asarray(corners.values, np.int64), corners.sizes)
-    strips = elements.get(STRIPS, {})
+    # Lists of this element are triangle strips: each corner makes a triangle with the two before it; -1 begins a new strip.
+    strips = elements.get("tristrips", {})
     for own in (strips[name] for name in CORNERS if name in strips):
         if isinstance(own, Ragged):
             faces = np.concatenate([faces, strip_triangles(own)])

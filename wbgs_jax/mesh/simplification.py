@@ -20,11 +20,6 @@ from scipy.sparse import coo_array
 from wbgs_jax.mesh.facets import Facets, areas, facets_from_mesh
 from wbgs_jax.types import Mesh
 
-BORDER = 10.0
-"""Weight of a border's perpendicular plane, whose area is the square of the border's length."""
-SHORT = 1e-16
-"""Extra cost of a side: this factor times the fourth power of its length and a random factor of 1 to 2. Flat pieces lose their
-short sides first, in a random order in which many can be collapsed at once."""
 FEW = 3000
 """Number of facets that cost little time: at least this many of the existing ones are kept (and this many of a simplified
 mesh), ..."""
@@ -32,8 +27,6 @@ KEPT = 0.98
 """... and as many of the largest ones as make up this fraction of the surface."""
 LEFT_OUT = 0.1
 """Fraction of the surface that may be omitted as its smallest facets before the mesh is simplified instead."""
-PROBES = 1000
-"""Points on the mesh whose distances from the simplified mesh are measured."""
 
 Quadrics = Float[np.ndarray, "v 10"]
 """Coefficients xx, xy, xz, yy, yz, zz, x, y, z and 1 of the sum of squared distances from planes, relative to the vertex:
@@ -157,7 +150,8 @@ def vertex_quadrics(points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray,
     border = np.flatnonzero(_multiplicity(sides, len(points)) == 1)
     u, v = sides[border].T
     upright, length = _unit(np.cross(points[v] - points[u], normal[border // 3]))
-    walls = BORDER * _plane(upright) * (length**2)[:, None]
+    weight = 10.0  # weight of a border's perpendicular plane, whose area is the square of the border's length
+    walls = weight * _plane(upright) * (length**2)[:, None]
     for corner in (u, v):
         np.add.at(quadrics, corner, walls)
     return quadrics
@@ -167,8 +161,9 @@ def distances(corners: Float[np.ndarray, "t 3 3"], others: Float[np.ndarray, "f 
     """Returns the distances (metres) of points drawn at random on triangles from other triangles."""
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     rng = np.random.default_rng(seed)
-    one = corners[rng.choice(len(corners), PROBES, p=area / area.sum())]
-    probes = np.sum(one * rng.dirichlet(np.ones(3), PROBES)[..., None], 1)
+    number = 1000  # points on the mesh whose distances from the simplified mesh are measured
+    one = corners[rng.choice(len(corners), number, p=area / area.sum())]
+    probes = np.sum(one * rng.dirichlet(np.ones(3), number)[..., None], 1)
     return np.array([distance_from(probe, others) for probe in probes])
 
 
@@ -205,7 +200,10 @@ class _Sides:
         names = names[np.append(True, np.diff(names) > 0)]
         u, v = names // len(points), names % len(points)
         way = points[v] - points[u]
-        short = SHORT * np.sum(way**2, -1) ** 2
+        # Extra cost of a side: this factor times the fourth power of its length and a random factor of 1 to 2. Flat pieces lose
+        # their short sides first, in a random order in which many can be collapsed at once.
+        extra = 1e-16
+        short = extra * np.sum(way**2, -1) ** 2
         to_v, to_u = _at(quadrics[u], way) + quadrics[v, -1], _at(quadrics[v], -way) + quadrics[u, -1]
         cost = [np.maximum(one, 0) + short * rng.uniform(1, 2, len(u)) for one in (to_v, to_u)]
         start, end = np.concatenate([u, v]), np.concatenate([v, u])

@@ -31,10 +31,8 @@ LAW = np.array([-45.0, 2.0, 6.0])
 """Prior means of the power at one metre (dBm), the exponent and the loss of a wall (dB), ..."""
 LAW_WIDTH = np.array([30.0, 1.0, 4.0])
 """... and their prior standard deviations."""
-ALIKE = 1.0
-"""Metres: the readings within a square of this size count as one reading in the fit of the law, ..."""
 APART = 5.0
-"""... with this standard deviation of its error (dB)."""
+"""Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
 """Metres: lower bound on distances."""
 MAX_PLACES = 1500
@@ -166,7 +164,8 @@ def _law_features(tx: Any, receivers: Any, walls: Walls) -> Any:
 
 def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
-    _, square = np.unique(np.floor(readings.places / ALIKE).astype(int), axis=0, return_inverse=True)
+    side = 1.0  # metres: the readings within a square of this size count as one reading in the fit of the law
+    _, square = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
     received = np.isfinite(readings.powers)
     weights = np.zeros(readings.powers.shape)
     for r in range(len(readings.receivers)):

@@ -130,8 +130,6 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
 
 FEW = 128
 """Number of training spectra from which on virtual links are not used."""
-COUNT = 4, 256
-"""Virtual links per training link, and their maximum number."""
 BEYOND, BESIDE = 0.3, 0.1
 """Range of virtual transmitters beyond two measured ones, relative to the distance between these, and r.m.s. displacement from
 the line through them, relative to the extent of all transmitters."""
@@ -157,7 +155,7 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
     if len(train) >= FEW or extent == 0 or not dataset.has_spectra:
         return None
     rng = np.random.default_rng([seed, 7])
-    count = min(COUNT[0] * len(train), COUNT[1])
+    count = min(4 * len(train), 256)  # virtual links: four per training link, up to a maximum
     first, second = rng.integers(len(train), size=(2, count))
     along = rng.uniform(-BEYOND, 1 + BEYOND, (count, 1))
     places = positions[first] + along * (positions[second] - positions[first])

@@ -26,8 +26,6 @@ from wbgs_jax._util.devices import is_first
 from wbgs_jax._util.errors import UserError
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
-FILE_BYTES = 8 * 2**20
-"""Approximate size of a checkpoint's files, small enough for uploads that are limited in size."""
 
 
 @dataclass(frozen=True)
@@ -194,10 +192,11 @@ def _demand(fits: bool, saved: Saved) -> None:
 
 
 def _small_files() -> contextlib.AbstractContextManager[Any]:
-    """Makes Orbax write files of at most about `FILE_BYTES`, in the array format that allows this."""
+    """Makes Orbax write files of a limited size, in the array format that allows this."""
     from orbax.checkpoint import v1 as ocp
 
-    saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=FILE_BYTES)
+    file_bytes = 8 * 2**20  # approximate size of a checkpoint's files, small enough for uploads that are limited in size
+    saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=file_bytes)
     context: contextlib.AbstractContextManager[Any] = ocp.Context(array_options=ocp.options.ArrayOptions(saving=saving))
     return context
 

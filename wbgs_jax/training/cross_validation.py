@@ -38,8 +38,6 @@ from wbgs_jax.training.loop import train
 
 FOLDS = 4
 """Number of blocks; if there are fewer transmitters, each is a block."""
-SHARE = 0.25
-"""Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse."""
 FOLDER = "folds"
 
 
@@ -119,10 +117,12 @@ def _answers(
 
 
 def shortened(settings: Settings, steps: int) -> Settings:
-    """Returns settings with the fraction `SHARE` of a number of steps, rounded to whole epochs, without evaluation and with few
+    """Returns settings with a fraction of a number of steps, rounded to whole epochs, without evaluation and with few
     checkpoints."""
     block = settings.loop.epoch_steps
-    steps = max(round(SHARE * steps / block), 1) * block
+    # Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse.
+    share = 0.25
+    steps = max(round(share * steps / block), 1) * block
     optim = dataclasses.replace(settings.optim, steps=steps, min_steps=0, max_epochs=1e9)
     loop = dataclasses.replace(settings.loop, evaluate_spectra=0, checkpoint_every=10 * steps)
     return dataclasses.replace(settings, optim=optim, loop=loop)

@@ -104,15 +104,9 @@ PRIOR, RIDGE, RIDGE_SLOPE = (-1.0, 0.0, 0.0, 2.0, 0.0), (0.03, 0.03, 0.03, 0.03,
 """Prior logits of the simple methods (kriging itself tends to a mean far from the data), and penalties, in SSIM of a single
 transmitter, on the squared distances from these and on squared slopes. A line of sight becomes apparent from few transmitters;
 the other methods differ little, and a few transmitters do not show which is best."""
-AVERAGED = 512
-"""Maximum number of measured spectra over which the mean is computed."""
 ERRORS, ERRORS_WITH_PATHS = 2.0, 1.0
 """Distance of the bound below the mean gain, in standard errors; smaller for fields with paths, which use more information
 than the spectra."""
-USUAL_SPREAD, USUAL_WEIGHT = 0.1, 2.0
-"""Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as."""
-WORTH = 0.005
-"""Minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone."""
 
 
 class Known(NamedTuple):
@@ -342,8 +336,9 @@ _member_spectra = jax.jit(member_spectra)
 
 
 def _means(known: Known, kept: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns the means of N subsets of at most `AVERAGED` of the measured spectra."""
-    sample = np.random.default_rng(3).permutation(len(known.links))[:AVERAGED]
+    """Returns the means of N subsets of a limited number of the measured spectra."""
+    averaged = 512  # maximum number of measured spectra over which the mean is computed
+    sample = np.random.default_rng(3).permutation(len(known.links))[:averaged]
     pixels = known.images[sample].reshape(len(sample), -1).astype(np.float32) / 255
     means = kept[:, sample] @ pixels / np.maximum(kept[:, sample].sum(1), 1)[:, None].astype(np.float32)
     return means.reshape(len(kept), *known.images.shape[1:])
@@ -366,28 +361,31 @@ def choose_share(
     bound = functools.partial(lower_bound, group=group, errors=errors)
     best, found = 0.0, (-30.0, 0.0)
     slopes = (0.0, -1.0, 1.0)  # slopes of the logit of the field's weight that are tried
+    least_gain = 0.005  # minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone
     for slope in slopes:
         for middle in SHARES[1:]:
             bias = float(logit(np.clip(middle, 1e-4, 1 - 1e-4)))
             share = expit(bias + slope * u) if slope else np.full(len(u), middle)
             worth = bound(_at(scores, share) - scores[:, 0], share=float(share.mean()))
-            if worth > best + (WORTH if slope and not found[1] else 0):
+            if worth > best + (least_gain if slope and not found[1] else 0):
                 best, found = worth, (bias, slope)
     chosen = expit(found[0] + found[1] * u)
     alone = (
         bound(scores[:, -1] - scores[:, 0], share=1.0) > 0
-        and standard_error(_at(scores, chosen) - scores[:, -1], group)[0] < WORTH
+        and standard_error(_at(scores, chosen) - scores[:, -1], group)[0] < least_gain
     )
     return found, bool(alone)
 
 
 def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:
     """Returns the lower confidence bound of a mean gain over groups. Their variance combines the observed one with a prior that
-    counts as `USUAL_WEIGHT` groups, so that a few groups that happen to agree are little evidence."""
+    counts as two groups, so that a few groups that happen to agree are little evidence."""
     by_group = by_transmitter(gains, group)
     n = len(by_group)
-    usual = (USUAL_SPREAD * share) ** 2
-    variance = (USUAL_WEIGHT * usual + np.sum((by_group - by_group.mean()) ** 2)) / (USUAL_WEIGHT + n - 1)
+    # Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as.
+    usual_spread, usual_weight = 0.1, 2.0
+    usual = (usual_spread * share) ** 2
+    variance = (usual_weight * usual + np.sum((by_group - by_group.mean()) ** 2)) / (usual_weight + n - 1)
     return float(by_group.mean() - errors * np.sqrt(variance / n))
 
 

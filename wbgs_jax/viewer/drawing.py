@@ -12,15 +12,11 @@ from wbgs_jax.radio.array import pas_directions
 COLORS, GAUSSIAN_COLORS = "viridis", "inferno"
 """Colormaps of spectra and maps, and of Gaussians."""
 PATH_RANGE_DB = 40.0
-"""Range of the colours of paths below the strongest one; weaker paths fade ..."""
-FADED_DB, FADED = 20.0, 0.85
-"""... over this range to this share of the background."""
+"""Range of the colours of paths below the strongest one; weaker paths fade."""
 BACKGROUND = np.array([255, 255, 255], np.uint8)
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
 BOUNCE_WORDS = "none", "one", "two", "three"
-OPAQUE, DIM = 230, 70
-"""Opacity of a map, and of an outdated one, of 255."""
 
 
 def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = COLORS) -> UInt8[np.ndarray, "*n 3"]:
@@ -59,7 +55,8 @@ def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"]
         colors = colored(power_db, top - PATH_RANGE_DB, top + PATH_RANGE_DB / 5, "plasma")  # its last colours are pale
     else:
         colors = BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
-    faded = FADED * np.clip((top - PATH_RANGE_DB - power_db) / FADED_DB, 0, 1)[:, None]
+    over_db, faintest = 20.0, 0.85  # weaker paths fade over this range to this share of the background
+    faded = faintest * np.clip((top - PATH_RANGE_DB - power_db) / over_db, 0, 1)[:, None]
     return ((1 - faded) * colors + faded * BACKGROUND).round().astype(np.uint8)
 
 
@@ -94,7 +91,8 @@ def map_picture(values: Float[np.ndarray, "ny nx"], low: float, high: float, dim
     """Returns a map as an image, with the largest y at the top, transparent where the values are NaN. `low` and `high` are the
     values of the first and the last colour; `dim` shows it as an outdated one."""
     known = np.isfinite(values)
-    opacity = (DIM if dim else OPAQUE) * known[..., None].astype(np.uint8)
+    opaque, outdated = 230, 70  # opacity of a map, and of an outdated one, of 255
+    opacity = (outdated if dim else opaque) * known[..., None].astype(np.uint8)
     picture = np.concatenate([colored(np.where(known, values, low), low, high), opacity], -1)
     return np.ascontiguousarray(picture[::-1])
 

@@ -16,14 +16,10 @@ from wbgs_jax.types import Receiver
 from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.session import PathList
 
-DOME_RADIUS = 0.4
-"""Radius of the spectrum around the receiver, relative to the shortest side of the room."""
 CHOSEN = np.array([[214, 39, 40]], np.uint8)
 """Colour of the chosen path."""
 VALID, INVALID = (31, 97, 180), (214, 39, 40)
 """Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
-ASIDE = (-0.08, -0.45, 0.6)
-"""Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes."""
 FIELD_OF_VIEW = float(np.radians(60))
 """Vertical, of the camera."""
 
@@ -66,7 +62,8 @@ class SceneView:
     @property
     def dome_radius(self) -> float:
         """Largest distance of the drawn spectrum from the receiver, metres."""
-        return DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
+        share = 0.4  # radius of the spectrum around the receiver, relative to the shortest side of the room
+        return share * float(np.ptp(self.box, axis=0).min())
 
     def show_receiver(self, receiver: Receiver) -> None:
         """Shows the receiver at its place."""
@@ -95,7 +92,9 @@ class SceneView:
             turned = int(np.ptp(self.box, axis=0)[flat].argmax()) == 0
         else:
             turned = False
-        aside = np.array([ASIDE[1], ASIDE[0], ASIDE[2]] if turned else ASIDE)
+        # Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes.
+        from_middle = (-0.08, -0.45, 0.6)
+        aside = np.array([from_middle[1], from_middle[0], from_middle[2]] if turned else from_middle)
         direction = np.roll(aside, self.up - 2)
         # Parts of the picture in which the room is seen: middle and half size, relative to half of the picture. On a tall
         # screen the panel covers the lower half.
