@@ -30,9 +30,6 @@ from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NO_PATH_DB
 
-SHOWN = 6
-"""Maximum number of spectra in a plot."""
-
 
 def draw_all(
     folder: Path,
@@ -58,7 +55,7 @@ def draw_all(
     return [save(figure, folder / name) for name, figure in figures.items()]
 
 
-def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
+def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = 6) -> Int[np.ndarray, " count"]:
     """Returns positions in `index` that cover the range of frequencies, with different transmitters if there are enough."""
     frequencies = np.unique(dataset.frequencies_hz[index])
     rng = np.random.default_rng(0)

@@ -244,13 +244,11 @@ def _reason(error: Exception) -> str:
     return words[:200] or type(error).__name__
 
 
-LARGEST, DEEPEST = 1_000_000, 20
-"""Maximum number of characters and of levels of nesting, far more than files of positions need."""
-
-
 class _PlainLoader(yaml.SafeLoader):
     """PyYAML's safe loader without aliases."""
 
+    deepest = 20
+    """Maximum number of levels of nesting, far more than files of positions need."""
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -258,8 +256,8 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.YAMLError("it has an alias (*name); write the values out")
         self.depth += 1
-        if self.depth > DEEPEST:
-            raise yaml.YAMLError(f"it is nested more than {DEEPEST} levels deep")
+        if self.depth > self.deepest:
+            raise yaml.YAMLError(f"it is nested more than {self.deepest} levels deep")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -271,9 +269,9 @@ def read_yaml(path: Path) -> Any:
     Raises:
         UserError: the file is missing, damaged, too large, or uses aliases or very deep nesting.
     """
-    text = read_text(path)
-    if len(text) > LARGEST:
-        raise UserError(f"{path} has {len(text):,} characters; a file of positions has far fewer than {LARGEST:,}")
+    text, largest = read_text(path), 1_000_000
+    if len(text) > largest:
+        raise UserError(f"{path} has {len(text):,} characters; a file of positions has far fewer than {largest:,}")
     try:
         return yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:  # ValueError: an invalid date

@@ -159,13 +159,11 @@ class Dataset(Observed):
         return positions[first], which.reshape(-1)
 
 
-NAMES = ("name", "convention")
-
-
 def checksum(dataset: Dataset) -> str:
     """Returns a checksum (SHA-256) of all numbers of a dataset, including its split but not names."""
     found = hashlib.sha256()
-    parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
+    numbers = (field.name for field in dataclasses.fields(dataset) if field.name not in ("name", "convention"))
+    parts = {name: getattr(dataset, name) for name in numbers}
     # Kinds of observation with another name in checksums, so that those of old run folders remain valid.
     renamed = {"pas": "images"}
     parts |= {renamed.get(name, name): values for name, values in parts.pop("observations").items()}

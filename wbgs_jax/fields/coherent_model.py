@@ -46,8 +46,6 @@ from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 DENSITIES_HZ = 1e9, 1e11
 """Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
 between, constant beyond."""
-LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
-"""Logarithm of the largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows."""
 
 
 @pytree
@@ -265,7 +263,9 @@ def phase_blind_pas(params: WaveParams, plan: WavePlan, paths: TracedPaths, link
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
     """Returns the slabs of all facets at one frequency."""
     m, material = params.materials, plan.surfaces.facets.material
-    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
+    # The largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows.
+    largest_log = float(np.log(1e6))
+    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), largest_log))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
     thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
     return Slabs(permittivity[material], thickness[material], params.thick)

@@ -30,8 +30,6 @@ MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
 LEVEL = 0.9
 """Nominal coverage of the intervals."""
-AT_RECEIVER_M = 0.1
-"""Distance up to which a transmitter counts as being at the receiver, where none can be measured and intervals do not hold."""
 POWER_MARGIN_DB = 0.1
 """Keeps the logarithm of a zero error finite."""
 FILE, POWER_FILE = "confidence.npz", "power_confidence.npz"
@@ -147,7 +145,7 @@ def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array
 def expected_ssim(
     confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
 ) -> Expected:
-    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver (`AT_RECEIVER_M`).
+    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver.
 
     Args:
         confidence: the regression, for the queried receiver.
@@ -172,7 +170,7 @@ def expected_power(
     confidence: PowerConfidence, power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]
 ) -> ExpectedPower:
     """Returns the expected errors of received powers (dB) that a field predicts for B queries; NaN for a transmitter at the
-    receiver (`AT_RECEIVER_M`).
+    receiver.
 
     Args:
         confidence: the regression.
@@ -191,7 +189,8 @@ def expected_power(
 
 def _apart(query: Query, rx_position: Float[Array, "*#b 3"]) -> Bool[Array, " b"]:
     """Returns which transmitters are not at the receiver."""
-    return jnp.sum((query.tx_position - rx_position) ** 2, -1) > AT_RECEIVER_M**2
+    at_receiver_m = 0.1  # up to this distance none can be measured and intervals do not hold
+    return jnp.sum((query.tx_position - rx_position) ** 2, -1) > at_receiver_m**2
 
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:

@@ -16,8 +16,6 @@ from wbgs_jax.radio.array import codebook, pas_directions
 from wbgs_jax.radio.geometry import direction_to_angles
 from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 
-BEST_BEAM = "best-beam"
-
 
 @dataclass(frozen=True)
 class Plane:
@@ -69,7 +67,7 @@ def evaluate_plane(
     for name in parts[0]:
         values = np.moveaxis(np.concatenate([part[name] for part in parts]), 1, 0)
         maps[name] = values.reshape(len(frequencies_hz), *shape, *values.shape[2:])
-    more = beam_angles() if what == BEST_BEAM else {}
+    more = beam_angles() if what == "best-beam" else {}
     return maps | more | {"xs": plane.xs, "ys": plane.ys, "height": np.array(plane.height), "frequencies_hz": frequencies_hz}
 
 

@@ -17,14 +17,12 @@ from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814
 """Y_0^0; a colour is 0.5 + SH_CONSTANT * f_dc."""
-RESTS = 45
-"""Coefficients beyond the constant that viewers expect: three degrees for three colours."""
 PLACE, COLOUR, SCALE, TURN = (
     ("x", "y", "z"),
     ("f_dc_0", "f_dc_1", "f_dc_2"),
     *(tuple(f"{name}_{i}" for i in range(count)) for name, count in (("scale", 3), ("rot", 4))),
 )
-NAMES = (*PLACE, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(RESTS)), "opacity", *SCALE, *TURN)
+NAMES = (*PLACE, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(45)), "opacity", *SCALE, *TURN)
 NEEDED = (*PLACE, *COLOUR, "opacity", *SCALE, *TURN)
 
 

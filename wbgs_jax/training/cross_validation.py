@@ -1,7 +1,7 @@
 """Corrections of a trained field if few transmitters were measured: simple methods, the weight of the field, and prediction
 intervals, all from cross-validation (host).
 
-A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than `ENOUGH`, simple methods
+A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than 20, simple methods
 are part of the mixture from the start (training/fit_mixture.py). A field without paths is cross-validated over all
 transmitters, in blocks (`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A
 field with paths takes too long for that; only its predictions for the validation part are used.
@@ -128,10 +128,6 @@ def shortened(settings: Settings, steps: int) -> Settings:
     return dataclasses.replace(settings, optim=optim, loop=loop)
 
 
-ENOUGH = 20
-"""Number of validation transmitters from which on the validation part alone is sufficient."""
-
-
 class Training(NamedTuple):
     """The arguments of the training of a field."""
 
@@ -158,7 +154,8 @@ class Few(NamedTuple):
 def is_few(dataset: Dataset) -> bool:
     """Returns whether a dataset has so few spectra that simple methods are part of the mixture."""
     validation = np.unique(dataset.tx_index[dataset.validation])
-    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < ENOUGH
+    enough = 20  # validation transmitters, from which on the validation part alone is sufficient
+    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < enough
 
 
 def learn_few(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> Few:

@@ -13,7 +13,6 @@ COLORS, GAUSSIAN_COLORS = "viridis", "inferno"
 """Colormaps of spectra and maps, and of Gaussians."""
 PATH_RANGE_DB = 40.0
 """Range of the colours of paths below the strongest one; weaker paths fade."""
-BACKGROUND = np.array([255, 255, 255], np.uint8)
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
 BOUNCE_WORDS = "none", "one", "two", "three"
@@ -57,7 +56,7 @@ def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"]
         colors = BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
     over_db, faintest = 20.0, 0.85  # weaker paths fade over this range to this share of the background
     faded = faintest * np.clip((top - PATH_RANGE_DB - power_db) / over_db, 0, 1)[:, None]
-    return ((1 - faded) * colors + faded * BACKGROUND).round().astype(np.uint8)
+    return ((1 - faded) * colors + faded * 255).round().astype(np.uint8)
 
 
 def linear(colors: UInt8[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:

@@ -20,12 +20,9 @@ from wbgs_jax.viewer.drawing import BOUNCE_WORDS, BY_BOUNCES, COLORS, color_tabl
 WIDTH = 350.0
 LEFT, RIGHT, TOP, BOTTOM = 40.0, 52.0, 15.0, 27.0
 """Margins of axes: labels at the left, a colour bar at the right, the value under the pointer at the top, labels below."""
-SPECTRUM_HEIGHT, CURVE_HEIGHT, MAP_HEIGHT = 76.0, 84.0, 168.0
-"""Heights of the axes; that of a map is the largest that its shape can have."""
+CURVE_HEIGHT = 84.0
 KNOTS = 33
 """Colours of a filter, between which the browser interpolates."""
-TICKS = 4
-"""Approximate number of ticks of an axis."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Axis:
         return (np.asarray(value, float) - self.low) / (self.high - self.low)
 
 
-def axis_over(low: float, high: float, label: str, count: int = TICKS) -> Axis:
+def axis_over(low: float, high: float, label: str, count: int = 4) -> Axis:
     """Returns an axis from `low` to `high` with about `count` round ticks."""
     high = high if high > low else low + 1.0
     rough = (high - low) / count
@@ -64,7 +61,7 @@ AMPLITUDE = Axis(0.0, 1.0, "amplitude", (0.0, 0.5, 1.0))
 def spectrum(pas: Float[np.ndarray, "90 360"], name: str) -> str:
     """Returns a figure of a spectrum: azimuth to the right, zenith 0 at the top, amplitude relative to the maximum as colour.
     `name` distinguishes the figures of a page."""
-    box = LEFT, TOP, WIDTH - LEFT - RIGHT, SPECTRUM_HEIGHT
+    box = LEFT, TOP, WIDTH - LEFT - RIGHT, 76.0
     read = "azimuth {x}°, zenith {y}°: amplitude {v}"
     return _figure(
         [_image(pas, box, AMPLITUDE, name), _axes(box, AZIMUTH, ZENITH), _color_bar(box, AMPLITUDE, name)],
@@ -92,8 +89,8 @@ def power_map(
         marks: places (x, y) that are marked by their first letter, by name.
         dim: whether the map is shown as an outdated one.
     """
-    wide = WIDTH - LEFT - RIGHT
-    per_metre = min(wide / (x.high - x.low), MAP_HEIGHT / (y.high - y.low))
+    wide, highest = WIDTH - LEFT - RIGHT, 168.0
+    per_metre = min(wide / (x.high - x.low), highest / (y.high - y.low))
     box = LEFT, TOP, per_metre * (x.high - x.low), per_metre * (y.high - y.low)
     lines = "".join(
         f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}"/>'

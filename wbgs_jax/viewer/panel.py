@@ -19,8 +19,6 @@ SHOWN_PATHS = 30
 """Number of paths that are drawn at first."""
 LABEL_ROOM = 0.14
 """Minimum distance of two marks of the frequency slider that are labelled, relative to its range."""
-BAND_MHZ, POINTS = 100.0, 201
-"""Initial bandwidth of the frequency response, and its number of frequencies."""
 MOVED = "moved"
 
 
@@ -125,7 +123,7 @@ def make_panel(
             disabled=off,
             hint="Transmitted power, and noise floor of the receiver",
         )
-        band = gui.add_number("band [MHz]", BAND_MHZ, min=1.0, max=2000.0, step=10.0, disabled=not most)
+        band = gui.add_number("band [MHz]", 100.0, min=1.0, max=2000.0, step=10.0, disabled=not most)
         channel = gui.add_html("" if most else as_words("This field does not predict paths."))
     with tabs.add_tab("Paths"):
         paths = gui.add_slider("strongest", 0, most_paths, step=1, initial_value=min(SHOWN_PATHS, most), disabled=not most)
@@ -260,7 +258,7 @@ def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float)
         return as_words("This field does not predict paths.")
     if not len(paths.power_db):
         return as_words("No path carries power from here to the receiver.")
-    offsets = np.linspace(-band_mhz / 2, band_mhz / 2, POINTS)
+    offsets = np.linspace(-band_mhz / 2, band_mhz / 2, 201)
     response = budget.received_dbm(paths.frequency_response_db(1e6 * offsets))
     x = figures.axis_over(-band_mhz / 2, band_mhz / 2, "offset from the carrier [MHz]")
     high = float(np.ceil(response.max() / 5) * 5)

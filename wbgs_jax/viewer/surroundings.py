@@ -16,8 +16,6 @@ from wbgs_jax.types import Receiver
 from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.session import PathList
 
-CHOSEN = np.array([[214, 39, 40]], np.uint8)
-"""Colour of the chosen path."""
 VALID, INVALID = (31, 97, 180), (214, 39, 40)
 """Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
 FIELD_OF_VIEW = float(np.radians(60))
@@ -173,7 +171,7 @@ class SceneView:
         self._draw_lines("/paths", points, colors, 2.0)
         self._draw_handles(drawing.path_handles(points), colors, on_click)
         if chosen is not None and chosen < len(points):
-            self._draw_lines("/chosen_path", points[chosen : chosen + 1], CHOSEN, 5.0)
+            self._draw_lines("/chosen_path", points[chosen : chosen + 1], np.array([[214, 39, 40]], np.uint8), 5.0)
         else:
             self.scene.remove_by_name("/chosen_path")
 
