@@ -548,7 +548,7 @@ def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
     shown_receivers = 12  # maximum number of receivers in a plot
     shown = min(shown_receivers, len(cells.receivers))
-    columns, rows = min(3, shown), -(-shown // 3)
+    columns, rows = min(3, shown), -(-shown // 3)  # up to three beside each other
     size = (high - low) / max(high - low)
     figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)

@@ -87,9 +87,9 @@ def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[A
     words = [source_digest(), jax.__version__, jax.default_backend(), structure, *(f"{s.dtype} {s.shape}" for s in shapes)]
     name = hashlib.sha256("\n".join(words).encode()).hexdigest()[:32]
     path = folder / PROGRAMS / f"{name}.bin"
-    kernel_call = "__gpu$xla.gpu.triton"  # custom call of the renderer's GPU kernels, whose stability JAX does not guarantee
     if not path.exists():
-        kernels = jax.export.DisabledSafetyCheck.custom_call(kernel_call)  # the file is used by one version of JAX only
+        # JAX does not guarantee the stability of the renderer's GPU kernels; the file is used by one version of JAX only.
+        kernels = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
         exported = jax.export.export(jax.jit(function), disabled_checks=[kernels])(*shapes)
         with atomic_write(path) as stream:
             stream.write(exported.serialize())

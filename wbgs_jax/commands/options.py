@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from jaxtyping import Bool, Float
 
-from wbgs_jax._util.cli import say
+from wbgs_jax._util.cli import parse_numbers, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.training import EXAMPLE
 
@@ -81,10 +81,7 @@ def parse_receiver(word: str, dataset: "Dataset") -> "Receiver":
     if not word or (word.isdecimal() and len(word) < 7):
         return dataset.receiver(int(word or 0))
     like = dataset.receiver()
-    try:
-        values = np.array([float(part) for part in word.split(",")])
-    except ValueError:
-        values = np.zeros(0)
+    values = parse_numbers(word)
     turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
     shortest = 1e-3  # minimum length of a quaternion; the maximum is its inverse, others are mistakes
     rotated = shortest < np.linalg.norm(turn) < 1 / shortest

@@ -153,23 +153,9 @@ def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndar
     powers = np.where(np.isneginf(powers), np.nan, powers)
     # Numbers that devices write if they received nothing ...
     sentinels = (
-        0.0,
-        1.0,
-        100.0,
-        127.0,
-        255.0,
-        -100.0,
-        -110.0,
-        -120.0,
-        -127.0,
-        -128.0,
-        -140.0,
-        -150.0,
-        -174.0,
-        -199.0,
-        -200.0,
-        -999.0,
-    )
+        0.0, 1.0, 100.0, 127.0, 255.0,
+        -100.0, -110.0, -120.0, -127.0, -128.0, -140.0, -150.0, -174.0, -199.0, -200.0, -999.0,
+    )  # fmt: skip
     apart_db = 8.0  # ... if all other values are at least this far to one side of them ...
     often = 0.2  # ... or if at least this fraction of the readings equals the lowest value.
     for number in sentinels:

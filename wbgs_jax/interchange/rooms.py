@@ -49,16 +49,13 @@ def read_room(
         UserError: the file or the materials cannot be read, or the size is not that of a room.
     """
     objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
-    # Metres: range of the largest side of a scene; outside it the unit is probably not the metre, unless the scale is given,
-    # ...
-    extent = (0.5, 200.0)
-    given_extent = (0.01, 20_000.0)  # ... in which case this range applies. A scene.xml of Sionna RT is always in metres.
-    _check_size(file, objects, given_extent if simulated or scale is not None else extent)
-    unknown = 0.0  # thickness in a room file that marks an unmeasured one
+    # Range of the largest side, metres: outside it the unit is probably not the metre. It is wider if the scale is given; a
+    # scene.xml of Sionna RT is always in metres.
+    _check_size(file, objects, (0.01, 20_000.0) if simulated or scale is not None else (0.5, 200.0))
     if named or materials is not None or simulated:
         slabs = slabs_of(file, objects, materials)
     else:
-        slabs = [Slab(one.name, unknown) for one in objects]
+        slabs = [Slab(one.name, 0.0) for one in objects]  # of unknown thickness
     found = [RoomObject(one.name, one.mesh, slab) for one, slab in zip(objects, slabs, strict=True)]
     if simulated:
         return found

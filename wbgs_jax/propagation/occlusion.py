@@ -106,9 +106,8 @@ def _boxes(
 ]:
     """Returns lowest and highest corners of blocks, then of leaves (`FacetHierarchy`). `there` excludes padding; `xp` is the
     module of the arrays."""
-    # Metres, and fraction of the largest coordinate, by which boxes are enlarged, so that rounding loses no intersection.
-    enlarged = 2e-3, 1e-5
-    margin, own, real = enlarged[0] + enlarged[1] * xp.max(xp.abs(corners)), corners[facet], there[..., None]
+    # Boxes are enlarged by millimetres and by a fraction of the largest coordinate, so that rounding loses no intersection.
+    margin, own, real = 2e-3 + 1e-5 * xp.max(xp.abs(corners)), corners[facet], there[..., None]
     far = 1e9  # coordinates (metres) of the boxes of padding, which no segment reaches
     low = xp.where(real, own.min(2) - margin, far).min(1).reshape(-1, WORD, 3)
     high = xp.where(real, own.max(2) + margin, -far).max(1).reshape(-1, WORD, 3)

@@ -164,8 +164,7 @@ def tabulated(e_theta: Inexact[np.ndarray, "zenith azimuth"], e_phi: Inexact[np.
         ValueError: the table is too small, or has an odd number of azimuths.
     """
     rows, columns = e_theta.shape
-    smallest_table = 4, 4  # smallest number of zenith angles and azimuths of a tabulated pattern
-    if rows < smallest_table[0] or columns < smallest_table[1] or columns % 2:
+    if rows < 4 or columns < 4 or columns % 2:
         raise ValueError(f"{rows} zenith angles and {columns} azimuths; give at least 4 of both, azimuths in even number")
     if e_phi is None:
         values = np.array(e_theta)[..., None]

@@ -124,11 +124,11 @@ def make_panel(
             hint="Transmitted power, and noise floor of the receiver",
         )
         band = gui.add_number("band [MHz]", 100.0, min=1.0, max=2000.0, step=10.0, disabled=not most)
-        channel = gui.add_html("" if most else as_words("This field does not predict paths."))
+        channel = gui.add_html("" if most else _without_paths(None))
     with tabs.add_tab("Paths"):
         paths = gui.add_slider("strongest", 0, most_paths, step=1, initial_value=min(SHOWN_PATHS, most), disabled=not most)
         by_power = gui.add_dropdown("color", ("by power", "by reflections"), disabled=not most)
-        path_table = gui.add_html("" if most else as_words("This field does not predict paths."))
+        path_table = gui.add_html("" if most else _without_paths(None))
     with tabs.add_tab("Map"):
         map_controls = _map_controls(gui, session)
     with tabs.add_tab("Room"):
@@ -252,12 +252,17 @@ def truth_figure(sample: Sample | None) -> str:
     return figure("Spectrum at the receiver, observed", drawn + f'<div class="wbgs-words">{below}</div>')
 
 
+def _without_paths(paths: PathList | None) -> str:
+    """Returns why there are no paths to show."""
+    return as_words(
+        "This field does not predict paths." if paths is None else "No path carries power from here to the receiver."
+    )
+
+
 def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float) -> str:
     """Returns the frequency response of the link over a band around the carrier, and its impulse response."""
-    if paths is None:
-        return as_words("This field does not predict paths.")
-    if not len(paths.power_db):
-        return as_words("No path carries power from here to the receiver.")
+    if paths is None or not len(paths.power_db):
+        return _without_paths(paths)
     offsets = np.linspace(-band_mhz / 2, band_mhz / 2, 201)
     response = budget.received_dbm(paths.frequency_response_db(1e6 * offsets))
     x = figures.axis_over(-band_mhz / 2, band_mhz / 2, "offset from the carrier [MHz]")
@@ -284,10 +289,8 @@ def gaussian_legend(top: float, by: str) -> str:
 
 def path_list(paths: PathList | None, count: int, chosen: int | None, budget: LinkBudget, by_power: bool) -> str:
     """Returns the legend of the drawn paths and their table; `chosen` is the number of the path that is marked."""
-    if paths is None:
-        return as_words("This field does not predict paths.")
-    if not len(paths.power_db):
-        return as_words("No path carries power from here to the receiver.")
+    if paths is None or not len(paths.power_db):
+        return _without_paths(paths)
     power = budget.received_dbm(paths.power_db)
     legend = figures.bounce_legend()
     if by_power:
