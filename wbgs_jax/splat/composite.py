@@ -1,4 +1,4 @@
-"""Front-to-back alpha blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see reference.py).
+"""Front-to-back alpha blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see `render.render_dense`).
 
 A job holds `CHUNK` Gaussians of one tile. Its footprints are computed once and shared by all queries; an unrolled chain of
 products blends them. There are two implementations of the same image, chosen by the platform that the code is lowered for
