@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset, Materials
-from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.mesh.bodies import ClosedBody, inside
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Mesh, Receiver, Surface, SurfaceSampling
 

@@ -140,12 +140,8 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
     return values
 
 
-DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
-"""Largest longitude and latitude; largest extent of a site in degrees; and minimum ratio of its distance from the origin to its
-extent."""
-FEWEST, ELSEWHERE = 5, 50.0
-"""Minimum number of positions that may be degrees, or of powers of a receiver that may lack their sign; and minimum ratio of
-the distance to the nearest receiver (in metres) to the extent of such positions."""
+DEGREES, TINY = (180.0, 90.0), 0.3
+"""Largest longitude and latitude, and largest extent of a site, degrees."""
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
@@ -184,7 +180,7 @@ def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
         )
     for number, column in enumerate(powers.T, 1):
         own = column[~np.isnan(column)]
-        if len(own) >= FEWEST and own.min() >= 0:
+        if len(own) >= 5 and own.min() >= 0:  # fewer may all be strong
             raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
     powers_dbm = (-200.0, 50.0)  # range of plausible powers
     if not ((received >= powers_dbm[0]) & (received <= powers_dbm[1])).all():
@@ -204,7 +200,8 @@ def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
     plane = positions[:, :2]
     extent, offset = np.ptp(plane, axis=0).max(), np.abs(plane.mean(0)).max()
     ranged = (np.abs(plane) <= DEGREES).all() or (np.abs(plane) <= DEGREES[::-1]).all()
-    if len(plane) > 1 and ranged and extent < TINY and offset > FAR * max(extent, 1e-12):
+    far = 20.0  # minimum ratio of the distance of a site in degrees from the origin to its extent
+    if len(plane) > 1 and ranged and extent < TINY and offset > far * max(extent, 1e-12):
         raise UserError(
             f"{what} all lie within {extent:.2g}, {offset:.3g} from the origin: degrees of longitude and latitude; project "
             "them to metres (for example UTM), relative to an origin on the site"
@@ -216,7 +213,9 @@ def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np
     plane = np.unique(places[:, :2], axis=0)
     extent = np.ptp(plane, axis=0).max()
     nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
-    if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
+    # Minimum number of positions, and minimum ratio of the distance to the nearest receiver (metres) to their extent (degrees).
+    fewest, elsewhere = 5, 50.0
+    if len(plane) >= fewest and extent < TINY and nearest > elsewhere * extent and (np.abs(plane) <= max(DEGREES)).all():
         raise UserError(
             f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
             "latitude; project them to metres (for example UTM), relative to the origin of the receivers"

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.pytree import AnyArray
 from wbgs_jax.inference.quantities import INTERVALS
-from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.mesh.bodies import ClosedBody, inside
 from wbgs_jax.types import MIN_FREQUENCY_HZ
 
 ROUNDED = 1e-6
