@@ -9,10 +9,11 @@ from wbgs_jax._util.errors import UserError
 
 LOCAL = "local"
 """Value in place of a scheduler's address that starts processes on this machine."""
+CONNECT_S = "30s"
 SETTINGS: dict[str, Any] = {
     # By default Dask limits linear algebra to one thread per process, and serial runs might then differ in the last bit.
     "distributed.nanny.pre-spawn-environ": {},
-    "distributed.comm.timeouts.connect": "30s",
+    "distributed.comm.timeouts.connect": CONNECT_S,
     # A worker that compiles for minutes is busy, not lost.
     "distributed.scheduler.worker-ttl": None,
 }
@@ -43,7 +44,7 @@ def connected(where: str, workers: int) -> Iterator[Any]:
             cluster = distributed.LocalCluster(**wanted, silence_logs=logging.ERROR)
             stack.callback(_close, cluster)
         try:
-            client = distributed.Client(cluster, timeout="30s")
+            client = distributed.Client(cluster, timeout=CONNECT_S)
         except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise UserError(f"no Dask scheduler answers at {where} ({reason}); start one with `dask scheduler`") from error
