@@ -2,6 +2,7 @@
 strongest direction, and the power lost by choosing beams from predicted spectra.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,14 @@ PSNR_LIMIT_DB = 100.0
 
 def ssim(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:
     """Returns the structural similarity of every spectrum, float64: scikit-image, data_range 1, its default 7 x 7 window."""
-    pairs = zip(predicted, truth, strict=True)
-    return np.array([structural_similarity(p.astype(np.float64), t.astype(np.float64), data_range=1.0) for p, t in pairs])
+
+    def one(p: Float[np.ndarray, "90 360"], t: Float[np.ndarray, "90 360"]) -> float:
+        return float(structural_similarity(p.astype(np.float64), t.astype(np.float64), data_range=1.0))
+
+    if len(predicted) != len(truth):
+        raise ValueError(f"{len(predicted)} spectra cannot be compared with {len(truth)}")
+    with ThreadPoolExecutor() as threads:  # its filters release the interpreter's lock
+        return np.array(list(threads.map(one, predicted, truth)), np.float64)
 
 
 def mae(predicted: Float[np.ndarray, "n 90 360"], truth: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, " n"]:

@@ -22,6 +22,7 @@ from wbgs_jax import metrics
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
@@ -461,6 +462,22 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
 
 
+def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], frequency_hz: float) -> Figure:
+    """Returns a figure of a channel over time (`applications.movement.channel_over_time`, with `time_s`): its power, and its
+    Doppler spectrogram from the strongest part down to `FADED_DB` below it."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    above.plot(found["time_s"], _amplitude_db(found["response"]), linewidth=1)
+    above.set(ylabel="received power [dB]")
+    doppler = found["doppler_db"]
+    bars = {"vmin": float(doppler.max()) - FADED_DB, "vmax": float(doppler.max())}
+    shown = below.pcolormesh(found["doppler_time_s"], found["doppler_hz"], doppler, cmap=COLORS, shading="nearest", **bars)
+    below.set(xlabel="time [s]", ylabel="Doppler shift [Hz]")
+    figure.colorbar(shown, ax=below, label="power [dB]", extend=_clipped(doppler, **bars))
+    figure.suptitle(f"{origin_words(source)}, {frequency_hz / 1e9:g} GHz", fontsize=9)
+    return figure
+
+
 def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
     """Returns a figure of the first six maps with the walls that the plane cuts. Stars are the receiver
     or, for quantities of several transmitters, these. `source` is the provenance (`LoadedField.source`)."""
@@ -538,42 +555,27 @@ def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
 
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
-    height = float(np.median(cells.places[:, 2]))
-    outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), cells.places[:, :2], cells.receivers[:, :2]])
+    height, places = float(np.median(cells.places[:, 2])), cells.places
+    outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), places[:, :2], cells.receivers[:, :2]])
     finest, margin = 0.1, 0.3  # pixel spacing and margin around the plan, metres
+    most_pixels, most_receivers = 40_000, 12  # the spacing grows for larger plans
     low, high = outline.min(0) - margin, outline.max(0) + margin
-    pixels = 40_000  # maximum number of pixels; the spacing grows for larger plans
-    spacing = max(finest, float(np.sqrt(np.prod(high - low) / pixels)))
+    spacing = max(finest, float(np.sqrt(np.prod(high - low) / most_pixels)))
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
-    powers = _powers(learned, np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1))
-    shown_receivers = 12  # maximum number of receivers in a plot
-    shown = min(shown_receivers, len(cells.receivers))
-    columns, rows = min(3, shown), -(-shown // 3)  # up to three beside each other
-    size = (high - low) / max(high - low)
-    figure = Figure(figsize=(1 + 4 * columns * size[0], 0.8 + 4.2 * rows * size[1]), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    span = {"vmin": float(powers[:, :shown].min()), "vmax": float(powers[:, :shown].max())}
-    for r, axis in enumerate(axes.flat):
-        if r >= shown:
-            axis.axis("off")
-            continue
-        extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
-        image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap="viridis", **span)
-        _plan(axis, walls, cells.places)
+    pixels = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1)
+    powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, 2048)
+    titles = [f"receiver {r + 1}" for r in range(min(most_receivers, len(cells.receivers)))]
+    width, depth = 4.1 * (high - low) / max(high - low)
+    figure, axes = _panels(titles, 3, (width, depth), sharex=True, sharey=True)
+    norm = Normalize(*np.quantile(powers[:, : len(axes)], (0, 1)))
+    extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
+    for r, axis in enumerate(axes):
+        image = axis.imshow(powers[:, r].reshape(len(y), len(x)), extent=extent, origin="lower", cmap=COLORS, norm=norm)
+        for wall in np.asarray(walls.ends):
+            axis.plot(wall[:, 0], wall[:, 1], color="black", linewidth=1.2)
+        axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
         axis.plot(*cells.receivers[r, :2], **STAR)
-        axis.set_title(f"receiver {r + 1}", fontsize=10)
-    axes[0, 0].legend(fontsize=8, loc="upper right")
-    _name_axes(axes.flat, "x [m]", "y [m]")
+    axes[0].legend(fontsize=8, loc="upper right")
+    _name_axes(axes, "x [m]", "y [m]")
     figure.colorbar(image, ax=axes, shrink=0.8, label=f"mean received power {height:.2g} m above the floor [dBm]")
     return figure
-
-
-def _plan(axis: Axes, walls: Walls, places: Float[np.ndarray, "n 3"]) -> None:
-    for wall in np.asarray(walls.ends):
-        axis.plot(wall[:, 0], wall[:, 1], color="black", linewidth=1.2)
-    axis.plot(places[:, 0], places[:, 1], ".", color="black", markersize=1, alpha=0.5)
-
-
-def _powers(learned: PowerMap, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n r"]:
-    blocks = np.array_split(places, -(-len(places) // 2048))
-    return np.concatenate([np.asarray(received_power(learned, jnp.asarray(block, jnp.float32))[0]) for block in blocks])

@@ -20,10 +20,10 @@ from experiments.results import FOLDER
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.files import write_json
 from wbgs_jax.applications import choose_next_places
-from wbgs_jax.commands import measure
-from wbgs_jax.data.rssi_folder import Readings, load_readings
+from wbgs_jax.data.rssi_folder import Readings
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.power_map.model import LENGTH, learn_map, received_power
+from wbgs_jax.power_map.survey import load_survey
 
 SHARED = Path("..") / "shared" / "data"
 SETS = {"ble_flat": 100, "ble_tetam": 40}
@@ -92,10 +92,8 @@ def readings_for(error: float, curve: dict[int, float]) -> float:
 
 def account(name: str, seeds: int) -> dict[str, Any]:
     """Returns the mean curves of a set over seeds, with standard deviations, and the readings that each method needs."""
-    folder = SHARED / name
-    cells, _ = measure.means(load_readings(folder, measure.Command.height), measure.Command.cell)
-    walls = measure.walls_of(measure.Command(data=folder))
-    curves = {method: [curve(cells, walls, method, seed) for seed in range(seeds)] for method in METHODS}
+    survey = load_survey(SHARED / name)
+    curves = {method: [curve(survey.cells, survey.walls, method, seed) for seed in range(seeds)] for method in METHODS}
     mean = {method: {n: float(np.mean([one[n] for one in own])) for n in own[0]} for method, own in curves.items()}
     std = {method: float(np.mean([np.std([one[n] for one in own]) for n in own[0]])) for method, own in curves.items()}
     counts = np.array(list(mean["random"]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import FREQUENCIES_HZ, RX, tiny_dataset, tiny_scene, tiny_settings
-from builders.untrained import make_trained
+from builders.untrained import make_coherent_run, make_trained
 from jax.extend.core import jaxprs_in_params
 
 from wbgs_jax.data.scene import DatasetScene
@@ -15,6 +15,7 @@ from wbgs_jax.inference import predictor as inference
 from wbgs_jax.inference.batching import map_queries, predict_blocks, predict_many, predict_map
 from wbgs_jax.inference.predictor import make_predictor
 from wbgs_jax.splat import TileLimits
+from wbgs_jax.training.run_folder import load_trained
 from wbgs_jax.types import Query, make_query, make_receiver
 
 TX = np.array([[1.0, 0.5, 1.5], [-1.0, 1.0, 1.2]])
@@ -213,6 +214,21 @@ def test_spectra_of_a_dataset_are_those_of_its_queries(trained, predict, monkeyp
     images = inference.predict_spectra(trained.field, trained.params, dataset, index)
     expected = predict_many(predict, dataset.tx_positions[index], dataset.frequencies_hz[index], block=2)
     np.testing.assert_allclose(images, expected, atol=1e-6)
+
+
+def test_links_of_any_number_share_a_compiled_program(tmp_path, monkeypatch):
+    """Paths are prepared for all links and handed over for those of a block: the answers are those of the whole plan."""
+    coherent = load_trained(make_coherent_run(tmp_path / "run"))
+    field, params, dataset = coherent.field, coherent.params, coherent.dataset()
+    monkeypatch.setattr(inference, "BLOCK", 4)
+    inference._observe.clear_cache()
+    few, all_links = np.arange(3), np.arange(len(dataset))[::-1]
+    found = [np.asarray(inference.observe_links(field, params, dataset, index).pas) for index in (few, all_links)]
+    assert inference._observe._cache_size() == 1
+    links = dataset.links(all_links)
+    whole = field.plan(params, dataset.receiver(), field.prepare(links, dataset.receivers))
+    np.testing.assert_allclose(found[1], _render(field, params, whole, links), atol=2e-6)
+    np.testing.assert_allclose(found[0], found[1][::-1][:3], atol=2e-6)
 
 
 def test_what_is_known_about_the_training():

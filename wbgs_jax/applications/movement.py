@@ -5,7 +5,7 @@ Doppler shifts are not computed, they are what the samples show. A rate above 4 
 moving at v reflects.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -14,7 +14,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Complex, Float
 
+from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import MaterialProperties, Params
 from wbgs_jax.fields.calibratable import Calibratable
@@ -24,10 +26,14 @@ from wbgs_jax.propagation.displacement import Motion
 from wbgs_jax.propagation.image_method import ImageTree
 from wbgs_jax.propagation.mechanisms import sizes_of, trace_paths
 from wbgs_jax.radio.channel import Paths, decibels
-from wbgs_jax.types import Mesh, Query, Receiver
+from wbgs_jax.types import SPEED_OF_LIGHT, Mesh, Query, Receiver
 
 SKIN = 7.98, 36.4
 """Relative permittivity and conductivity (S/m) of dry skin at 60 GHz (Gabriel et al., Phys. Med. Biol. 41, 1996)."""
+COLUMNS = 12
+"""Windows, not counting those that overlap, of the spectrogram of a short channel."""
+REACH = 1.0
+"""Distance within which a point names a body, metres."""
 
 
 def person(
@@ -177,6 +183,84 @@ def paths_over_time(params: Any, plan: WavePlan, query: Query, motion: Motion) -
 
     found: Paths = jax.lax.map(at, (query, motion))
     return found
+
+
+def channel_over_time(
+    field: Field,
+    params: Params,
+    receiver: Receiver,
+    query: Query,
+    motion: Motion,
+    rate_hz: float,
+    at_once: int = 200,
+    advance: Callable[[], None] = lambda: None,
+) -> dict[str, np.ndarray]:
+    """Returns the channel at T instants with its paths and its Doppler spectrogram, computed in blocks (host).
+
+    Args:
+        field, params: a field with paths, with the bodies that move.
+        receiver: at its nominal position.
+        query: the transmitter and the frequency at each instant.
+        motion: where bodies and receiver are at each instant.
+        rate_hz: instants per second.
+        at_once: number of instants that are computed together.
+        advance: called after every block.
+
+    Returns:
+        response (T,), complex, at an element at the array's centre, relative to the transmitted amplitude; power_db (T,);
+        path_amplitude (T, k) and path_delay_s (T, k), with amplitude 0 where a path does not exist; doppler_hz (f,),
+        doppler_time_s (s,) and doppler_db (f, s) (`doppler_spectrogram`).
+
+    Raises:
+        UserError: the field does not trace paths.
+    """
+    plan = plan_movement(field, params, receiver, query.tx_position, motion)
+    _, params = _tracing(field, params)
+
+    def block(rows: tuple[Query, Motion]) -> tuple[Array, Array]:
+        found = jax.block_until_ready(paths_over_time(params, plan, *rows))
+        advance()
+        return found.amplitude, found.length
+
+    amplitude, length = map_blocks(block, (query, motion), at_once)
+    kept = (amplitude != 0).any(0)
+    response = amplitude.sum(-1)
+    window = min(max(len(response) // COLUMNS, 16), 128)
+    hertz, seconds, power = doppler_spectrogram(jnp.asarray(response), rate_hz, window)
+    return {
+        "response": response,
+        "power_db": np.asarray(decibels(jnp.abs(response) ** 2)),
+        "path_amplitude": amplitude[:, kept],
+        "path_delay_s": length[:, kept] / SPEED_OF_LIGHT,
+        "doppler_hz": np.asarray(hertz),
+        "doppler_time_s": np.asarray(seconds),
+        "doppler_db": np.asarray(power),
+    }
+
+
+def position_along(places: Float[np.ndarray, "n 3"], share: Float[np.ndarray, " t"]) -> Float[np.ndarray, "t 3"]:
+    """Returns where something is that passes places (metres) at constant speed, after shares of the time (0 to 1)."""
+    passed = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+    return np.stack([np.interp(share * passed[-1], passed, column) for column in places.T], axis=1)
+
+
+def nearest_body(field: Field, point: Float[np.ndarray, "3"]) -> int:
+    """Returns the number of the body of which a corner or a centre of a facet is nearest to a point (world frame, metres).
+
+    Raises:
+        UserError: the field does not trace paths, or no body is within `REACH` of the point.
+    """
+    own = field.ability(Calibratable)
+    if own is None:
+        raise UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
+    corners, number = np.asarray(own.field.facets.corners), np.asarray(own.field.facets.mover)
+    samples = np.concatenate([corners, corners.mean(1, keepdims=True)], 1)
+    distance = np.linalg.norm(samples - point, axis=-1).min(1)
+    if not distance.min() <= REACH:
+        raise UserError(
+            f"no body of the mesh is within {REACH:g} m of {point_words(point)}; give a point at the one that moves"
+        )
+    return int(number[distance.argmin()])
 
 
 def doppler_spectrogram(

@@ -63,7 +63,7 @@ def main(arguments: list[str] | None = None) -> None:
     console = Console(file=sys.stderr, markup=False, soft_wrap=True)
     index = held_out(dataset, command.part)
     console.print(f"evaluating {command.run} (step {trained.step}) on {len(index)} spectra of {dataset.name} ...")
-    report, predicted = evaluate(trained, dataset, command.part)
+    report, predicted = evaluate(trained, dataset, command.part, shown=True)
     beside = "" if command.data is None else f"-{dataset.name}"  # scores on other data never replace the run's own
     write_json(command.run / f"{with_part('eval', command.part)}{beside}.json", report)
     if command.data is None and (command.run / MANIFEST).exists():
@@ -73,6 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
         write_json(path, report | {"provenance": provenance(trained)})
         console.print(f"results: {path}")
     if command.pictures and dataset.has_spectra:
+        console.print("pictures ...")
         entries = curves.read(command.run / "metrics.jsonl")
         folder = command.run / f"{with_part('pictures', command.part)}{beside}"
         for path in plotting.draw_all(folder, dataset, index, predicted, report, entries):

@@ -23,6 +23,7 @@ COMMANDS = {
     ),
     "predict": Entry("wbgs_jax.commands.predict", "predict spectra or channel quantities with a trained field, or export it"),
     "map": Entry("wbgs_jax.commands.map", "predict maps over a floor: received power, best beams, K-factor, spreads"),
+    "move": Entry("wbgs_jax.commands.move", "predict a channel over time while antennas, people or furniture move"),
     "view": Entry("wbgs_jax.commands.view", "show a trained field in a browser: drag the transmitter, see paths and maps"),
     "next": Entry("wbgs_jax.commands.next", "choose where to measure next: where the field is most uncertain"),
     "measure": Entry("wbgs_jax.commands.measure", "fit a map of received power to measured powers, and score it"),

@@ -30,13 +30,14 @@ from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, check_writable, write_csv, write_json
 from wbgs_jax.commands.options import PICTURES, check_suffixes
-from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, extruded, load_walls
-from wbgs_jax.data.rssi_folder import Readings, attribution, cell_means, load_readings
+from wbgs_jax.data.floor_plan import extruded
+from wbgs_jax.data.rssi_folder import attribution
 from wbgs_jax.data.tables import check_positions
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.plotting import draw_power_maps, save
-from wbgs_jax.power_map.model import MAX_PLACES, PowerMap, learn_map, received_power
+from wbgs_jax.power_map.model import PowerMap, learn_map, received_power
+from wbgs_jax.power_map.survey import CELL_M, HEIGHT_M, find_walls, load_survey
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
 
@@ -48,9 +49,9 @@ class Command:
     """Folder with readings.csv, receivers.csv and, optionally, the floor plan walls.csv (docs/measured.md)."""
     floor_plan: Path | None = None
     """Walls: a CSV file of segments x1,y1,x2,y2, or of the corners x,y of an outline; by default that of the folder."""
-    height: float = 1.3
+    height: float = HEIGHT_M
     """Height of the transmitters above the floor (metres), if the readings have no z."""
-    cell: float = 0.25
+    cell: float = CELL_M
     """Side of the cells (metres) over which readings are averaged."""
     out: Path | None = None
     """Write the scores to this .json file."""
@@ -79,21 +80,6 @@ def check(command: Command) -> None:
         value = getattr(command, name)
         if not (np.isfinite(value) and (name == "height" or value > 0)):
             raise UserError(f"--{name} is {value:g}; give metres")
-
-
-def walls_of(command: Command) -> Walls:
-    """Returns the walls of --floor-plan, otherwise those of the folder; none if there is no floor plan."""
-    named = [command.floor_plan] if command.floor_plan else [command.data / name for name in FILES if command.data]
-    path = next((path for path in named if path.exists()), None)
-    if path is None and command.floor_plan:
-        raise UserError(f"floor plan {command.floor_plan} does not exist")
-    return NO_WALLS if path is None else load_walls(path)
-
-
-def means(readings: Readings, size: float) -> tuple[Readings, float]:
-    """Returns means over cells and the size of the cells, which is doubled until their number is within the limit of a map."""
-    cells = cell_means(readings, size)
-    return (cells, size) if len(cells.places) <= MAX_PLACES else means(readings, 2 * size)
 
 
 def table(found: list[Score]) -> Table:
@@ -129,19 +115,6 @@ def answers(learned: PowerMap, places: Float[np.ndarray, "tx 3"], where: Domain)
     return [["x", "y", "z", *names], *rows]
 
 
-def measured_domain(cells: Readings, walls: Walls) -> Domain:
-    """Returns the measured domain: the box around readings, receivers and walls."""
-    points = np.concatenate([cells.places, cells.receivers])
-    low, high = points.min(0), points.max(0)
-    ends = np.asarray(walls.ends).reshape(-1, 2)
-    if len(ends):
-        low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
-    # Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room,
-    # not the next building.
-    beyond_m = 2.0
-    return Domain("the readings", np.stack([low, high]), (0.0, np.inf), beyond_m)
-
-
 def report(learned: PowerMap, found: list[Score], command: Command, size: float) -> dict[str, Any]:
     """Returns the content of a results file."""
     law, scales = (np.asarray(a, float).round(4).tolist() for a in (learned.law, learned.scales))
@@ -173,7 +146,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(Command, args=arguments, prog="wbgs-jax measure")
     check(command)
     check_writable(command.out, command.picture, command.answers, command.mesh)
-    places, walls = parse_positions(command.tx), walls_of(command)
+    places, walls = parse_positions(command.tx), find_walls(command.data, command.floor_plan)
     check_positions("--tx", places)
     if command.mesh and not len(walls.ends):
         raise UserError("--mesh needs walls: give --floor-plan walls.csv")
@@ -183,13 +156,14 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"mesh: {command.mesh} ({len(walls.ends)} walls, {command.ceiling:g} m high)")
     if command.data is None:
         return
-    cells, size = means(load_readings(command.data, command.height), command.cell)
+    survey = load_survey(command.data, command.height, command.cell, command.floor_plan)
+    cells, size = survey.cells, survey.cell_m
     say(f"{len(cells.places)} cells of {size:g} m, {len(cells.receivers)} receivers, {len(walls.ends)} walls or faces of walls")
     for line in attribution(command.data):
         say(f"about the data: {line}")
     learned = learn_map(cells, walls)
     if command.tx:
-        where = measured_domain(cells, walls)
+        where = survey.domain
         rows = answers(learned, places, where)
         for row, outside in zip(rows[1:], where.outside(places), strict=True):
             what = "mean dBm" if outside else "mean dBm, 90 % within"

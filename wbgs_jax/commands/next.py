@@ -132,19 +132,16 @@ def of_readings(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     import jax
     import jax.numpy as jnp
 
-    from wbgs_jax.commands import measure
-    from wbgs_jax.data.rssi_folder import load_readings
     from wbgs_jax.power_map.model import LENGTH as ALIKE_M
     from wbgs_jax.power_map.model import learn_map, received_power
+    from wbgs_jax.power_map.survey import load_survey
 
     assert command.data is not None, "checked"
-    options = measure.Command(data=command.data)
-    walls = measure.walls_of(options)
-    cells, _ = measure.means(load_readings(command.data, options.height), options.cell)
-    learned = learn_map(cells, walls)
+    survey = load_survey(command.data)
+    learned = learn_map(survey.cells, survey.walls)
     _, std = jax.jit(received_power)(learned, jnp.asarray(places, jnp.float32))
-    outside = measure.measured_domain(cells, walls).outside(places)
-    return State(np.asarray(cells.places, float), np.where(outside, np.nan, np.asarray(std).mean(1)), "dB", ALIKE_M)
+    outside = survey.domain.outside(places)
+    return State(np.asarray(survey.cells.places, float), np.where(outside, np.nan, np.asarray(std).mean(1)), "dB", ALIKE_M)
 
 
 def choose(command: Command) -> None:

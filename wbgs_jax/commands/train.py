@@ -21,6 +21,7 @@ from wbgs_jax._util.cli import option_value, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.devices import by_first, connect, is_first
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.progress_lines import Pulse
 from wbgs_jax.config import Settings, check, from_sections, present_option, sections
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset
@@ -286,12 +287,13 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
         of_spectra, of_powers = learn_confidence(*trained, None)
         write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
         return
-    say("validation: correction by measured spectra nearby, prediction intervals")
-    learned = learn_neighbours(*trained) if config.neighbours else Learned()
-    write_neighbours(folder, learned.neighbours)
-    if learned.line:
-        say(learned.line)
-    write_confidence(folder, *learn_confidence(*trained, learned.of_training))
+    with Pulse(lambda: "validation: correction by measured spectra nearby, prediction intervals") as pulse:
+        pulse.print()
+        learned = learn_neighbours(*trained) if config.neighbours else Learned()
+        write_neighbours(folder, learned.neighbours)
+        if learned.line:
+            say(learned.line)
+        write_confidence(folder, *learn_confidence(*trained, learned.of_training))
 
 
 def summary(result: TrainResult, folder: Path, seconds: float) -> str:

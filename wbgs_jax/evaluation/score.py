@@ -12,6 +12,8 @@ Besides the accuracy of spectra, snapshots and received powers, the report has
 import dataclasses
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -23,6 +25,7 @@ from scipy.stats import rankdata
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json
+from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene import in_sight
@@ -204,7 +207,7 @@ Part = Literal["test", "validation"]
 
 
 def evaluate(
-    trained: TrainedField, dataset: Dataset, part: Part = "test"
+    trained: TrainedField, dataset: Dataset, part: Part = "test", shown: bool = False
 ) -> tuple[dict[str, Any], Float[np.ndarray, "n 90 360"]]:
     """Returns the report of a field on a dataset's held-out links, ready for JSON, and the predicted spectra (n, 90, 360).
 
@@ -212,6 +215,7 @@ def evaluate(
         trained: a trained field.
         dataset: the data of its run, or others of the same kind.
         part: "test" or "validation".
+        shown: print progress on stderr.
 
     Returns:
         The report, {figure: value}, and the spectra (n, 90, 360) in the order of the held-out links.
@@ -228,7 +232,12 @@ def evaluate(
         left = without_asked(trained.correction, dataset.query(index))
         trained = dataclasses.replace(trained, correction=left)
     reference = with_validation_trained(dataset) if tested else dataset
-    predictions = observe(trained, dataset, index)
+    with ThreadPoolExecutor(1) as threads, CountProgress("predicted spectra", len(index), shown=shown) as progress:
+        calls = timed_calls(trained, dataset)
+        compiled = [threads.submit(call) for call in calls.values()]  # while the predictions are computed
+        predictions = observe(trained, dataset, index, progress.advance)
+        for one in compiled:
+            one.result()
     report = {"scene": dataset.name, "field": trained.origin()["field"], "part": part}
     power_db = power_of(predictions, dataset)
     power = None if power_db is None else power_figures(power_db, reference, index)
@@ -236,9 +245,9 @@ def evaluate(
         power |= {"confidence_db": calibrate_power(trained.power_intervals, power_db, dataset, index)}
     own = own_scores(predictions, dataset, index)
     if not dataset.has_spectra:
-        return report | own | (power or {}) | time_queries(trained, dataset), np.asarray(predictions.pas)
+        return report | own | (power or {}) | time_queries(calls), np.asarray(predictions.pas)
     truth = np.asarray(dataset.pas(index))
-    spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index, reference)
+    spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index, reference, shown)
     report |= spectra
     noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
     if not np.array_equal(noisy, predictions.pas):
@@ -252,7 +261,7 @@ def evaluate(
         and (expected := expectations(intervals, dataset, index, np.asarray(predictions.pas), power_db))
     ):
         report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
-    report |= time_queries(trained, dataset)
+    report |= time_queries(calls)
     return report, np.asarray(predictions.pas)
 
 
@@ -262,6 +271,7 @@ def score_spectra(
     dataset: Dataset,
     index: Int[np.ndarray, " n"],
     reference: Dataset,
+    shown: bool = False,
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """Returns the report of spectra predicted for links, with the baselines and the repeatability of the scene beside them, and
     the SSIM of each.
@@ -272,18 +282,24 @@ def score_spectra(
         dataset: the data.
         index: indices of the links.
         reference: the same data, whose training links the baselines use.
+        shown: print progress on stderr.
 
     Raises:
         UserError: a prediction is NaN or infinite.
     """
     groups = dataset.frequencies_hz[index], in_sight(dataset, index)
     elements = dataset.receiver().element_positions
-    figures = metrics.figures(pas, truth, elements)
+    beside = baselines(reference) if can_lend(reference, index) else {}
+    rivals = {}
+    with CountProgress("scores of the field and of simple methods", 1 + len(beside), shown=shown) as progress:
+        figures = metrics.figures(pas, truth, elements)
+        progress.advance()
+        for name, predict in beside.items():
+            rivals[name] = metrics.score(np.asarray(predict(index)), truth, *groups, elements)
+            progress.advance()
     report = metrics.summarise(figures, *groups, dataset.receiver_index[index])
     repeats = repeatability(dataset.name, np.unique(groups[0]) / 1e9)
     report |= {} if repeats is None else {"truth_repeats": repeats}
-    beside = baselines(reference) if can_lend(reference, index) else {}
-    rivals = {name: metrics.score(np.asarray(predict(index)), truth, *groups, elements) for name, predict in beside.items()}
     return report | {"baselines": rivals}, figures["ssim"]
 
 
@@ -372,17 +388,31 @@ def watch(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray,
     return {"held_out_ssim": float(np.median(metrics.ssim(noisy, np.asarray(dataset.pas(index)))))}
 
 
-def time_queries(trained: TrainedField, dataset: Dataset, repeats: int = 7) -> dict[str, float]:
-    """Returns milliseconds per PAS, for single queries and in blocks: medians over repeats after compilation."""
+TIMED = {"ms_per_pas": BLOCK, "ms_per_pas_single": 1}
+"""Queries of a call that is timed, by the name of the figure."""
+
+
+def timed_calls(trained: TrainedField, dataset: Dataset) -> dict[str, Callable[[], None]]:
+    """Returns the calls that `time_queries` measures, by the names of its figures. The first one of each compiles."""
     plan = trained.field.plan(trained.params, dataset.receiver())
     neighbours = for_receiver(trained.correction, dataset.receiver())
+    asked = dataset.test if len(dataset.test) else dataset.train
+
+    def call(size: int) -> None:
+        query = dataset.query(np.resize(asked, size))
+        jax.block_until_ready(render_pas(trained.field, trained.params, plan, query, neighbours))
+
+    return {name: partial(call, size) for name, size in TIMED.items()}
+
+
+def time_queries(calls: dict[str, Callable[[], None]], repeats: int = 7) -> dict[str, float]:
+    """Returns milliseconds per PAS, for single queries and in blocks: medians over repeats of calls that are compiled."""
     result = {}
-    for name, size in (("ms_per_pas", BLOCK), ("ms_per_pas_single", 1)):
-        query = dataset.query(np.resize(dataset.test if len(dataset.test) else dataset.train, size))
+    for name, call in calls.items():
         seconds = []
-        for _ in range(repeats + 1):
+        for _ in range(repeats):
             begin = time.perf_counter()
-            jax.block_until_ready(render_pas(trained.field, trained.params, plan, query, neighbours))
+            call()
             seconds.append(time.perf_counter() - begin)
-        result[name] = round(1e3 * float(np.median(seconds[1:])) / size, 3)  # the first call includes compilation
+        result[name] = round(1e3 * float(np.median(seconds)) / TIMED[name], 3)
     return result

@@ -86,6 +86,7 @@ class Inspection(NamedTuple):
     """State for the queried links."""
 
 
+@runtime_checkable
 class Prepared(Protocol):
     """The result of `Field.prepare` for some links: a pytree."""
 

@@ -16,7 +16,7 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.splits import group_transmitters
 from wbgs_jax.fields import Field, Observation, base
-from wbgs_jax.fields.base import Params, outputs_of
+from wbgs_jax.fields.base import Params, Prepared, outputs_of
 from wbgs_jax.inference.kriging import Beside, correct, for_receiver
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.radio.array import PAS_SHAPE
@@ -183,7 +183,17 @@ class OnAnyShape:
         return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), self.render(query))
 
 
-def observe_links(field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+Advance = Callable[[int], None]
+"""Called with the number of links of every finished block."""
+
+
+def _unwatched(count: int) -> None:
+    """Ignores the progress."""
+
+
+def observe_links(
+    field: Field, params: Params, dataset: Dataset, index: Int[np.ndarray, " n"], advance: Advance = _unwatched
+) -> Observation:
     """Returns the predictions of a field for links of a dataset, as NumPy arrays in their order.
 
     The field prepares the links once (`Field.prepare`); they are rendered in blocks of one shape, receiver by receiver. Every
@@ -196,9 +206,12 @@ def observe_links(field: Field, params: Params, dataset: Dataset, index: Int[np.
         for number in np.unique(dataset.receiver_index[index]):
             plan = field.plan(params, dataset.receiver(int(number)), prepared)
             of_receiver = np.flatnonzero(dataset.receiver_index[index] == number)
-            known = devices.replicated((field, params, plan))
+            known = devices.replicated((field, params))
             for block, filled in _blocks(of_receiver, BLOCK * devices.count):
-                yield block, _observe(*known, None, _taken(links, filled), None, devices.mesh)
+                some = _taken(links, filled)
+                of_block = devices.replicated(_plan_of_block(plan, prepared, some))
+                yield block, _observe(*known, of_block, None, some, None, devices.mesh)
+                advance(len(block))
 
     return _gathered(answers(), len(index))
 
@@ -221,11 +234,27 @@ def observe_queries(trained: TrainedField, receiver: Receiver, query: Query, qua
             some = np.arange(start, min(start + PREPARED, count))
             prepared = field.prepare(_taken(links, some), jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], receiver))
             plan = field.plan(params, receiver, prepared)
-            known = devices.replicated((field, params, plan, neighbours))
+            known = devices.replicated((field, params))
             for block, filled in _blocks(some, min(BLOCK, count) * devices.count):
-                yield block, _observe(*known, _taken(links, filled), quantity, devices.mesh)
+                taken = _taken(links, filled)
+                of_block = devices.replicated((_plan_of_block(plan, prepared, taken), neighbours))
+                yield block, _observe(*known, *of_block, taken, quantity, devices.mesh)
 
     return _gathered(answers(), count)
+
+
+def _plan_of_block(plan: Any, prepared: Any, links: Links) -> Any:
+    """Returns a plan that carries only what is prepared for the links of a block: its shapes, and with them the compiled
+    program, do not depend on the number of prepared links."""
+    if prepared is None:
+        return plan
+    own = _subset(prepared, links)
+    return jax.tree.map(lambda node: own if node is prepared else node, plan, is_leaf=lambda node: node is prepared)
+
+
+@jax.jit
+def _subset(prepared: Prepared, links: Links) -> Any:
+    return prepared.subset(links)
 
 
 def _devices(count: int) -> Devices:
@@ -256,9 +285,11 @@ def _blocks(numbers: Int[np.ndarray, " n"], size: int) -> Iterator[tuple[Int[np.
         yield block, np.concatenate([block, np.repeat(block[-1:], size - len(block))])
 
 
-def observe(trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"]) -> Observation:
+def observe(
+    trained: TrainedField, dataset: Dataset, index: Int[np.ndarray, " n"], advance: Advance = _unwatched
+) -> Observation:
     """Returns the same as `observe_links`, with spectra corrected by residual kriging or a mixture (one receiver only)."""
-    seen = observe_links(trained.field, trained.params, dataset, index)
+    seen = observe_links(trained.field, trained.params, dataset, index, advance)
     if dataset.n_receivers > 1:
         return seen
     neighbours = for_receiver(trained.correction, dataset.receiver())

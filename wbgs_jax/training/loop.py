@@ -490,6 +490,7 @@ def _begin(run: Run, progress: TrainingProgress, interrupt: dict[str, bool]) -> 
 
     if run.run_hooks(say):
         run.save()
+        progress.stage("compiling; first steps")
 
 
 def _advance(run: Run, total: int, progress: TrainingProgress, interrupt: dict[str, bool]) -> None:

@@ -25,7 +25,7 @@ from rich.progress import (
 )
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.progress_lines import LOG_INTERVAL, Bar
+from wbgs_jax._util.progress_lines import Bar, Pulse
 from wbgs_jax.fields import Field
 
 HELD_OUT = ("held_out_ssim", "held_out_power_error_db")
@@ -44,11 +44,12 @@ class TrainingProgress:
     """Shows the metrics of a training, steps per second and the remaining time, on stderr."""
 
     def __init__(self, total: int, done: int = 0, shown: bool = True):
-        self.total, self.done, self.start_step, self.shown = total, done, done, shown
+        self.total, self.start_step = total, done
         self.held_out: dict[str, float] = {}
-        self.started = self.last_line = time.monotonic()
+        self.begun = self.started = time.monotonic()
         self.compiled = False
-        self.console = Console(file=sys.stderr)
+        self.state = "compiling"
+        console = Console(file=sys.stderr)
         self.bar = Bar(
             SpinnerColumn(),
             TextColumn("{task.completed}/{task.total}"),
@@ -57,23 +58,26 @@ class TrainingProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            console=self.console,
-            disable=not (shown and self.console.is_terminal),
+            console=console,
+            disable=not (shown and console.is_terminal),
         )
         self.task = self.bar.add_task("train", total=total, completed=done, status="compiling ...")
+        self.pulse = Pulse(lambda: f"{self.state} ({time.monotonic() - self.begun:.0f} s)", shown)
 
     def __enter__(self) -> "TrainingProgress":
         self.bar.start()
+        self.pulse.__enter__()
         return self
 
-    def __exit__(self, *exception) -> None:
+    def __exit__(self, *exception: object) -> None:
+        self.pulse.__exit__()
         self.bar.stop()
 
     def stage(self, what: str) -> None:
         """Shows a stage of the work before the first step."""
+        self.state = what
         self.bar.update(self.task, status=f"{what} ...")
-        if self.shown and not self.console.is_terminal:
-            print(f"{what} ({time.monotonic() - self.started:.0f} s)", file=sys.stderr, flush=True)
+        self.pulse.print()
 
     def update(self, entry: dict[str, Any]) -> None:
         """Shows an entry of the curves: step, loss, metrics of the batches, sizes of the field, held-out figures."""
@@ -85,11 +89,10 @@ class TrainingProgress:
         rate = (step - self.start_step) / elapsed if self.compiled else None
         status = "  ".join([*figures, *([] if rate is None else [f"{rate:.1f} steps/s"])])
         self.bar.update(self.task, completed=step, status=status)
-        due = time.monotonic() - self.last_line > LOG_INTERVAL or step >= self.total
-        if due and self.shown and not self.console.is_terminal:
-            self.last_line = time.monotonic()
-            left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
-            print(f"step {step}/{self.total}  {status}{left}", file=sys.stderr, flush=True)
+        left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
+        self.state = f"step {step}/{self.total}  {status}{left}"
+        if step >= self.total:
+            self.pulse.print()
         if not self.compiled:  # calibration and compilation happen once: their time is not part of the rate
             self.compiled, self.started, self.start_step = True, time.monotonic(), step
 

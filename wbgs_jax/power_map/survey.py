@@ -1,0 +1,75 @@
+"""A survey: readings of a folder as means over small cells, with the walls of the floor plan and the measured domain."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wbgs_jax._util.errors import UserError
+from wbgs_jax.data.floor_plan import FILES, NO_WALLS, Walls, load_walls
+from wbgs_jax.data.rssi_folder import Readings, cell_means, load_readings
+from wbgs_jax.inference.domain import Domain
+from wbgs_jax.power_map.model import MAX_PLACES
+
+HEIGHT_M = 1.3
+"""Height of the transmitters above the floor if the readings have no z."""
+CELL_M = 0.25
+"""Side of the cells over which readings are averaged."""
+BEYOND_M = 2.0
+"""Distance (metres) from readings, receivers and walls up to which predictions have an interval: it includes the next room, not
+the next building."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Measured powers of one building."""
+
+    cells: Readings
+    """Means over cells."""
+    cell_m: float
+    """Side of the cells, metres."""
+    walls: Walls
+    """Walls of the floor plan; none without one."""
+
+    @property
+    def domain(self) -> Domain:
+        """The measured domain: the box around readings, receivers and walls."""
+        points = np.concatenate([self.cells.places, self.cells.receivers])
+        low, high = points.min(0), points.max(0)
+        ends = np.asarray(self.walls.ends).reshape(-1, 2)
+        if len(ends):
+            low[:2], high[:2] = np.minimum(low[:2], ends.min(0)), np.maximum(high[:2], ends.max(0))
+        return Domain("the readings", np.stack([low, high]), (0.0, np.inf), BEYOND_M)
+
+
+def load_survey(folder: Path, height_m: float = HEIGHT_M, cell_m: float = CELL_M, floor_plan: Path | None = None) -> Survey:
+    """Returns the survey of a folder with readings.csv, receivers.csv and, optionally, a floor plan.
+
+    Args:
+        folder: the folder.
+        height_m: height of the transmitters above the floor if the readings have no z.
+        cell_m: side of the cells. It is doubled until their number is within the limit of a map (`MAX_PLACES`).
+        floor_plan: the file of the walls; by default the one in the folder.
+
+    Raises:
+        UserError: a file is missing or cannot be read.
+    """
+    readings = load_readings(folder, height_m)
+    cells = cell_means(readings, cell_m)
+    while len(cells.places) > MAX_PLACES:
+        cell_m *= 2
+        cells = cell_means(readings, cell_m)
+    return Survey(cells, cell_m, find_walls(folder, floor_plan))
+
+
+def find_walls(folder: Path | None, floor_plan: Path | None) -> Walls:
+    """Returns the walls of a floor plan, otherwise those of the folder; none if there is no floor plan.
+
+    Raises:
+        UserError: the floor plan does not exist or cannot be read.
+    """
+    named = [floor_plan] if floor_plan else [folder / name for name in FILES if folder]
+    path = next((path for path in named if path.exists()), None)
+    if path is None and floor_plan:
+        raise UserError(f"floor plan {floor_plan} does not exist")
+    return NO_WALLS if path is None else load_walls(path)
