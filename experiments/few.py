@@ -31,7 +31,7 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.evaluation.score import evaluate
 from wbgs_jax.fields import default_field, get_field
 from wbgs_jax.inference.intervals import LEVEL
-from wbgs_jax.inference.mixture import Mixture
+from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.inference.predictor import predict_spectra
 from wbgs_jax.inference.trained_field import RunConfig
 from wbgs_jax.metrics import ssim

@@ -8,10 +8,10 @@ from ._util.pytree import pytree as pytree
 from ._util.pytree import static as static
 from .commands.train import train_field as train_field
 from .data.load import load_dataset as load_dataset
-from .data.room_file import load_room as load_room
 from .data.scene import make_mesh as make_mesh
 from .data.scene import make_surface as make_surface
 from .data.scene import surface_from_points as surface_from_points
+from .data.scene_file import load_room as load_room
 from .data.scene_file import load_scene as load_scene
 from .data.scene_file import save_scene as save_scene
 from .evaluation.score import evaluate as evaluate

@@ -12,10 +12,6 @@ from typing import Any
 
 from wbgs_jax._util.errors import UserError
 
-FEWEST_STEPS, STEPS_A_SPECTRUM = 600, 8
-"""Lower bounds on `OptimConfig.min_steps` when spectra are few: in total, and per spectrum."""
-
-
 RENAMED: Mapping[str, str] = {
     "search.sure": "calibration.n_sigma",
     "search.antenna_sure": "calibration.antenna_n_sigma",
@@ -264,7 +260,9 @@ def limit_steps(settings: Settings, n_train: int, no_paths: bool = False) -> Set
     """Returns settings with `optim.steps` limited for a data set of `n_train` spectra, a multiple of the epoch block. A field
     that predicts no paths (`no_paths`) needs all steps for many spectra, but overfits to few, and gets fewer steps for them."""
     optim, block = settings.optim, settings.loop.epoch_steps
-    fewest = min(optim.min_steps, max(FEWEST_STEPS, STEPS_A_SPECTRUM * n_train)) if no_paths else optim.min_steps
+    # Lower bounds on `OptimConfig.min_steps` when spectra are few: in total, and per spectrum.
+    fewest_steps, steps_a_spectrum = 600, 8
+    fewest = min(optim.min_steps, max(fewest_steps, steps_a_spectrum * n_train)) if no_paths else optim.min_steps
     most = optim.steps if no_paths else optim.share_with_paths * optim.steps
     wanted = max(fewest, min(optim.max_epochs * n_train / optim.batch, most))
     steps = min(optim.steps, round(wanted / block) * block)

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from wbgs_jax import metrics
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.floor_plan import Walls
 from wbgs_jax.data.rssi_folder import Readings
@@ -30,15 +30,6 @@ from wbgs_jax.inference.quantities import NETWORK, QUANTITIES, Quantity
 from wbgs_jax.inference.queries import Queries, shown_rows
 from wbgs_jax.power_map.model import PowerMap, received_power
 from wbgs_jax.radio.channel import NO_PATH_DB
-
-SHOWN = 6
-"""Maximum number of spectra in a plot."""
-LONGEST_ARROW = 0.1
-"""Length of the longest arrow, relative to the scene's size."""
-DOTS = 110
-"""Pixels per inch."""
-SIZES = ("gaussians",)
-"""Counts of a field that change during training."""
 
 
 def draw_all(
@@ -65,7 +56,7 @@ def draw_all(
     return [save(figure, folder / name) for name, figure in figures.items()]
 
 
-def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = SHOWN) -> Int[np.ndarray, " count"]:
+def spread(dataset: Dataset, index: Int[np.ndarray, " n"], count: int = 6) -> Int[np.ndarray, " count"]:
     """Returns positions in `index` that cover the range of frequencies, with different transmitters if there are enough."""
     frequencies = np.unique(dataset.frequencies_hz[index])
     rng = np.random.default_rng(0)
@@ -127,7 +118,8 @@ def draw_curves(entries: list[dict[str, Any]]) -> Figure:
     """Returns the loss, metrics of the batches and of held-out links, and counts that change, over the steps."""
     steps = [e for e in entries if "loss" in e]
     held_out = sorted({name for e in steps for name in e if name.startswith("held_out")})
-    sizes = [name for name in SIZES if any(name in e for e in steps)]
+    counts = ("gaussians",)  # counts of a field that change during training
+    sizes = [name for name in counts if any(name in e for e in steps)]
     figure = Figure(figsize=(13 if sizes else 9, 3.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, 3 if sizes else 2))
     axes[0].plot([e["step"] for e in steps], [e["loss"] for e in steps], color="C0")
@@ -157,7 +149,8 @@ def draw_motion(folder: Path, corners: Float[np.ndarray, "f k 3"], shift: Float[
     colours = colormaps["viridis"](size / max(size.max(), 1e-9))
     different, first, body = np.unique(shift, axis=0, return_index=True, return_inverse=True)  # equal shifts: one rigid body
     centre = np.array([corners[body.reshape(-1) == k].mean((0, 1)) for k in range(len(different))])
-    longest = LONGEST_ARROW * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
+    longest_arrow = 0.1  # length of the longest arrow, relative to the scene's size
+    longest = longest_arrow * np.ptp(corners.reshape(-1, 3), axis=0).max() / max(size.max() * 1e-3, 1e-9)
     for axis, (i, j), name in zip(axes, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
         outlines = np.concatenate([corners, corners[:, :1]], 1)[..., [i, j]]
         axis.add_collection(LineCollection(list(outlines), colors=colours, linewidths=0.8))
@@ -193,13 +186,13 @@ def draw_frequencies(report: dict[str, Any]) -> Figure:
 
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure in the format that the suffix of the file names; returns the file."""
+    dots = 110  # pixels per inch
     with atomic_write(path) as stream:
-        figure.savefig(stream, format=path.suffix[1:], dpi=DOTS)
+        figure.savefig(stream, format=path.suffix[1:], dpi=dots)
     return path
 
 
 COLORS = "viridis"
-PATH_COLORS = "plasma"
 FADED_DB = 40.0
 """Paths and taps of impulse responses are drawn that are less than this below the strongest one."""
 STAR: dict[str, Any] = {
@@ -209,14 +202,6 @@ STAR: dict[str, Any] = {
     "markersize": 14,
     "linestyle": "none",
     "label": "receiver",
-}
-DISC: dict[str, Any] = {
-    "marker": "o",
-    "color": "white",
-    "markeredgecolor": "black",
-    "markersize": 7,
-    "linestyle": "none",
-    "label": "transmitter",
 }
 
 
@@ -324,8 +309,16 @@ def draw_paths(
     positions, frequencies = queries.flat()
     figure, axes = _panels(_link_titles(queries), 2, (4.6, 3.9), sharex=True, sharey=True)
     figure.set_layout_engine("compressed")  # panels keep their aspect
-    shown = ScalarMappable(Normalize(-FADED_DB, 0), PATH_COLORS)
+    shown = ScalarMappable(Normalize(-FADED_DB, 0), "plasma")
     link = np.stack([found[name] for name in ("x", "y", "z", "frequency_ghz")], -1)
+    disc: dict[str, Any] = {
+        "marker": "o",
+        "color": "white",
+        "markeredgecolor": "black",
+        "markersize": 7,
+        "linestyle": "none",
+        "label": "transmitter",
+    }
     for axis, place, hertz in zip(axes, positions, frequencies, strict=True):
         own = np.flatnonzero(np.isclose(link, [*place, hertz / 1e9]).all(-1))
         top = found["power_db"][own].max(initial=NO_PATH_DB)
@@ -335,7 +328,7 @@ def draw_paths(
         lines = list(found["points_m"][own[strong]][..., :2])
         axis.add_collection(LineCollection(lines, colors=shown.to_rgba(power[strong]), linewidths=1.0))
         axis.plot(*rx[:2], **STAR)
-        axis.plot(*place[:2], **DISC)
+        axis.plot(*place[:2], **disc)
         axis.set_aspect("equal")
         words = f"{len(strong)} of {len(own)} paths, the strongest {top:.1f} dB of the transmitted" if len(own) else "no paths"
         axis.set_title(f"{axis.get_title()}\n{words}", fontsize=8)
@@ -469,10 +462,6 @@ def _places(axis: Axes, queries: Queries) -> tuple[Float[np.ndarray, " n"], list
     return np.concatenate([[0.0], np.cumsum(steps)]), [f"{frequency / 1e9:.4g} GHz" for frequency in queries.frequencies_hz]
 
 
-SHOWN_MAPS = 6
-"""Maximum number of frequencies in a plot."""
-
-
 def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], frequency_hz: float) -> Figure:
     """Returns a figure of a channel over time (`applications.movement.channel_over_time`, with `time_s`): its power, and its
     Doppler spectrogram from the strongest part down to `FADED_DB` below it."""
@@ -490,12 +479,12 @@ def draw_channel(found: Mapping[str, np.ndarray], source: Mapping[str, Any], fre
 
 
 def draw_maps(what: str, answer: dict[str, np.ndarray], walls: Float[np.ndarray, "n 2 2"], source: Mapping[str, Any]) -> Figure:
-    """Returns a figure of the first `SHOWN_MAPS` maps with the walls that the plane cuts. Stars are the receiver
+    """Returns a figure of the first six maps with the walls that the plane cuts. Stars are the receiver
     or, for quantities of several transmitters, these. `source` is the provenance (`LoadedField.source`)."""
     quantity, xs, ys = QUANTITIES[what], answer["xs"], answer["ys"]
     network = what in NETWORK
     stars = answer["tx_positions"] if network else np.array([source["receiver"]["position"]])
-    values = _drawn(quantity, answer)[:SHOWN_MAPS]
+    values = _drawn(quantity, answer)[:6]
     half = [(np.ptp(places) / (len(places) - 1) if len(places) > 1 else 1.0) / 2 for places in (xs, ys)]
     extent = (xs[0] - half[0], xs[-1] + half[0], ys[0] - half[1], ys[-1] + half[1])
     wide = extent[1] - extent[0] > extent[3] - extent[2]
@@ -564,28 +553,20 @@ def _span(values: Float[np.ndarray, "freq ny nx"]) -> dict[str, Any]:
     return {"vmin": float(low), "vmax": float(high)}
 
 
-SPACING, MARGIN = 0.1, 0.3
-"""Pixel spacing and margin around the plan, metres."""
-PIXELS = 40_000
-"""Maximum number of pixels; the spacing grows for larger plans."""
-AT_ONCE = 2048
-SHOWN_RECEIVERS = 12
-"""Maximum number of receivers in a plot."""
-COLUMNS = 3
-
-
 def draw_power_maps(learned: PowerMap, walls: Walls, cells: Readings) -> Figure:
     """Returns a figure with a map for every receiver at the median height of the measurements, with walls and cells."""
     height, places = float(np.median(cells.places[:, 2])), cells.places
     outline = np.concatenate([np.asarray(walls.ends).reshape(-1, 2), places[:, :2], cells.receivers[:, :2]])
-    low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
-    spacing = max(SPACING, float(np.sqrt(np.prod(high - low) / PIXELS)))
+    finest, margin = 0.1, 0.3  # pixel spacing and margin around the plan, metres
+    most_pixels, most_receivers = 40_000, 12  # the spacing grows for larger plans
+    low, high = outline.min(0) - margin, outline.max(0) + margin
+    spacing = max(finest, float(np.sqrt(np.prod(high - low) / most_pixels)))
     x, y = (np.arange(low[k] + spacing / 2, high[k], spacing) for k in range(2))
     pixels = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.full(len(x) * len(y), height)], -1)
-    powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, AT_ONCE)
-    titles = [f"receiver {r + 1}" for r in range(min(SHOWN_RECEIVERS, len(cells.receivers)))]
+    powers = map_blocks(lambda block: received_power(learned, jnp.asarray(block, jnp.float32))[0], pixels, 2048)
+    titles = [f"receiver {r + 1}" for r in range(min(most_receivers, len(cells.receivers)))]
     width, depth = 4.1 * (high - low) / max(high - low)
-    figure, axes = _panels(titles, COLUMNS, (width, depth), sharex=True, sharey=True)
+    figure, axes = _panels(titles, 3, (width, depth), sharex=True, sharey=True)
     norm = Normalize(*np.quantile(powers[:, : len(axes)], (0, 1)))
     extent = (low[0], low[0] + spacing * len(x), low[1], low[1] + spacing * len(y))
     for r, axis in enumerate(axes):

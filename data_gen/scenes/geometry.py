@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.mesh import solids
+from wbgs_jax.mesh import bodies
 
 Vec3 = tuple[float, float, float]
 
@@ -36,7 +36,7 @@ def merge(meshes: Iterable[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 def winding_number(mesh: trimesh.Trimesh, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Returns the winding number of a closed mesh around every point: 0 outside, 1 or -1 inside."""
-    return solids.winding_number(np.asarray(mesh.triangles), points)
+    return bodies.winding_number(np.asarray(mesh.triangles), points)
 
 
 def crossings(mesh: trimesh.Trimesh, start: Float[np.ndarray, "n 3"], end: Float[np.ndarray, "3"]) -> Int[np.ndarray, " n"]:

@@ -189,7 +189,6 @@ def render_slots(splats: TorchSplats, attenuation: Tensor, signal: Tensor) -> Te
     return blend_slots(splats, attenuation, signal, tile_lists(splats, 9, 8))
 
 
-STRAIGHTFORWARD = "tiles"
 FORMS: dict[str, Callable[[TorchSplats, Tensor, Tensor], Tensor]] = {
     "tiles": render_tiles,
     "groups": render_groups,

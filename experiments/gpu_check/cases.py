@@ -75,11 +75,6 @@ class Case:
     costly: bool = False
     """It takes long to compile, and others stand for it where time is short."""
 
-    @property
-    def public_name(self) -> str:
-        """The name in `wb` that it stands for."""
-        return self.name.split(":")[0].split(".")[0]
-
     def program(self) -> Callable[..., Any]:
         """Returns a function of the arguments: values, and the gradients of a weighted sum of all of them."""
         if not self.differentiable:

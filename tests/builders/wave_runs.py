@@ -17,6 +17,8 @@ from wbgs_jax.types import make_query
 RX = (1.0, 1.0, 1.2)
 PARTS = [*room(), box((3, 1, 0.5), (4, 2, 1.2))]
 THICKNESS = 0.05
+REFLECTIONS = {"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)}
+"""Settings of the field for few paths, without diffraction."""
 
 
 def places(n_tx, margin=0.3):

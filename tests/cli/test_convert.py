@@ -8,7 +8,7 @@ from builders.untrained import make_coherent_run, make_run
 
 from wbgs_jax.commands import convert as convert_command
 from wbgs_jax.data.load import load_dataset
-from wbgs_jax.data.room_file import load_room
+from wbgs_jax.data.scene_file import load_room
 from wbgs_jax.interchange.deepmimo import read_deepmimo
 from wbgs_jax.interchange.gaussian_ply import read_gaussians
 from wbgs_jax.interchange.ray_paths import load_paths

@@ -17,7 +17,7 @@ from wbgs_jax.commands import predict as predict_command
 from wbgs_jax.inference.evaluate_quantities import domain_of
 from wbgs_jax.inference.intervals import PowerConfidence, write_confidence
 from wbgs_jax.inference.quantities import QUANTITIES
-from wbgs_jax.inference.radio_map import BEST_BEAM, cut_at, pieces, plane_over
+from wbgs_jax.inference.radio_map import cut_at, pieces, plane_over
 from wbgs_jax.radio.array import codebook
 from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 from wbgs_jax.training.run_folder import load_trained
@@ -60,7 +60,7 @@ def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
 
 def test_best_beams_are_those_of_the_spectra(runs, tmp_path):
     out, points = tmp_path / "map.npz", tmp_path / "points.npz"
-    assert ask(runs, "wideband", "--ghz", 28, "--what", BEST_BEAM, *AREA, "--step", 0.5, "--out", out).code == 0
+    assert ask(runs, "wideband", "--ghz", 28, "--what", "best-beam", *AREA, "--step", 0.5, "--out", out).code == 0
     with np.load(out) as found:
         beams, xs, ys = found["best_beam"], found["xs"], found["ys"]
         azimuth, zenith = found["beam_azimuth_deg"], found["beam_zenith_deg"]

@@ -15,8 +15,7 @@ from PIL import Image
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset, scene_dataset
 from wbgs_jax.data.image_folder import NOMINAL_FREQUENCY_HZ, export_layout, load_layout, mesh_to_world, world_to_mesh
-from wbgs_jax.data.room_file import Room, save_room
-from wbgs_jax.data.scene_file import SceneFile, save_scene
+from wbgs_jax.data.scene_file import Room, SceneFile, save_room, save_scene
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import planar_array
 

@@ -12,7 +12,7 @@ from builders.synthetic import tiny_dataset
 from wbgs_jax.data.scene import closed_bodies
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.evaluate_quantities import domain_of
-from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.mesh.bodies import ClosedBody, inside
 
 BESIDE = np.array([3.0, 3, 0])
 

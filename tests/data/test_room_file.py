@@ -7,9 +7,8 @@ import pytest
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data import load_dataset
-from wbgs_jax.data.room_file import Room, load_room, save_room
 from wbgs_jax.data.scene import DatasetScene
-from wbgs_jax.data.scene_file import save_scene
+from wbgs_jax.data.scene_file import Room, load_room, save_room, save_scene
 from wbgs_jax.interchange.scenes import scene_of_snapshots
 from wbgs_jax.radio.array import planar_array
 

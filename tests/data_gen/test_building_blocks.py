@@ -26,7 +26,7 @@ from data_gen.scenes.furniture import (
 from data_gen.scenes.geometry import box, crossings, distance, winding_number
 from data_gen.scenes.walls import Door, inner_wall, wall
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.mesh import solids
+from wbgs_jax.mesh import bodies
 
 MORE = [bed(1.6), bench(1.5), cabinet(1, 0.5, 1), counter(2), desk(1.5), monitor(0.7), office_chair(), wardrobe(1.2)]
 
@@ -89,7 +89,7 @@ def test_without_rtree_the_message_says_how_to_get_it(monkeypatch):
 def test_chunks_change_nothing(monkeypatch, rng):
     mesh, points = chair(), rng.uniform(-1, 1, (50, 3))
     whole = winding_number(mesh, points)
-    monkeypatch.setattr(solids, "CHUNK", 200)
+    monkeypatch.setattr(bodies, "CHUNK", 200)
     np.testing.assert_array_equal(winding_number(mesh, points), whole)
 
 

@@ -11,8 +11,6 @@ from experiments.bench import gate, quality, renderer, timing
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.errors import UserError
 
-FIELDS = {"value", "unit", "direction", "spread", "tolerance"}
-
 
 def figure(value, unit="x", direction="higher"):
     return {"value": value, "unit": unit, "direction": direction, "spread": 0.0, "tolerance": 0.25}

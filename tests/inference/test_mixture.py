@@ -9,8 +9,18 @@ import pytest
 from builders.synthetic import RX, tiny_dataset
 
 from wbgs_jax.evaluation.baselines import line_of_sight, nearest_tx
-from wbgs_jax.inference.kriging import correct, for_receiver, read_neighbours, without_asked, write_neighbours
-from wbgs_jax.inference.mixture import MEMBERS, answer, field_share, member_spectra, member_weights
+from wbgs_jax.inference.kriging import (
+    MEMBERS,
+    correct,
+    field_share,
+    for_receiver,
+    member_spectra,
+    member_weights,
+    mixed_spectra,
+    read_neighbours,
+    without_asked,
+    write_neighbours,
+)
 from wbgs_jax.training.fit_mixture import Known, start_mixture
 from wbgs_jax.types import make_query, make_receiver
 
@@ -83,7 +93,7 @@ def test_an_answer_is_shared_by_the_distance(dataset, rng):
     positions = dataset.tx_positions[dataset.train[0]] + rng.normal(size=(3, 3)) * [[0.01], [0.5], [40]]
     frequency = np.full(3, dataset.frequencies_hz[dataset.train[0]])
     own = rng.random((3, 90, 360)).astype(np.float32)
-    got = answer(mixture, jnp.asarray(own), make_query(positions, frequency))
+    got = mixed_spectra(mixture, jnp.asarray(own), make_query(positions, frequency))
     for i in range(3):
         spectra, distance = spectra_at(mixture, positions[i], frequency[i])
         u = np.clip(np.log(distance), -3, 2)
@@ -106,7 +116,7 @@ def test_it_can_be_differentiated_at_a_known_transmitter(dataset):
     own, frequency = jnp.full((1, 90, 360), SOME), np.array([dataset.frequencies_hz[dataset.train[0]]])
 
     def brightness(position):
-        return answer(mixture, own, make_query(position[None], frequency)).sum()
+        return mixed_spectra(mixture, own, make_query(position[None], frequency)).sum()
 
     gradient = jax.grad(brightness)(jnp.asarray(dataset.tx_positions[dataset.train[0]], jnp.float32))
     assert np.isfinite(gradient).all()

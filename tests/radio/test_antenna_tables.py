@@ -8,7 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.antenna_file import read_antenna
-from wbgs_jax.radio.antenna import Antenna, dipole_gain, element_gain, mean_gain, pattern_exponents, tabulated, zenith_vector
+from wbgs_jax.radio.antenna import (
+    Antenna,
+    dipole_gain,
+    element_gain,
+    pattern_exponents,
+    tabulated,
+    zenith_vector,
+    zenith_weights,
+)
 from wbgs_jax.radio.geometry import angles_to_direction
 
 STEP = 2
@@ -18,6 +26,16 @@ ZENITH, AZIMUTH = np.radians(np.arange(0, 181, STEP)), np.radians(np.arange(0, 3
 def grid():
     azimuth, zenith = np.meshgrid(AZIMUTH, ZENITH)
     return angles_to_direction(jnp.asarray(azimuth, jnp.float32), jnp.asarray(zenith, jnp.float32))
+
+
+def mean_gain(antenna, rows=361):
+    """The mean over the sphere of an antenna's power gain: its efficiency, 1 without losses."""
+    zenith = np.linspace(0, np.pi, rows)
+    azimuth = np.arange(2 * (rows - 1)) * (np.pi / (rows - 1))
+    azimuths, zeniths = (jnp.asarray(angle, jnp.float32) for angle in np.meshgrid(azimuth, zenith))
+    field = antenna.field(angles_to_direction(azimuths, zeniths))
+    gain = np.sum(np.abs(np.asarray(field, np.complex128)) ** 2, -1).mean(1)
+    return float(np.sum(gain * zenith_weights(rows)))
 
 
 def named(pattern):

@@ -20,9 +20,14 @@ rotation_matrix, to_local, covariance_factor, direction_to_angles, angles_to_dir
     ),
 )
 angles_to_pixel = jax.jit(geometry.angles_to_pixel, static_argnames="projection")
-pixel_to_angles = jax.jit(geometry.pixel_to_angles, static_argnames="projection")
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+def pixel_to_angles(pixels, projection="hemisphere"):
+    """Returns azimuth and zenith (radians) of pixel coordinates."""
+    sx, sy = geometry.pixels_per_radian(projection)
+    return pixels[..., 0] / sx - jnp.pi, pixels[..., 1] / sy
 
 
 def scipy_rotation(quats) -> Rotation:

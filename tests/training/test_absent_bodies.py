@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders.rooms import box
 from builders.synthetic import tiny_settings
-from builders.wave_runs import PARTS, heard_in, of_concrete, places, run_in
+from builders.wave_runs import PARTS, REFLECTIONS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.calibration.obstacles import absent_movers, search_absent
@@ -18,7 +18,7 @@ N_TX, FREQUENCIES = 60, np.array([1e9, 4e9, 16e9])
 PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
-    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    field=REFLECTIONS,
     optim={"steps": 4, "min_steps": 4},
     calibration={
         "spectra": 80,

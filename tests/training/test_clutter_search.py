@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_settings
-from builders.wave_runs import PARTS, heard_in, of_concrete, places, run_in
+from builders.wave_runs import PARTS, REFLECTIONS, heard_in, of_concrete, places, run_in
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.fields.base import paths_of
@@ -21,10 +21,7 @@ N_TX, FREQUENCIES = 80, np.array([2e9, 10e9])
 PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
-    field={
-        "specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,),
-        "clutter_cell": 0.3,
-    },
+    field=REFLECTIONS | {"clutter_cell": 0.3},
     optim={"steps": 4, "min_steps": 4},
     calibration={"spectra": 80, "rounds": 1, "antenna_rounds": 0, "absorption_spectra": 160, "absorption_steps": 400},
 )  # fmt: skip

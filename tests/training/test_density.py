@@ -16,8 +16,7 @@ from wbgs_jax.fields.wideband import WidebandField, WidebandParams
 from wbgs_jax.training.density import DensityControl, DensityStatistics, choose, control_density, reset_attenuation
 from wbgs_jax.training.hooks import Context, Edit, map_moments
 from wbgs_jax.training.loop import Run
-from wbgs_jax.training.optim import make_optimizer
-from wbgs_jax.training.step import TrainState
+from wbgs_jax.training.step import TrainState, make_optimizer
 from wbgs_jax.types import Gaussians
 
 STEP, SLOTS = 7, 64

@@ -10,7 +10,7 @@ from builders.synthetic import tiny_dataset
 
 from wbgs_jax.data.splits import hold_out_validation, training_links
 from wbgs_jax.fields.mixture import SHARES
-from wbgs_jax.inference.mixture import answer
+from wbgs_jax.inference.kriging import mixed_spectra
 from wbgs_jax.metrics import ssim
 from wbgs_jax.training import fit_mixture
 from wbgs_jax.training import fit_mixture as module
@@ -115,7 +115,7 @@ def test_simple_methods_are_no_worse_than_the_best_of_them(dataset, known, membe
     spectra, _ = predict_members(members, dataset, known, dataset.test, everything)
     truth = np.asarray(dataset.pas(dataset.test))
     best = max(ssim(spectra[:, k], truth).mean() for k in range(spectra.shape[1]))
-    mixed = np.asarray(answer(members, jnp.zeros_like(jnp.asarray(truth)), dataset.query(dataset.test)))
+    mixed = np.asarray(mixed_spectra(members, jnp.zeros_like(jnp.asarray(truth)), dataset.query(dataset.test)))
     assert ssim(mixed, truth).mean() > best - 0.02
 
 

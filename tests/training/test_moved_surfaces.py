@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 from builders.synthetic import tiny_settings
-from builders.wave_runs import PARTS, RX, heard_in, of_concrete, places, run_in
+from builders.wave_runs import PARTS, REFLECTIONS, RX, heard_in, of_concrete, places, run_in
 
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration import alignment, pipeline
@@ -25,7 +25,7 @@ N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
 PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
-    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    field=REFLECTIONS,
     calibration={
         "spectra": 80,
         "rounds": 2,

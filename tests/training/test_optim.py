@@ -12,7 +12,7 @@ from builders.synthetic import tiny_dataset, tiny_settings
 from wbgs_jax.config import OptimConfig
 from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.fields import Group, get_field
-from wbgs_jax.training.optim import ADAMS_RMS, make_muon, make_optimizer, schedule
+from wbgs_jax.training.step import ADAMS_RMS, make_muon, make_optimizer, schedule
 
 OPTIM = OptimConfig(steps=6, final_fraction=0.1)
 RATES = {

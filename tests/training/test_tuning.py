@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.synthetic import tiny_settings
-from builders.wave_runs import PARTS, places, run_in
+from builders.wave_runs import PARTS, REFLECTIONS, places, run_in
 
 from wbgs_jax.fields import coherent
 from wbgs_jax.training.calibration.array_gains import least_squares, search_tuning
@@ -18,7 +18,7 @@ N_TX, FREQUENCIES = 40, np.array([1e9, 4e9, 16e9])
 PLACES = places(N_TX, 0.4)
 SETTINGS = tiny_settings(
     "wave",
-    field={"specular_tried": 32, "specular_kept": 16, "diffracted_tried": 1, "diffracted_kept": 1, "mirror_areas": (0.0,)},
+    field=REFLECTIONS,
     calibration={"rounds": 0, "antenna_rounds": 0, "geometry": False},
 )
 

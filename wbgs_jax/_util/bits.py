@@ -30,11 +30,6 @@ def packed(bits: Bool[Array, "*n f"], width: int = WORD) -> UInt32[Array, "*n wo
     return jnp.sum(jnp.where(bits.reshape(*bits.shape[:-1], bits.shape[-1] // width, width), values, 0), -1, dtype=jnp.uint32)
 
 
-def counted(words: UInt32[Array, "*n words"]) -> Int[Array, "*n"]:
-    """Returns the number of bits that are set."""
-    return jnp.sum(jax.lax.population_count(words).astype(jnp.int32), -1)
-
-
 def first_of(words: UInt32[Array, " words"], most: int) -> tuple[Int[Array, " most"], Bool[Array, " most"]]:
     """Returns the indices of the first `most` set bits, ascending, and a mask of those that exist; 0 for the others."""
     place = jnp.arange(len(words))

@@ -10,8 +10,6 @@ from jaxtyping import Float
 
 from wbgs_jax._util.errors import UserError
 
-FURTHEST = 1e5
-"""Metres, or metres per second: larger values are mistakes, and soon exceed single precision."""
 _default_format = warnings.formatwarning
 
 
@@ -80,13 +78,19 @@ def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "me
     Raises:
         UserError: the string is not of this form, or a number is too large.
     """
-    try:
-        values = np.array([float(part) for part in word.split(",")])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != 3 or not (np.abs(values) <= FURTHEST).all():
-        raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {FURTHEST:g}")
+    values = parse_numbers(word)
+    furthest = 1e5  # metres, or metres per second: larger values are mistakes, and soon exceed single precision
+    if len(values) != 3 or not (np.abs(values) <= furthest).all():
+        raise UserError(f"{option} {word[:60]} is not a {kind}; give x,y,z in {unit}, each at most {furthest:g}")
     return values
+
+
+def parse_numbers(word: str) -> Float[np.ndarray, " n"]:
+    """Returns the numbers of a string "a,b,...", none if it is not of this form."""
+    try:
+        return np.array([float(part) for part in word.split(",")])
+    except ValueError:
+        return np.zeros(0)
 
 
 def point_words(position: Float[np.ndarray, "3"]) -> str:

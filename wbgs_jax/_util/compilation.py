@@ -17,11 +17,6 @@ VARIABLE = "WBGS_CACHE"
 """Environment variable with the folder of the cache; an empty value disables it."""
 MIN_SECONDS = 0.5
 """Compile time in seconds below which programs are not kept."""
-MOST_BYTES = 2e9
-"""Maximum size of the cache; beyond it the least recently used files are removed."""
-SOURCES = Path(__file__).parents[1]
-KERNEL_CALL = "__gpu$xla.gpu.triton"
-"""Custom call of the renderer's GPU kernels, whose stability JAX does not guarantee."""
 PROGRAMS = "programs"
 """Subfolder of the cache for traced programs."""
 
@@ -58,7 +53,7 @@ def use_compilation_cache() -> Path | None:
     return folder
 
 
-def limit_size(folder: Path, most: float | int = MOST_BYTES) -> None:
+def limit_size(folder: Path, most: float | int = 2e9) -> None:
     """Removes the least recently used files of a cache until the others have at most `most` bytes."""
     entries = []
     for path in folder.rglob("*"):
@@ -93,7 +88,8 @@ def trace_program(folder: Path, function: Callable[..., Any], shapes: Sequence[A
     name = hashlib.sha256("\n".join(words).encode()).hexdigest()[:32]
     path = folder / PROGRAMS / f"{name}.bin"
     if not path.exists():
-        kernels = jax.export.DisabledSafetyCheck.custom_call(KERNEL_CALL)  # the file is used by one version of JAX only
+        # JAX does not guarantee the stability of the renderer's GPU kernels; the file is used by one version of JAX only.
+        kernels = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
         exported = jax.export.export(jax.jit(function), disabled_checks=[kernels])(*shapes)
         with atomic_write(path) as stream:
             stream.write(exported.serialize())
@@ -112,7 +108,7 @@ def load_program(folder: Path, name: str) -> Callable[..., Any]:
 def source_digest() -> str:
     """Returns a checksum of this package's source."""
     found = hashlib.sha256()
-    for path in sorted(SOURCES.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         found.update(path.read_bytes())
     return found.hexdigest()
 

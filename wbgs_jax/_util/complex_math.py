@@ -12,8 +12,6 @@ from jaxtyping import Array, Complex, Float
 
 _SINE = tuple((-1) ** (power // 2) * (2 * math.pi) ** power / math.factorial(power) for power in range(1, 13, 2))
 """Taylor series of sin(2 pi y) in y, y^3, ..., y^11: enough for single precision up to a quarter of a turn."""
-SMALLEST = 1e-12
-"""Magnitude below which complex numbers count as 0."""
 
 
 @jax.custom_jvp
@@ -50,6 +48,7 @@ def quotient(a: Complex[Array, "*#n"], b: Complex[Array, "*#n"]) -> Complex[Arra
 def root(z: Complex[Array, "*n"]) -> Complex[Array, "*n"]:
     """Returns the square root of numbers with a non-negative real part and |z|^2 within the range of single precision. Value
     and gradient are finite at 0."""
-    size = jnp.sqrt(jnp.maximum(z.real * z.real + z.imag * z.imag, SMALLEST**2))
+    smallest = 1e-12  # magnitude below which complex numbers count as 0
+    size = jnp.sqrt(jnp.maximum(z.real * z.real + z.imag * z.imag, smallest**2))
     real = jnp.sqrt(0.5 * (size + jnp.maximum(z.real, 0)))
     return jax.lax.complex(real, 0.5 * z.imag / real)

@@ -10,7 +10,6 @@ from wbgs_jax._util.errors import UserError
 LOCAL = "local"
 """Value in place of a scheduler's address that starts processes on this machine."""
 CONNECT_S = "30s"
-CLOSE_S = 30.0
 SETTINGS: dict[str, Any] = {
     # By default Dask limits linear algebra to one thread per process, and serial runs might then differ in the last bit.
     "distributed.nanny.pre-spawn-environ": {},
@@ -55,7 +54,7 @@ def connected(where: str, workers: int) -> Iterator[Any]:
 def _close(cluster: Any) -> None:
     """Closes local workers. If one does not end in time, results are kept all the same; it ends with this process."""
     with contextlib.suppress(TimeoutError, OSError):
-        cluster.close(timeout=CLOSE_S)
+        cluster.close(timeout=30.0)
 
 
 def finished(

@@ -1,8 +1,5 @@
 """Errors shown to users: one line that states the problem, its location, and a remedy."""
 
-LONGEST, END = 1000, 200
-"""Maximum length of a message, and of the end that is kept when it is shortened, characters: messages quote file contents."""
-
 
 class UserError(Exception):
     """A problem that the user can fix. Command lines exit with code 2.
@@ -11,4 +8,7 @@ class UserError(Exception):
 
     def __init__(self, message: str = ""):
         line = " ".join(message.splitlines())
-        super().__init__(line if len(line) <= LONGEST else f"{line[: LONGEST - END]} ... {line[-END:]}")
+        # Maximum length of a message, and of the end that is kept when it is shortened, characters: messages quote file
+        # contents.
+        longest, end = 1000, 200
+        super().__init__(line if len(line) <= longest else f"{line[: longest - end]} ... {line[-end:]}")

@@ -5,12 +5,15 @@ Files are written under a temporary name in the same folder and then renamed, so
 Array archives (.npz) may be damaged or not archives at all. Every error of NumPy, zipfile, zlib and Python's tokenizer about
 them becomes one `UserError`. Python objects are never unpickled, as this would run code from the file.
 
+A pytree of arrays is one archive of a run folder.
+
 YAML files are small and written by hand. Anything but plain data is rejected, such as aliases that expand to gigabytes or very
 deep nesting.
 """
 
 import contextlib
 import csv
+import dataclasses
 import errno
 import glob
 import io
@@ -20,14 +23,16 @@ import re
 import tempfile
 import time
 import zipfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import yaml
 
 from wbgs_jax._util.errors import UserError
+
+T = TypeVar("T")
 
 try:
     import fcntl
@@ -36,8 +41,6 @@ except ImportError:  # on Windows, where stale files are not removed
 
 STALE_S = 5.0
 """Age in seconds from which temporary files may be left over from a killed process."""
-LONGEST_NAME = 100
-"""Characters: file systems allow 255, and endings are appended."""
 
 
 @contextlib.contextmanager
@@ -119,7 +122,8 @@ def read_text(path: Path) -> str:
 
 def safe_name(name: str) -> str:
     """Returns a name from data as a safe file name: only letters, digits, blanks and -+._, without dots at the ends."""
-    return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:LONGEST_NAME] or "data"
+    longest_name = 100  # characters: file systems allow 255, and endings are appended
+    return re.sub(r"[^\w+. -]+", "_", name).strip("._ ")[:longest_name] or "data"
 
 
 def write_csv(path: Path | str, rows: Iterable[Iterable[Any]]) -> None:
@@ -240,13 +244,11 @@ def _reason(error: Exception) -> str:
     return words[:200] or type(error).__name__
 
 
-LARGEST, DEEPEST = 1_000_000, 20
-"""Maximum number of characters and of levels of nesting, far more than files of positions need."""
-
-
 class _PlainLoader(yaml.SafeLoader):
     """PyYAML's safe loader without aliases."""
 
+    deepest = 20
+    """Maximum number of levels of nesting, far more than files of positions need."""
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -254,8 +256,8 @@ class _PlainLoader(yaml.SafeLoader):
         if self.check_event(yaml.events.AliasEvent):
             raise yaml.YAMLError("it has an alias (*name); write the values out")
         self.depth += 1
-        if self.depth > DEEPEST:
-            raise yaml.YAMLError(f"it is nested more than {DEEPEST} levels deep")
+        if self.depth > self.deepest:
+            raise yaml.YAMLError(f"it is nested more than {self.deepest} levels deep")
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -267,10 +269,48 @@ def read_yaml(path: Path) -> Any:
     Raises:
         UserError: the file is missing, damaged, too large, or uses aliases or very deep nesting.
     """
-    text = read_text(path)
-    if len(text) > LARGEST:
-        raise UserError(f"{path} has {len(text):,} characters; a file of positions has far fewer than {LARGEST:,}")
+    text, largest = read_text(path), 1_000_000
+    if len(text) > largest:
+        raise UserError(f"{path} has {len(text):,} characters; a file of positions has far fewer than {largest:,}")
     try:
         return yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:  # ValueError: an invalid date
         raise UserError(f"{path} is not valid YAML ({' '.join(str(error).split())}); correct it") from error
+
+
+def write_tree(path: Path, tree: Any) -> None:
+    """Writes the arrays of a pytree under the names of its fields; None removes the file."""
+    if tree is None:
+        path.unlink(missing_ok=True)
+        return
+    arrays: dict[str, Any] = {f.name: np.asarray(getattr(tree, f.name)) for f in dataclasses.fields(tree)}
+    with atomic_write(path) as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+def read_tree(path: Path, classes: Sequence[type[T]], without: str, before: Mapping[str, Any] | None = None) -> T | None:
+    """Returns the pytree stored in a file, in single precision or in the smaller type it was written in; None if there is no
+    file.
+
+    Args:
+        path: of the file.
+        classes: possible classes; the first one with the file's fields is used.
+        without: what removing the file means, for the message.
+        before: values of arrays that older files lack.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    if not path.exists():
+        return None
+    advice = f"remove it to {without}, or train again"
+    arrays = {name: np.asarray(value) for name, value in (before or {}).items()} | read_arrays(path, "", advice)
+    fits = (cls for cls in classes if {f.name for f in dataclasses.fields(cls)} == arrays.keys())  # type: ignore[arg-type]
+    with told(str(path), advice):
+        return next(fits, classes[-1])(**{name: _in_memory(value) for name, value in arrays.items()})
+
+
+def _in_memory(value: np.ndarray) -> Any:
+    import jax.numpy as jnp  # imported here because commands read files without JAX
+
+    return jnp.asarray(value, value.dtype if value.dtype in (np.uint8, np.float16) else jnp.float32)  # images as stored

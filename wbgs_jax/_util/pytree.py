@@ -1,8 +1,8 @@
-"""Frozen dataclasses as pytrees."""
+"""Frozen dataclasses as pytrees, and functions of trees that are evaluated in blocks of rows."""
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -124,3 +124,24 @@ def to_device(tree: Any) -> Any:
         return jnp.asarray(np.asarray(a, np.float32 if np.issubdtype(np.asarray(a).dtype, np.floating) else np.int32))
 
     return jax.tree.map(leaf, tree)
+
+
+def map_blocks(function: Callable[[Any], Any], rows: Any, size: int, full: bool = False) -> Any:
+    """Returns `function(rows)`, computed for at most `size` rows at a time, which needs one compilation and little memory.
+
+    Args:
+        function: maps a tree like `rows` to a tree of arrays with the same leading axis.
+        rows: a tree of arrays with a common leading axis, which must not be empty.
+        size: number of rows of a block. The last block is filled up with copies of its last row.
+        full: a single block is filled up as well, so that calls with fewer rows share the compilation.
+
+    Returns:
+        A tree of NumPy arrays.
+    """
+    count, parts = len(jax.tree.leaves(rows)[0]), []
+    size = size if full else min(size, count)
+    for start in range(0, count, size):
+        index = np.minimum(np.arange(start, start + size), count - 1)
+        block = jax.tree.map(lambda leaf, index=index: leaf[index], rows)
+        parts.append(jax.tree.map(np.asarray, function(block)))
+    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *parts)

@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Complex, Float
 
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import MaterialProperties, Params
 from wbgs_jax.fields.calibratable import Calibratable

@@ -32,10 +32,6 @@ if TYPE_CHECKING:
 
 SCENES = ("1", "2", "3", "4", "5", "6")
 """Released scenes of the benchmark; `python -m wbgs_jax` reads them as data sets of these names."""
-KINDS = ("pas", "snapshots", "power_db")
-"""Arrays of which a file of predictions contains at least one."""
-ROUNDING = 1e-3
-"""Spectra are at most 1 up to this."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +106,9 @@ def read_predictions(path: Path, dataset: "Dataset") -> dict[str, np.ndarray]:
     """Returns the arrays of a file of predictions; other shapes or values than those of the test links are a `UserError`."""
     n, elements = len(dataset.test), dataset.receiver().element_positions.shape[0]
     shapes = {"pas": (n, 90, 360), "snapshots": (n, elements), "power_db": (n,)}
-    arrays = read_arrays(path, "file of predictions", "write it with numpy.savez", KINDS)
+    arrays = read_arrays(path, "file of predictions", "write it with numpy.savez", shapes)
     if not arrays:
-        raise UserError(f"{path} has none of the arrays {', '.join(KINDS)}; write one of them, one row per test link")
+        raise UserError(f"{path} has none of the arrays {', '.join(shapes)}; write one of them, one row per test link")
     for name, values in arrays.items():
         if values.shape != shapes[name]:
             raise UserError(f"{name} of {path} has shape {values.shape}; the {n} test links need {shapes[name]}")
@@ -122,7 +118,8 @@ def read_predictions(path: Path, dataset: "Dataset") -> dict[str, np.ndarray]:
         if not np.isfinite(values).all():
             raise UserError(f"{name} of {path} contains NaN or infinity; predict every test link")
     pas = arrays.get("pas")
-    if pas is not None and not (pas.min() >= 0 and pas.max() <= 1 + ROUNDING):
+    rounding = 1e-3  # spectra are at most 1 up to this
+    if pas is not None and not (pas.min() >= 0 and pas.max() <= 1 + rounding):
         raise UserError(
             f"pas of {path} lies within {pas.min():.3g} to {pas.max():.3g}; give amplitudes from 0 to 1, divided by the "
             "maximum of each spectrum"

@@ -30,10 +30,6 @@ from wbgs_jax.inference.queries import parse_array, parse_grid
 
 # Modules that load JAX are imported where they are used, as in predict.py.
 
-COLORS = "viridis"
-BRIGHT = 0.99
-"""Quantile of the brightness at which the colour map ends."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -124,8 +120,9 @@ def _write_gaussians(
             f"the {trained.field.name} field of this run has no Gaussians; train one that has (docs/which_field.md)"
         )
     signal, attenuation = (np.abs(np.asarray(values)).mean(1) for values in (seen.signal, seen.attenuation))
-    brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], BRIGHT)), 1e-12)
-    colours = colormaps[COLORS](np.clip(signal / brightest, 0, 1))[:, :3]
+    bright = 0.99  # quantile of the brightness at which the colour map ends
+    brightest = max(float(np.quantile(signal[np.asarray(seen.gaussians.alive)], bright)), 1e-12)
+    colours = colormaps["viridis"](np.clip(signal / brightest, 0, 1))[:, :3]
     count = write_gaussians(command.out, seen.gaussians, colours, attenuation)
     return f"Gaussians: {command.out} ({count}, coloured by their mean signal at {command.ghz:g} GHz)"
 
@@ -182,7 +179,7 @@ def take_in(command: Command) -> str:
 
 def take_room(command: Command) -> str:
     """Writes a room file from a model, lists its objects, and returns a line for the user."""
-    from wbgs_jax.data.room_file import save_room
+    from wbgs_jax.data.scene_file import save_room
     from wbgs_jax.interchange.rooms import describe_room, read_room, room_of
 
     assert command.model is not None, "checked"

@@ -30,8 +30,7 @@ from wbgs_jax.fields.base import outputs_of
 from wbgs_jax.inference.predictor import BLOCK
 from wbgs_jax.inference.trained_field import TrainedField, at_receivers
 from wbgs_jax.training import curves
-from wbgs_jax.training.manifest import write_manifest
-from wbgs_jax.training.run_folder import MANIFEST, open_run
+from wbgs_jax.training.run_folder import MANIFEST, open_run, write_manifest
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,16 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.image_folder import export_layout
 from wbgs_jax.data.scene_file import load_scene
 
-USAGE = "usage: wbgs-jax layout SCENE.npz FOLDER"
-
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    usage = "usage: wbgs-jax layout SCENE.npz FOLDER"
     if {"-h", "--help"} & set(arguments):
-        print(f"{USAGE}\n\nWrite a scene file as a folder of the published layout (docs/formats.md).")
+        print(f"{usage}\n\nWrite a scene file as a folder of the published layout (docs/formats.md).")
         return
     if len(arguments) != 2:
-        raise UserError(USAGE)
+        raise UserError(usage)
     export_layout(load_scene(arguments[0]), arguments[1])
 
 

@@ -36,7 +36,6 @@ from wbgs_jax.inference.quantities import INTERVALS, NETWORK, Network, names_for
 
 # Modules that load JAX are imported where they are used, so that `--help` and errors of the command line appear at once.
 
-MOST_PLACES = 1_000_000
 if TYPE_CHECKING:
     from wbgs_jax.inference.evaluate_quantities import LoadedField
 
@@ -140,9 +139,10 @@ def plane_of(command: Command, dataset: Any) -> Any:
         if corners.shape != (2, 2) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise UserError(f"--area {command.area} is not a rectangle; give x0,y0:x1,y1 in metres, the lower corner first")
         low, high = corners
-    if np.prod((high - low) / command.step) > MOST_PLACES:
+    most_places = 1_000_000
+    if np.prod((high - low) / command.step) > most_places:
         raise UserError(
-            f"--step {command.step:g} gives more than {MOST_PLACES:,} positions; give a larger one, or a smaller --area"
+            f"--step {command.step:g} gives more than {most_places:,} positions; give a larger one, or a smaller --area"
         )
     height = float(np.median(dataset.tx_positions[:, 2])) if command.height is None else command.height
     return plane_over(low, high, height, command.step)

@@ -40,8 +40,6 @@ from wbgs_jax.power_map.model import PowerMap, learn_map, received_power
 from wbgs_jax.power_map.survey import CELL_M, HEIGHT_M, find_walls, load_survey
 from wbgs_jax.power_map.validation import COMPARED, NINETY, Score, scores
 
-SUFFIXES = {"out": (".json",), "picture": PICTURES, "answers": (".csv",), "mesh": (".ply",)}
-
 
 @dataclass(frozen=True)
 class Command:
@@ -71,7 +69,7 @@ class Command:
 
 def check(command: Command) -> None:
     """Raises a `UserError` for an invalid or incomplete command line."""
-    check_suffixes(command, SUFFIXES)
+    check_suffixes(command, {"out": (".json",), "picture": PICTURES, "answers": (".csv",), "mesh": (".ply",)})
     if command.data is None and (command.floor_plan is None or command.mesh is None):
         raise UserError("give --data FOLDER with readings, or --floor-plan walls.csv --mesh walls.ply")
     if command.data is None and (command.tx or command.out or command.picture):

@@ -24,17 +24,6 @@ from wbgs_jax._util.files import check_writable, write_csv
 from wbgs_jax.commands.options import TrainedFieldOptions, check_suffixes, load_field, parse_frequencies
 from wbgs_jax.inference import queries as parsing
 
-MOST = 4000
-"""Maximum number of candidates."""
-MOST_CHOSEN = 200
-"""Maximum number of places that are chosen."""
-AT_ONCE = 128
-"""Candidates whose spectra are in memory together."""
-FREQUENCIES = 4
-"""Number of training frequencies at which errors are expected, if none are given."""
-LENGTH = 3.0
-"""Default of the distance over which errors are alike, in median distances between neighbouring measured places."""
-
 
 @dataclass(frozen=True)
 class Command(TrainedFieldOptions):
@@ -83,8 +72,9 @@ def check(command: Command) -> None:
         _ = command.folder  # one is named
     if (command.candidates is None) == (not command.grid):
         raise UserError("give the places that can be measured: --candidates places.csv, or --grid FROM:TO:NXxNYxNZ")
-    if not 1 <= command.count <= MOST_CHOSEN:
-        raise UserError(f"--count {command.count} is not a number of places; give 1 to {MOST_CHOSEN}")
+    most_chosen = 200  # maximum number of places that are chosen
+    if not 1 <= command.count <= most_chosen:
+        raise UserError(f"--count {command.count} is not a number of places; give 1 to {most_chosen}")
     if command.start:
         parse_vector(command.start, "--start", "position", "metres")
     if command.length is not None and not 0 < command.length < np.inf:
@@ -101,8 +91,9 @@ def candidates_of(command: Command) -> Float[np.ndarray, "c 3"]:
         assert command.candidates is not None, "checked"
         places = parsing.read_positions(command.candidates)
     places = np.unique(places, axis=0)
-    if len(places) > MOST:
-        raise UserError(f"{len(places):,} candidates are too many; at most {MOST:,} are possible")
+    most = 4000  # maximum number of candidates
+    if len(places) > most:
+        raise UserError(f"{len(places):,} candidates are too many; at most {most:,} are possible")
     return places
 
 
@@ -116,11 +107,15 @@ def of_run(command: Command, places: Float[np.ndarray, "c 3"]) -> State:
     if given is not None and (beyond := given[np.asarray(loaded.domain.out_of_band(given))]).size:
         raise UserError(f"--ghz {beyond[0] / 1e9:g} lies outside of the trained band, where no error is expected; omit it")
     learned = np.unique(data.frequencies_hz[data.train])
-    some = np.unique(np.linspace(0, len(learned) - 1, min(FREQUENCIES, len(learned))).round().astype(int))
+    frequencies = 4  # number of training frequencies at which errors are expected, if none are given
+    some = np.unique(np.linspace(0, len(learned) - 1, min(frequencies, len(learned))).round().astype(int))
     frequencies_hz = learned[some] if given is None else given
     measured = np.unique(data.tx_positions[np.concatenate([data.train, data.validation])], axis=0)
-    length = LENGTH * spacing(measured) if len(measured) > 1 else LENGTH
-    blocks = [places[start : start + AT_ONCE] for start in range(0, len(places), AT_ONCE)]
+    # Default of the distance over which errors are alike, in median distances between neighbouring measured places.
+    default_spacings = 3.0
+    length = default_spacings * spacing(measured) if len(measured) > 1 else default_spacings
+    at_once = 128  # candidates whose spectra are in memory together
+    blocks = [places[start : start + at_once] for start in range(0, len(places), at_once)]
     if trained.intervals is not None:
         ssim = [loaded.evaluate("spectra", block, frequencies_hz)["expected"][..., 0] for block in blocks]
         return State(measured, np.mean(1 - np.concatenate(ssim), -1), "SSIM", length)

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from jaxtyping import Bool, Float
 
-from wbgs_jax._util.cli import say
+from wbgs_jax._util.cli import parse_numbers, say
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.training import EXAMPLE
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from wbgs_jax.inference.quantities import Options
     from wbgs_jax.types import Receiver
 
-SHORTEST = 1e-3
-"""Minimum length of a quaternion; the maximum is its inverse. Others are mistakes."""
 SHOWN = 12
 """Maximum number of warnings printed."""
 PICTURES = (".png", ".svg", ".pdf")
@@ -83,12 +81,10 @@ def parse_receiver(word: str, dataset: "Dataset") -> "Receiver":
     if not word or (word.isdecimal() and len(word) < 7):
         return dataset.receiver(int(word or 0))
     like = dataset.receiver()
-    try:
-        values = np.array([float(part) for part in word.split(",")])
-    except ValueError:
-        values = np.zeros(0)
+    values = parse_numbers(word)
     turn = values[3:] if len(values) > 3 else np.asarray(like.orientation)
-    rotated = SHORTEST < np.linalg.norm(turn) < 1 / SHORTEST
+    shortest = 1e-3  # minimum length of a quaternion; the maximum is its inverse, others are mistakes
+    rotated = shortest < np.linalg.norm(turn) < 1 / shortest
     if len(values) not in (3, 7) or not (np.abs(values) <= LARGEST_COORDINATE_M).all() or not rotated:
         raise UserError(
             f"--rx {word[:60]} is not a receiver; give its index, x,y,z in metres, or x,y,z,w,i,j,k with a quaternion"

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 else:
     What = Literal[names_for("predict")]
 
-MOST_POINTS = 4096
 BLOCK = 256
 """Number of queries predicted and stored at a time."""
 
@@ -117,9 +116,10 @@ def check(command: Command) -> None:
     for name, word in _velocities(command).items():
         parse_vector(word, f"--{name}-velocity")
     parsing.parse_array(command.tx_array)
-    if not (0 < command.band_mhz < np.inf and 2 <= command.points <= MOST_POINTS):
+    most_points = 4096
+    if not (0 < command.band_mhz < np.inf and 2 <= command.points <= most_points):
         raise UserError(
-            f"--band-mhz {command.band_mhz:g} --points {command.points} is not a band; give 2 to {MOST_POINTS} points"
+            f"--band-mhz {command.band_mhz:g} --points {command.points} is not a band; give 2 to {most_points} points"
         )
 
 

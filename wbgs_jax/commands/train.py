@@ -38,9 +38,8 @@ from wbgs_jax.training.cross_validation import Training, is_few, learn_few
 from wbgs_jax.training.fit_intervals import learn_confidence
 from wbgs_jax.training.fit_kriging import Learned, learn_neighbours
 from wbgs_jax.training.loop import TrainResult, train
-from wbgs_jax.training.manifest import write_manifest
 from wbgs_jax.training.progress import Interrupted, duration_words, expected_seconds
-from wbgs_jax.training.run_folder import load_trained, locked, prepare_folder
+from wbgs_jax.training.run_folder import load_trained, locked, prepare_folder, write_manifest
 
 PROGRAM = "wbgs-jax train"
 

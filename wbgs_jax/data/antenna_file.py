@@ -18,18 +18,6 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_arrays, read_text
 from wbgs_jax.radio.antenna import Antenna, tabulated, zenith_weights
 
-SUFFIXES = (".csv", ".msi", ".pln", ".npz")
-"""Endings of pattern files."""
-COMPONENTS = ("theta_re", "theta_im", "phi_re", "phi_im")
-"""Columns of a CSV file with fields instead of gains."""
-DIPOLE_DBI = 2.15
-"""Gain of a half-wave dipole, the reference of dBd."""
-LARGEST_DBI = 80.0
-"""Larger gains (dBi) are mistakes, such as powers instead of decibels."""
-REGULAR = 1e-3
-"""Largest deviation of an angle from its regular grid, degrees."""
-MOST_ROWS = 1_000_000
-"""Largest number of directions: finer than half a degree."""
 CUT = 360
 """Angles of a cut in an MSI file, one per degree."""
 
@@ -38,10 +26,10 @@ def read_antenna(path: Path) -> Antenna:
     """Returns the antenna of a pattern file (host).
 
     Args:
-        path: a file with one of the endings `SUFFIXES`:
+        path: a file that ends in `.csv`, `.msi`, `.pln` or `.npz`:
 
             * CSV: columns `azimuth_deg`, `zenith_deg` or `elevation_deg`, and `gain_dbi` with an optional `phase_deg`, or the
-              four `COMPONENTS`; every direction of a regular grid over the sphere.
+              four `theta_re`, `theta_im`, `phi_re` and `phi_im`; every direction of a regular grid over the sphere.
             * MSI Planet: `GAIN` (dBd, or dBi if the line says so) and the cuts `HORIZONTAL 360` and `VERTICAL 360`, whose
               attenuations (dB) are added in every direction. Its azimuths are clockwise, its elevations positive downwards.
             * NumPy archive: complex `e_theta` and `e_phi` (zenith, azimuth), and the angles `zenith` and `azimuth` in radians.
@@ -54,7 +42,7 @@ def read_antenna(path: Path) -> Antenna:
     """
     readers = {".csv": _read_csv, ".msi": _read_msi, ".pln": _read_msi, ".npz": _read_archive}
     if path.suffix.lower() not in readers:
-        raise UserError(f"{path} does not end in {', '.join(SUFFIXES)}; convert the antenna pattern to one of these formats")
+        raise UserError(f"{path} does not end in {', '.join(readers)}; convert the antenna pattern to one of these formats")
     return readers[path.suffix.lower()](path)
 
 
@@ -62,16 +50,18 @@ def _read_csv(path: Path) -> Antenna:
     rows = csv.reader(io.StringIO(read_text(path)))
     names = [name.strip().lower() for name in next(rows, [])]
     vertical = next((name for name in ("zenith_deg", "elevation_deg", "elevation") if name in names), "zenith_deg")
-    values = ("gain_dbi",) if "gain_dbi" in names else COMPONENTS
+    components = ("theta_re", "theta_im", "phi_re", "phi_im")  # columns of a CSV file with fields instead of gains
+    values = ("gain_dbi",) if "gain_dbi" in names else components
     needed = ("azimuth_deg", vertical, *values)
     if missing := [name for name in needed if name not in names]:
         raise UserError(
             f"{path} has no column {', '.join(missing)}; its first line must name azimuth_deg, zenith_deg and gain_dbi, or "
-            f"{', '.join(COMPONENTS)} instead of the gain"
+            f"{', '.join(components)} instead of the gain"
         )
     optional = ("phase_deg",) if "phase_deg" in names and "gain_dbi" in names else ()
     columns = [names.index(name) for name in (*needed, *optional)]
     table = []
+    most_rows = 1_000_000  # largest number of directions: finer than half a degree
     for row in rows:
         if not any(cell.strip() for cell in row):
             continue
@@ -79,8 +69,8 @@ def _read_csv(path: Path) -> Antenna:
             table.append([float(row[column]) for column in columns])
         except (ValueError, IndexError):
             raise UserError(f"line {rows.line_num} of {path} lacks a number; fill {', '.join(needed)}") from None
-        if len(table) > MOST_ROWS:
-            raise UserError(f"{path} has more than {MOST_ROWS:,} directions; give a coarser grid")
+        if len(table) > most_rows:
+            raise UserError(f"{path} has more than {most_rows:,} directions; give a coarser grid")
     found = np.array(table, np.float64).reshape(-1, len(columns))
     zenith = found[:, 1] if vertical == "zenith_deg" else 90 - found[:, 1]
     if "gain_dbi" in names:
@@ -112,8 +102,9 @@ def _read_archive(path: Path) -> Antenna:
 def _read_msi(path: Path) -> Antenna:
     lines = [line.split() for line in read_text(path).splitlines()]
     head = {words[0].upper(): words[1:] for words in lines if words and re.match("[A-Za-z]", words[0])}
+    dipole_dbi = 2.15  # gain of a half-wave dipole, the reference of dBd
     try:
-        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else DIPOLE_DBI)
+        gain = float(head["GAIN"][0]) + (0.0 if "DBI" in "".join(head["GAIN"][1:]).upper() else dipole_dbi)
         horizontal, vertical = (_cut(lines, name) for name in ("HORIZONTAL", "VERTICAL"))
     except (KeyError, IndexError, ValueError):
         raise UserError(
@@ -140,8 +131,9 @@ def _cut(lines: list[list[str]], name: str) -> Float[np.ndarray, "360"]:
 
 
 def _check_decibels(path: Path, values: Float[np.ndarray, " n"]) -> None:
-    if not (values < LARGEST_DBI).all():
-        raise UserError(f"{path} has gains beyond {LARGEST_DBI:g} dBi; give decibels relative to an isotropic antenna")
+    largest_dbi = 80.0  # larger gains (dBi) are mistakes, such as powers instead of decibels
+    if not (values < largest_dbi).all():
+        raise UserError(f"{path} has gains beyond {largest_dbi:g} dBi; give decibels relative to an isotropic antenna")
 
 
 def on_grid(
@@ -156,8 +148,9 @@ def on_grid(
     azimuth_deg = np.round(azimuth_deg, 6) % 360
     zeniths, azimuths = np.unique(np.round(zenith_deg, 6)), np.unique(azimuth_deg)
     regular = len(zeniths) > 1 and len(azimuths) > 1
+    tolerance = 1e-3  # largest deviation of an angle from its regular grid, degrees
     for angles, last in ((zeniths, 180), (azimuths, 360 - 360 / max(len(azimuths), 1))):
-        regular = regular and bool(np.abs(angles - np.linspace(0, last, len(angles))).max() < REGULAR)
+        regular = regular and bool(np.abs(angles - np.linspace(0, last, len(angles))).max() < tolerance)
     if not regular:
         raise UserError(
             f"{path} has no regular grid over the whole sphere; give zenith angles from 0 to 180 and azimuths from 0 to 360 "

@@ -29,17 +29,6 @@ ConventionName = Literal["zenith", "elevation"]
 """Name of a pixel order."""
 CONVENTIONS: tuple[ConventionName, ...] = get_args(ConventionName)
 
-INWARD = 3
-"""Distance in rows between an outer row and the inner row it is compared with: near the zenith, which is a single direction,
-the variation of pixels increases from zero; at the horizon it is nearly constant."""
-POLE, APART = 0.5, 2.0
-"""Maximum variation of the row at the zenith relative to that of the inner row; and minimum factor by which this ratio is
-larger at the other end."""
-VISIBLE = 0.3
-"""Minimum variation of inner pixels in grey levels (of 255): an image without content is not conclusive."""
-CHANCE, FEWEST = 1e-3, 5
-"""Probability that lines of sight favour a convention by chance, and minimum number of transmitters for the test."""
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -95,17 +84,26 @@ def find_convention(
         f"towards the transmitter, spectra are brighter than {100 * second.mean():.0f} % of their pixels read as elevations"
     )
     compared += f" and than {100 * first.mean():.0f} % read as zenith angles"
-    if len(gain) < FEWEST or not abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - CHANCE / 2) * error:
+    # Probability that lines of sight favour a convention by chance, and minimum number of transmitters for the test.
+    chance, fewest = 1e-3, 5
+    if len(gain) < fewest or not abs(gain.mean()) > stdtrit(len(gain) - 1, 1 - chance / 2) * error:
         return Evidence(None, compared)
     return Evidence("elevation" if gain.mean() > 0 else "zenith", compared)
 
 
 def _by_the_zenith(images: UInt8[np.ndarray, "n 90 360"]) -> Evidence | None:
-    outer, inner = (images[:, rows].std(2).mean(0) for rows in ([0, PAS_HEIGHT - 1], [INWARD, PAS_HEIGHT - 1 - INWARD]))
+    # Distance in rows between an outer row and the inner row it is compared with: near the zenith, which is a single direction,
+    # the variation of pixels increases from zero; at the horizon it is nearly constant.
+    inward = 3
+    outer, inner = (images[:, rows].std(2).mean(0) for rows in ([0, PAS_HEIGHT - 1], [inward, PAS_HEIGHT - 1 - inward]))
     share = outer / np.maximum(inner, 1e-9)
+    visible = 0.3  # minimum variation of inner pixels in grey levels (of 255): an image without content is not conclusive
+    # Maximum variation of the row at the zenith relative to that of the inner row; and minimum factor by which this ratio is
+    # larger at the other end.
+    uniform, apart = 0.5, 2.0
     for pole, convention, row in ((0, CONVENTIONS[0], "first"), (1, CONVENTIONS[1], "last")):
-        if inner.min() >= VISIBLE and share[pole] <= POLE and share[1 - pole] >= APART * share[pole]:
-            spread = f"grey levels vary by {outer[pole]:.1f}, {INWARD} rows further by {inner[pole]:.1f}"
+        if inner.min() >= visible and share[pole] <= uniform and share[1 - pole] >= apart * share[pole]:
+            spread = f"grey levels vary by {outer[pole]:.1f}, {inward} rows further by {inner[pole]:.1f}"
             return Evidence(convention, f"the {row} row shows a single direction ({spread}), like the zenith")
     return None
 

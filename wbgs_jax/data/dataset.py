@@ -159,16 +159,14 @@ class Dataset(Observed):
         return positions[first], which.reshape(-1)
 
 
-NAMES = ("name", "convention")
-RENAMED = {"pas": "images"}
-"""Kinds of observation with another name in checksums, so that those of old run folders remain valid."""
-
-
 def checksum(dataset: Dataset) -> str:
     """Returns a checksum (SHA-256) of all numbers of a dataset, including its split but not names."""
     found = hashlib.sha256()
-    parts = {field.name: getattr(dataset, field.name) for field in dataclasses.fields(dataset) if field.name not in NAMES}
-    parts |= {RENAMED.get(name, name): values for name, values in parts.pop("observations").items()}
+    numbers = (field.name for field in dataclasses.fields(dataset) if field.name not in ("name", "convention"))
+    parts = {name: getattr(dataset, name) for name in numbers}
+    # Kinds of observation with another name in checksums, so that those of old run folders remain valid.
+    renamed = {"pas": "images"}
+    parts |= {renamed.get(name, name): values for name, values in parts.pop("observations").items()}
     parts["materials"] = None if dataset.materials is None else dataclasses.asdict(dataset.materials) | {"names": ()}
     for path, leaf in jax.tree_util.tree_leaves_with_path(parts):
         array = np.ascontiguousarray(leaf)

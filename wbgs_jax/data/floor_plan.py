@@ -18,12 +18,6 @@ from wbgs_jax._util.pytree import pytree
 from wbgs_jax.data.tables import check_positions, numbers, read_table
 
 FILES = ("walls.csv", "layout.csv")
-OUTLINES = "room"
-"""Column that separates outlines."""
-IGNORED = ("id", "name", "material", "thickness", "comment", "note")
-"""Names of columns that are ignored: the path loss law treats all walls equally."""
-PARALLEL = 1e-9
-"""Square metres: smaller cross products count as parallel."""
 ON_WALL = 1e-2
 """Metres: a point this near to a wall counts as lying on it, and the wall as no obstacle."""
 
@@ -66,15 +60,18 @@ def load_walls(path: Path) -> Walls:
     form = SEGMENTS if SEGMENTS.columns[0] in header else OUTLINE
     values = numbers(path, header, rows, list(form.columns))
     check_positions(f"{path}: corners", values)
-    allowed = (*form.columns, *IGNORED, *([] if form is SEGMENTS else [OUTLINES]))
+    # Names of columns that are ignored: the path loss law treats all walls equally.
+    ignored = ("id", "name", "material", "thickness", "comment", "note")
+    outline_column = "room"  # column that separates outlines
+    allowed = (*form.columns, *ignored, *([] if form is SEGMENTS else [outline_column]))
     if other := [name for name in header if name not in allowed]:
         raise UserError(
             f"{path} has an unknown column {other[0]!r}; the columns of a floor plan are {', '.join(form.columns)}"
-            + (f" and, for several outlines, {OUTLINES}" if form is OUTLINE else "")
+            + (f" and, for several outlines, {outline_column}" if form is OUTLINE else "")
         )
     if form is SEGMENTS:
         return Walls(values.reshape(-1, 2, 2), np.full(len(values), form.share))
-    room = np.array([row[header.index(OUTLINES)] if OUTLINES in header else "" for row in rows])
+    room = np.array([row[header.index(outline_column)] if outline_column in header else "" for row in rows])
     outlines = [values[room == one] for one in dict.fromkeys(room.tolist())]
     ends = np.concatenate([np.stack([corners, np.roll(corners, -1, 0)], 1) for corners in outlines])
     return Walls(ends, np.full(len(ends), form.share))
@@ -92,12 +89,13 @@ def crossings(
     xp, along = namespace(start), walls.ends[:, 1] - walls.ends[:, 0]
     ray, corner = (goal - start)[..., None, :], walls.ends[:, 0] - start[..., None, :]
     ground = _cross(ray, along)
-    safe = xp.where(xp.abs(ground) < PARALLEL, 1.0, ground)
+    parallel = 1e-9  # square metres: smaller cross products count as parallel
+    safe = xp.where(xp.abs(ground) < parallel, 1.0, ground)
     on_ray, on_wall = _cross(corner, along) / safe, _cross(corner, ray) / safe
     long = xp.sqrt(xp.sum(along**2, -1))
     apart = xp.abs(ground) / xp.where(long > 0, long, 1.0)  # distance between the two points, perpendicular to the wall
     near = xp.minimum(on_ray, 1 - on_ray) * apart  # distance of the nearer point from the wall
-    hit = (xp.abs(ground) >= PARALLEL) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
+    hit = (xp.abs(ground) >= parallel) & (near > ON_WALL) & (on_wall >= 0) & (on_wall < 1)
     return xp.sum(xp.where(hit, walls.share, 0.0), -1)
 
 

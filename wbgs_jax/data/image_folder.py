@@ -37,8 +37,7 @@ from wbgs_jax._util.files import read_text, read_yaml, safe_name
 from wbgs_jax.data.conventions import CONVENTIONS, ConventionName, array_of, find_convention, to_pas
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import materials_of, scene_dataset
-from wbgs_jax.data.room_file import Room, load_room
-from wbgs_jax.data.scene_file import SceneFile
+from wbgs_jax.data.scene_file import Room, SceneFile, load_room
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters, tx_disjoint_split
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
@@ -49,9 +48,6 @@ from wbgs_jax.types import (
     make_receiver,
     stack_receivers,
 )
-
-SHORTEST, LONGEST = 1e-6, 1e6
-"""Range of quaternion norms that are accepted."""
 
 
 class Gateway(NamedTuple):
@@ -84,7 +80,8 @@ def read_gateway(path: Path) -> Gateway:
         warnings.warn(f"{path} has {len(gateways)} gateways; the first one, {first!r}, is used as the receiver", stacklevel=3)
     position = vector(gateway.get("position"), 3, f"{path}: position")
     x, y, z, w = vector(gateway.get("orientation"), 4, f"{path}: orientation (quaternion x, y, z, w)")
-    if not SHORTEST < np.linalg.norm(np.array([x, y, z, w]) / LONGEST) * LONGEST < LONGEST:
+    shortest, longest = 1e-6, 1e6  # range of quaternion norms that are accepted
+    if not shortest < np.linalg.norm(np.array([x, y, z, w]) / longest) * longest < longest:
         raise UserError(f"{path}: orientation is all zeros or out of range; write the quaternion [0, 0, 0, 1] for no rotation")
     frequency = entries.get("frequency", gateway.get("frequency"))
     name, convention = entries.get("dataset_name"), entries.get("convention", gateway.get("convention"))
@@ -131,8 +128,6 @@ def ghz_to_hz(word: str, where: Path) -> float:
     return hertz
 
 
-DIGITS = 9
-"""Maximum number of digits of an image number."""
 NOMINAL_FREQUENCY_HZ = 1e9
 """Frequency used for a folder without one: without a mesh, a model of a single frequency only needs some constant."""
 
@@ -366,7 +361,8 @@ def _read_index(path: Path, n: int) -> np.ndarray:
 
 
 def _image_number(word: str, where: Path) -> int:
-    if not (word.isascii() and word.isdigit() and len(word) <= DIGITS):
+    digits = 9  # maximum number of digits of an image number
+    if not (word.isascii() and word.isdigit() and len(word) <= digits):
         raise UserError(f"{where}: {word[:40]!r} is not an image number; images are named by numbers, 00001 for example")
     return int(word)
 

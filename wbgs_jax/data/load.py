@@ -17,13 +17,10 @@ from jaxtyping import Bool, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.conventions import ConventionName
 from wbgs_jax.data.dataset import Dataset, Materials
-from wbgs_jax.data.room_file import Room
-from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, SceneFile, load_scene
+from wbgs_jax.data.scene_file import TEST, TRAIN, VALIDATION, Room, SceneFile, load_scene
 from wbgs_jax.data.splits import group_transmitters, note_shared_transmitters
 from wbgs_jax.observation_kinds import only_kind
 from wbgs_jax.types import LARGEST_COORDINATE_M, Receiver, make_receiver, stack_receivers
-
-SURFACES = ("vertices", "faces", "face_part")
 
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
@@ -74,7 +71,8 @@ def _check_compatible(first: Dataset, other: Dataset) -> None:
     arrays = [(one.receivers.unit, one.receivers.element_positions.shape[1:]) for one in (first, other)]
     if arrays[0] != arrays[1]:
         raise UserError(f"{where}: their arrays differ in the number or unit of their elements")
-    if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in SURFACES):
+    surfaces = ("vertices", "faces", "face_part")
+    if not all(np.array_equal(getattr(first, name), getattr(other, name)) for name in surfaces):
         raise UserError(f"{where}: their surfaces differ; give datasets of one scene")
 
 
@@ -113,8 +111,6 @@ KINDS = {
     **dict.fromkeys(MODELS, ("a model", "export it as glTF or OBJ; then " + ROOM)),
 }
 """Descriptions of other kinds of files by suffix, and how to use their content."""
-COLMAP = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
-"""Files in a folder of RF-3DGS with the cameras of its images."""
 
 
 def check_kind(path: Path) -> None:
@@ -124,7 +120,9 @@ def check_kind(path: Path) -> None:
         raise UserError(f"{path} is {kind[0]}, not a scene file; {kind[1]}")
     if not path.is_dir() or (path / "spectrum").exists():
         return
-    if any((path / name).exists() for name in COLMAP):
+    # Files in a folder of RF-3DGS with the cameras of its images.
+    colmap = ("sparse", "cameras.bin", "cameras.txt", "transforms_train.json")
+    if any((path / name).exists() for name in colmap):
         raise UserError(
             f"{path} is a folder of RF-3DGS: images from COLMAP cameras, without positions of transmitters; give "
             "spectrum/, tx_pos.csv and gateway_info.yml (docs/formats.md)"
@@ -136,13 +134,9 @@ def check_kind(path: Path) -> None:
         )
 
 
-DATA_VARIABLE = "WBGS_DATA"
-"""Environment variable: folder of scene files that replaces those released with the package."""
 RELEASED = Path(__file__).parent / "released"
 """Folder of the released scene files."""
 
-MOST_MATERIALS, REST = 64, "others"
-"""Maximum number of distinct materials of a scene, and the label of the others."""
 PARTS = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 """Values of `split` in scene files by part."""
 
@@ -252,7 +246,8 @@ def _label(part: Any, number: int, name: str) -> tuple[str, float]:
 
 
 def _scene_folder() -> Path:
-    folder = os.environ.get(DATA_VARIABLE)
+    data_variable = "WBGS_DATA"  # environment variable: folder of scene files that replaces those released with the package
+    folder = os.environ.get(data_variable)
     return Path(folder) if folder else RELEASED
 
 
@@ -266,17 +261,18 @@ def _common(labels: list[tuple[str, float]], room: Room, name: str) -> list[tupl
     """Returns the labels of parts with at most `MOST_MATERIALS` distinct ones, those of the largest area; the others are
     combined by thickness. If every object has a material of its own, the calibration of all of them would take hours."""
     kinds = sorted(set(labels))
-    if len(kinds) <= MOST_MATERIALS:
+    most, rest = 64, "others"  # maximum number of distinct materials of a scene, and the label of the others
+    if len(kinds) <= most:
         return labels
     a, b, c = np.moveaxis(room.vertices[room.faces].astype(np.float64), 1, 0)
     of_face = np.array([kinds.index(label) for label in labels])[room.face_part]
     area = np.bincount(of_face, np.linalg.norm(np.cross(b - a, c - a), axis=-1), len(kinds))
-    largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:MOST_MATERIALS]}
+    largest = {kinds[i] for i in np.argsort(-area, kind="stable")[:most]}
     warnings.warn(
-        f"{name} has {len(kinds)} materials: all except the {MOST_MATERIALS} of the largest area are treated as one",
+        f"{name} has {len(kinds)} materials: all except the {most} of the largest area are treated as one",
         stacklevel=3,
     )
-    return [label if label in largest else (REST, label[1]) for label in labels]
+    return [label if label in largest else (rest, label[1]) for label in labels]
 
 
 def _receivers(scene: SceneFile) -> list[Receiver]:

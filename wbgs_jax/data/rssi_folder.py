@@ -48,8 +48,6 @@ from wbgs_jax.data.tables import (
 
 RSSI, CSI = "gateway_rssi.csv", "csidata.npy"
 TRANSMITTERS, GATEWAYS = ("tx_pos.csv",), ("gateway_position.yml",)
-ANTENNAS = ("base-station.yml", "rx_positions.yml")
-NOT_RECEIVED = -100.0
 
 Powers = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n r"], Float[np.ndarray, "r 3"]]
 """Transmitter positions (metres), powers (dB; NaN: nothing received), and receiver positions (metres)."""
@@ -66,12 +64,13 @@ def load_nerf2(folder: Path) -> Powers:
     Raises:
         UserError: a file is missing or damaged.
     """
+    antennas = ("base-station.yml", "rx_positions.yml")
     if (folder / RSSI).exists():
         source, listed = folder / RSSI, found(folder, GATEWAYS)
         names, receivers = _positions(listed)
         values = _rssi(source, names if names else len(receivers))
     else:
-        source, listed = folder / CSI, found(folder, ANTENNAS)
+        source, listed = folder / CSI, found(folder, antennas)
         (_, receivers), values = _positions(listed), _csi(source)
         if not (folder / TRANSMITTERS[0]).exists():
             raise UserError(
@@ -94,7 +93,7 @@ def _rssi(path: Path, gateways: list[str] | int) -> Float[np.ndarray, "n r"]:
     if len(header) != count:
         raise UserError(f"{path} has powers of {len(header)} gateways, but {GATEWAYS[0]} has {count}")
     values = numbers(path, header, rows, match_columns(path, header, gateways))
-    values = not_received(path, np.where(values <= NOT_RECEIVED, np.nan, values))
+    values = not_received(path, np.where(values <= -100.0, np.nan, values))  # -100: not received
     check_powers(path, values)
     return values
 
@@ -140,15 +139,6 @@ def _position(entry: Any) -> Any:
     return entry if isinstance(entry, list) else None
 
 
-READINGS, RECEIVERS = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
-NAMES = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
-"""Names of columns that may identify a receiver."""
-ROOMS = ("room", "floor", "storey", "level")
-"""Names of columns that divide readings; those of floors require heights."""
-IGNORED = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
-"""Names of columns that are ignored."""
-
-
 @dataclass(frozen=True)
 class Readings:
     """Powers received, or not received, by R receivers from N transmitter positions."""
@@ -192,21 +182,28 @@ def load_readings(folder: Path, height: float) -> Readings:
 
 
 def _load_tables(folder: Path, height: float) -> Readings:
-    path, of_receivers = found(folder, READINGS), found(folder, RECEIVERS)
+    reading_files, receiver_files = ("readings.csv", "calibration.csv"), ("receivers.csv", "anchors.csv")
+    path, of_receivers = found(folder, reading_files), found(folder, receiver_files)
     names, entries = read_table(of_receivers)
     receivers = numbers(of_receivers, names, entries, ["x", "y", "z"])
     header, rows = read_table(path)
-    powers = [name for name in header if name not in ("x", "y", "z", *ROOMS, *IGNORED)]
+    # Names of columns that are ignored.
+    ignored = ("time", "timestamp", "date", "datetime", "comment", "note", "device", "index")
+    # Names of columns that divide readings; those of floors require heights.
+    room_columns = ("room", "floor", "storey", "level")
+    powers = [name for name in header if name not in ("x", "y", "z", *room_columns, *ignored)]
     if len(powers) != len(receivers):
         raise UserError(
             f"{path} has {len(powers)} columns of powers ({', '.join(powers)}), {of_receivers} has {len(receivers)} receivers; "
             "name these columns by the ids of receivers, and remove columns that are not powers"
         )
-    ids = next((names.index(name) for name in NAMES if name in names), None)
+    # Names of columns that may identify a receiver.
+    identifiers = ("id", "name", "receiver", "gateway", "anchor", "ap", "mac", "bssid")
+    ids = next((names.index(name) for name in identifiers if name in names), None)
     powers = match_columns(path, powers, len(receivers) if ids is None else [entry[ids] for entry in entries])
     places = numbers(path, header, rows, ["x", "y", "z"] if "z" in header else ["x", "y"])
-    parts = [header.index(name) for name in ROOMS if name in header]
-    if places.shape[1] == 2 and set(ROOMS[1:]) & set(header):
+    parts = [header.index(name) for name in room_columns if name in header]
+    if places.shape[1] == 2 and set(room_columns[1:]) & set(header):
         raise UserError(f"{path} has a column of floors but no heights; add the column z, metres in the receivers' frame")
     if places.shape[1] == 2:
         places = np.column_stack([places, np.full(len(places), height)])

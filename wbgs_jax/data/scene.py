@@ -12,20 +12,12 @@ from scipy.spatial import cKDTree
 
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.dataset import Dataset, Materials
-from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.mesh.bodies import ClosedBody, inside
 from wbgs_jax.radio.geometry import to_local
 from wbgs_jax.types import Mesh, Receiver, Surface, SurfaceSampling
 
 MESH_SIZED = (20_000, 70_000)
 """Bounds on the number of points if it is derived from the mesh."""
-OVERSAMPLING = 30
-"""Candidates per point that are drawn by area before "solid_angle" selects among them."""
-MIN_DISTANCE = 0.3
-"""Metres; nearer surfaces are not sampled more densely than at this distance."""
-BELOW_HORIZON = -0.1
-"""Cosine of the largest zenith angle of initial points: slightly below the horizon, for footprints that extend above it."""
-BOX_MARGIN = 1.0
-"""Margin (metres) around transmitters and receivers in which points are drawn if there are no surfaces."""
 
 
 @dataclass(frozen=True)
@@ -82,13 +74,14 @@ def make_surface(dataset: Dataset, count: int, seed: int, sampling: SurfaceSampl
     rng = np.random.default_rng(seed)
     if count == 0:
         count = int(np.clip(len(dataset.vertices), *MESH_SIZED))
+    box_margin = 1.0  # margin (metres) around transmitters and receivers in which points are drawn if there are no surfaces
     if len(dataset.faces):
         points = _sample_mesh(dataset, count, rng, sampling)
     elif len(dataset.vertices):
         points = dataset.vertices[rng.choice(len(dataset.vertices), min(count, len(dataset.vertices)), replace=False)]
     else:
         places = _antennas(dataset)
-        points = rng.uniform(places.min(0) - BOX_MARGIN, places.max(0) + BOX_MARGIN, (count, 3))
+        points = rng.uniform(places.min(0) - box_margin, places.max(0) + box_margin, (count, 3))
     return surface_from_points(points)
 
 
@@ -141,7 +134,8 @@ def _sample_mesh(dataset: Dataset, count: int, rng: np.random.Generator, samplin
     mesh = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
     if sampling == "area":
         return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=rng)[0])
-    candidates, face = map(np.asarray, trimesh.sample.sample_surface(mesh, OVERSAMPLING * count, seed=rng))
+    oversampling = 30  # candidates per point that are drawn by area before "solid_angle" selects among them
+    candidates, face = map(np.asarray, trimesh.sample.sample_surface(mesh, oversampling * count, seed=rng))
     receivers = map(dataset.receiver, range(dataset.n_receivers))
     weight = sum((_solid_angle(candidates, mesh.face_normals[face], rx) for rx in receivers), np.zeros(len(candidates)))
     if np.count_nonzero(weight) < count:
@@ -154,14 +148,13 @@ def _solid_angle(
 ) -> Float[np.ndarray, " n"]:
     """Returns the solid angle of surface elements of unit area at a receiver; 0 below its horizon."""
     offset = points - np.asarray(receiver.position)
-    distance = np.maximum(np.linalg.norm(offset, axis=1), MIN_DISTANCE)
+    min_distance = 0.3  # metres; nearer surfaces are not sampled more densely than at this distance
+    distance = np.maximum(np.linalg.norm(offset, axis=1), min_distance)
     facing = np.abs(np.sum(offset * normals, -1)) / distance
     zenith = to_local(jnp.asarray(offset, jnp.float32), receiver.orientation)[:, 2] / distance
-    return np.where(np.asarray(zenith) > BELOW_HORIZON, facing / distance**2 + 1e-12, 0)
-
-
-CLEARANCE = 1e-3
-"""Metres at both ends of a line within which surfaces are ignored: antennas may be mounted on them."""
+    # Cosine of the largest zenith angle of initial points: slightly below the horizon, for footprints that extend above it.
+    below_horizon = -0.1
+    return np.where(np.asarray(zenith) > below_horizon, facing / distance**2 + 1e-12, 0)
 
 
 def in_sight(dataset: Dataset, index: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"] | None:
@@ -188,14 +181,9 @@ def _obstructed(
     starts, ways = (np.broadcast_to(vector, normals.shape) for vector in (start, way))
     points, cut, along = trimesh.intersections.planes_lines(triangles[:, 0], normals, starts, ways, return_distance=True)
     inside = (trimesh.triangles.points_to_barycentric(triangles[cut], points) >= 0).all(1)
-    margin = CLEARANCE / max(float(np.linalg.norm(way)), CLEARANCE)
+    clearance = 1e-3  # metres at both ends of a line within which surfaces are ignored: antennas may be mounted on them
+    margin = clearance / max(float(np.linalg.norm(way)), clearance)
     return bool((inside & (along > margin) & (along < 1 - margin)).any())
-
-
-ALIKE_M = 1e-4
-"""Metres: vertices nearer than this are identified."""
-MOST_TRIANGLES = 20_000
-"""Maximum number of triangles of all bodies together; the largest bodies are omitted."""
 
 
 def closed_bodies(dataset: Dataset) -> tuple[ClosedBody, ...]:
@@ -217,14 +205,16 @@ def closed_bodies(dataset: Dataset) -> tuple[ClosedBody, ...]:
             found.append(body)
     found.sort(key=lambda body: len(body.triangles))
     total = np.cumsum([len(body.triangles) for body in found])
-    return tuple(body for body, triangles in zip(found, total, strict=True) if triangles <= MOST_TRIANGLES)
+    most_triangles = 20_000  # maximum number of triangles of all bodies together; the largest bodies are omitted
+    return tuple(body for body, triangles in zip(found, total, strict=True) if triangles <= most_triangles)
 
 
 def _is_closed(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "t 3"]) -> bool:
     """Returns whether every edge belongs to two triangles of opposite direction."""
     used, index = np.unique(faces, return_inverse=True)
+    alike_m = 1e-4  # metres: vertices nearer than this are identified
     _, same = np.unique(
-        np.round(np.asarray(vertices, np.float64)[used] / ALIKE_M).astype(np.int64), axis=0, return_inverse=True
+        np.round(np.asarray(vertices, np.float64)[used] / alike_m).astype(np.int64), axis=0, return_inverse=True
     )
     corners = same.reshape(-1)[index.reshape(-1, 3)]
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])

@@ -16,8 +16,6 @@ from wbgs_jax.data.dataset import Dataset
 
 VALIDATION = 0.1
 """Fraction of the training transmitters used for validation, unless the data specify a validation part."""
-FEW_TX, LARGEST_SHARE = 8, 0.25
-"""Desired minimum number of validation transmitters, and maximum fraction used to reach it."""
 
 
 def group_transmitters(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -52,7 +50,7 @@ def tx_disjoint_split(
 
 def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Dataset:
     """Returns the dataset with `fraction` of its training transmitters moved to the validation part. If these are fewer than
-    `FEW_TX`, that many are moved, but at most a quarter of all, since fewer would decide nothing.
+    eight, eight are moved, but at most a quarter of all, since fewer would decide nothing.
 
     The choice depends only on the split, not on a run's seed or on what is trained. Data with a validation part of their own,
     and data with a single training transmitter, are unchanged.
@@ -64,8 +62,9 @@ def hold_out_validation(dataset: Dataset, fraction: float = VALIDATION) -> Datas
     if len(dataset.validation) or len(np.unique(tx_index)) < 2:
         return dataset
     transmitters = np.unique(tx_index)
+    few, largest_share = 8, 0.25  # desired minimum number of validation transmitters, and maximum fraction used to reach it
     if 0 < fraction < 1:  # other values are rejected below
-        fraction = max(fraction, min(FEW_TX / len(transmitters), LARGEST_SHARE))
+        fraction = max(fraction, min(few / len(transmitters), largest_share))
     seed = zlib.crc32(transmitters.astype("<i8").tobytes())
     moved = _draw(tx_index, fraction, np.random.default_rng(seed), "validation")
     return dataclasses.replace(dataset, train=dataset.train[~moved], validation=dataset.train[moved])

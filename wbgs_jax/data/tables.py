@@ -140,51 +140,27 @@ def numbers(path: Path, header: list[str], rows: list[list[str]], columns: list[
     return values
 
 
-POWERS_DBM = (-200.0, 50.0)
-"""Range of plausible powers."""
-SENTINELS = (
-    0.0,
-    1.0,
-    100.0,
-    127.0,
-    255.0,
-    -100.0,
-    -110.0,
-    -120.0,
-    -127.0,
-    -128.0,
-    -140.0,
-    -150.0,
-    -174.0,
-    -199.0,
-    -200.0,
-    -999.0,
-)
-"""Numbers that devices write if they received nothing ..."""
-APART_DB = 8.0
-"""... if all other values are at least this far to one side of them ..."""
-OFTEN = 0.2
-"""... or if at least this fraction of the readings equals the lowest value."""
-FURTHEST = 1e4
-"""Largest coordinate, metres."""
-DEGREES, TINY, FAR = (180.0, 90.0), 0.3, 20.0
-"""Largest longitude and latitude; largest extent of a site in degrees; and minimum ratio of its distance from the origin to its
-extent."""
-FEWEST, ELSEWHERE = 5, 50.0
-"""Minimum number of positions that may be degrees, or of powers of a receiver that may lack their sign; and minimum ratio of
-the distance to the nearest receiver (in metres) to the extent of such positions."""
+DEGREES, TINY = (180.0, 90.0), 0.3
+"""Largest longitude and latitude, and largest extent of a site, degrees."""
 
 
 def not_received(where: Path, powers: Float[np.ndarray, "n r"]) -> Float[np.ndarray, "n r"]:
     """Returns powers with NaN in place of numbers that mean "not received"; a warning names these numbers."""
     powers = np.where(np.isneginf(powers), np.nan, powers)
-    for number in SENTINELS:
+    # Numbers that devices write if they received nothing ...
+    sentinels = (
+        0.0, 1.0, 100.0, 127.0, 255.0,
+        -100.0, -110.0, -120.0, -127.0, -128.0, -140.0, -150.0, -174.0, -199.0, -200.0, -999.0,
+    )  # fmt: skip
+    apart_db = 8.0  # ... if all other values are at least this far to one side of them ...
+    often = 0.2  # ... or if at least this fraction of the readings equals the lowest value.
+    for number in sentinels:
         is_it = powers == number
         others = powers[~np.isnan(powers) & ~is_it]
         if not is_it.any() or not len(others):
             continue
-        apart = number > others.max() + APART_DB or number < others.min() - APART_DB
-        floor = number < others.min() and is_it.sum() >= OFTEN * len(others)
+        apart = number > others.max() + apart_db or number < others.min() - apart_db
+        floor = number < others.min() and is_it.sum() >= often * len(others)
         if apart or floor:
             share = is_it.sum() / powers.size
             warnings.warn(f"{where}: {number:g} is taken as not received ({100 * share:.0f} % of the powers)", stacklevel=2)
@@ -204,17 +180,19 @@ def check_powers(where: Path, powers: Float[np.ndarray, "n r"]) -> None:
         )
     for number, column in enumerate(powers.T, 1):
         own = column[~np.isnan(column)]
-        if len(own) >= FEWEST and own.min() >= 0:
+        if len(own) >= 5 and own.min() >= 0:  # fewer may all be strong
             raise UserError(f"{where}: the powers of receiver {number} are all positive; give magnitudes their sign (dBm)")
-    if not ((received >= POWERS_DBM[0]) & (received <= POWERS_DBM[1])).all():
-        span = " to ".join(f"{power:g}" for power in POWERS_DBM)
+    powers_dbm = (-200.0, 50.0)  # range of plausible powers
+    if not ((received >= powers_dbm[0]) & (received <= powers_dbm[1])).all():
+        span = " to ".join(f"{power:g}" for power in powers_dbm)
         raise UserError(f"{where}: powers must be dBm, {span}; leave cells empty where nothing was received")
 
 
 def check_positions(what: str, positions: Float[np.ndarray, "*n k"]) -> None:
     """Raises a `UserError` for invalid positions."""
-    if not (np.abs(positions) < FURTHEST).all():
-        raise UserError(f"{what} must be coordinates in metres, each less than {FURTHEST:g} m from the origin")
+    furthest = 1e4  # largest coordinate, metres
+    if not (np.abs(positions) < furthest).all():
+        raise UserError(f"{what} must be coordinates in metres, each less than {furthest:g} m from the origin")
 
 
 def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
@@ -222,7 +200,8 @@ def check_metres(what: str, positions: Float[np.ndarray, "n k"]) -> None:
     plane = positions[:, :2]
     extent, offset = np.ptp(plane, axis=0).max(), np.abs(plane.mean(0)).max()
     ranged = (np.abs(plane) <= DEGREES).all() or (np.abs(plane) <= DEGREES[::-1]).all()
-    if len(plane) > 1 and ranged and extent < TINY and offset > FAR * max(extent, 1e-12):
+    far = 20.0  # minimum ratio of the distance of a site in degrees from the origin to its extent
+    if len(plane) > 1 and ranged and extent < TINY and offset > far * max(extent, 1e-12):
         raise UserError(
             f"{what} all lie within {extent:.2g}, {offset:.3g} from the origin: degrees of longitude and latitude; project "
             "them to metres (for example UTM), relative to an origin on the site"
@@ -234,7 +213,9 @@ def check_frame(what: str, places: Float[np.ndarray, "n 3"], receivers: Float[np
     plane = np.unique(places[:, :2], axis=0)
     extent = np.ptp(plane, axis=0).max()
     nearest = np.linalg.norm(receivers[:, :2] - plane.mean(0), axis=1).min()
-    if len(plane) >= FEWEST and extent < TINY and nearest > ELSEWHERE * extent and (np.abs(plane) <= max(DEGREES)).all():
+    # Minimum number of positions, and minimum ratio of the distance to the nearest receiver (metres) to their extent (degrees).
+    fewest, elsewhere = 5, 50.0
+    if len(plane) >= fewest and extent < TINY and nearest > elsewhere * extent and (np.abs(plane) <= max(DEGREES)).all():
         raise UserError(
             f"{what} all lie within {extent:.2g}, {nearest:.3g} m from the nearest receiver: degrees of longitude and "
             "latitude; project them to metres (for example UTM), relative to the origin of the receivers"

@@ -91,40 +91,33 @@ def with_part(name: str, part: str) -> str:
 
 def table(report: dict[str, Any]) -> Table:
     """Returns the report as a table with one row per frequency and the baselines beside the field."""
-    if "median_ssim" not in report:
-        return _power_table(report)
     names = list(report["baselines"])
-    part = "held-out" if report["part"] == "test" else "validation"
-    result = Table(title=f"{report['scene']}, {report['field']}: {part} SSIM (median / mean) of {report['n']} spectra")
-    for column in ("GHz", report["field"], *(name.replace("_", " ") for name in names), "PSNR dB", "MAE"):
+    others = [name.replace("_", " ") for name in names]
+    if "median_ssim" in report:
+        part = "held-out" if report["part"] == "test" else "validation"
+        title, cells = f"{part} SSIM (median / mean) of {report['n']} spectra", _cells_of_spectra
+        columns = [report["field"], *others, "PSNR dB", "MAE"]
+    else:
+        title, cells = f"received power of {report['n']} held-out links", _cells_of_powers
+        columns = ["median error dB", "mean", *others]
+    result = Table(title=f"{report['scene']}, {report['field']}: {title}")
+    for column in ("GHz", *columns):
         result.add_column(column, justify="right")
-
-    def row(label: str, own: dict[str, Any], others: list[dict[str, Any]]) -> None:
-        pair = [f"{r['median_ssim']:.3f} / {r['mean_ssim']:.3f}" for r in (own, *others)]
-        result.add_row(label, *pair, f"{own['psnr_db']:.1f}", f"{own['mae']:.3f}")
-
     for i, own in enumerate(report["per_frequency"]):
-        row(f"{own['frequency_ghz']:g}", own, [report["baselines"][name]["per_frequency"][i] for name in names])
+        baselines = [report["baselines"][name]["per_frequency"][i] for name in names]
+        result.add_row(f"{own['frequency_ghz']:g}", *cells(own, baselines))
     result.add_section()
-    row("all", report, [report["baselines"][name] for name in names])
+    result.add_row("all", *cells(report, [report["baselines"][name] for name in names]))
     return result
 
 
-def _power_table(report: dict[str, Any]) -> Table:
-    result = Table(title=f"{report['scene']}, {report['field']}: received power of {report['n']} held-out links")
-    names = list(report["baselines"])
-    for column in ("GHz", "median error dB", "mean", *(name.replace("_", " ") for name in names)):
-        result.add_column(column, justify="right")
+def _cells_of_spectra(own: dict[str, Any], others: list[dict[str, Any]]) -> list[str]:
+    pairs = [f"{figures['median_ssim']:.3f} / {figures['mean_ssim']:.3f}" for figures in (own, *others)]
+    return [*pairs, f"{own['psnr_db']:.1f}", f"{own['mae']:.3f}"]
 
-    def row(label: str, own: dict[str, Any], others: list[dict[str, Any]]) -> None:
-        means = [f"{figures['power_mae_db']:.2f}" for figures in (own, *others)]
-        result.add_row(label, f"{own['power_error_db']:.2f}", *means)
 
-    for i, own in enumerate(report["per_frequency"]):
-        row(f"{own['frequency_ghz']:g}", own, [report["baselines"][name]["per_frequency"][i] for name in names])
-    result.add_section()
-    row("all", report, [report["baselines"][name] for name in names])
-    return result
+def _cells_of_powers(own: dict[str, Any], others: list[dict[str, Any]]) -> list[str]:
+    return [f"{own['power_error_db']:.2f}", *(f"{figures['power_mae_db']:.2f}" for figures in (own, *others))]
 
 
 def closing_lines(report: dict[str, Any], block: int) -> list[str]:

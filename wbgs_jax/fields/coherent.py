@@ -77,8 +77,6 @@ __all__ = [
 
 EXACT_PLACE = float(np.log(1e-6))
 """Logarithm of the standard deviation (metres) of a position that is known."""
-SAME_PLACE_M = 1e-3
-"""Distance, metres, below which two receiver positions count as the same."""
 _last: list[tuple[Any, ...]] = [()]
 """Facets, edges and settings of the last image tree, and the tree: `fields.pas` plans for the same receiver again and again."""
 
@@ -191,8 +189,10 @@ class WaveField(Calibratable):
         away = xp.linalg.norm(places - position, axis=-1)
         own = xp.argmin(away)
 
+        same_place_m = 1e-3  # distance, metres, below which two receiver positions count as the same
+
         def found(of_all: Any, xp: Any = jnp) -> Any:
-            return xp.where(away[own] < SAME_PLACE_M, of_all[own], 0)
+            return xp.where(away[own] < same_place_m, of_all[own], 0)
 
         position = position + found(shifts, xp)
         if xp is np:

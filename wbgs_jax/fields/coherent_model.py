@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.complex_math import phasor
-from wbgs_jax._util.pytree import pytree, same, static
+from wbgs_jax._util.pytree import map_blocks, pytree, same, static
 from wbgs_jax.fields.base import Observation
 from wbgs_jax.fields.coherent_settings import WaveConfig
 from wbgs_jax.propagation.absorption import Grid, attenuation, smoothed
@@ -44,16 +43,9 @@ from wbgs_jax.radio.channel import FAINTEST, Paths, added_powers, decibels
 from wbgs_jax.radio.geometry import quaternion_product, rotation_quaternion
 from wbgs_jax.types import Links, Query, Receiver, Transmitter, check_query
 
-FAINTEST_SUM = 1e-12
-"""Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
-there is no spectrum."""
 DENSITIES_HZ = 1e9, 1e11
 """Frequencies (Hz) at which the absorption grid stores a density; interpolated over the logarithm of the frequency in
 between, constant beyond."""
-THIN = 1e-3
-"""Initial density of the absorption grid, nepers per metre: a tenth of a decibel across a room."""
-LARGEST_LOG_CONDUCTIVITY = float(np.log(1e6))
-"""Logarithm of the largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows."""
 
 
 @pytree
@@ -238,6 +230,10 @@ def path_covariances(
     transmitters (`WaveParams.placement`), scaled to a trace of 1, and the mean power received by an element."""
     spread = jnp.exp(params.placement)
 
+    # Smallest total power of several paths, relative to the strongest path; if they cancel further, or if there are no paths,
+    # there is no spectrum.
+    faintest_sum = 1e-12
+
     def one(paths: TracedPaths, arrived: Paths, f: Float[Array, ""]) -> Any:
         strongest = jax.lax.stop_gradient(jnp.max(jnp.abs(arrived.amplitude)))
         strongest = jnp.where(strongest > FAINTEST, strongest, 1)  # no paths: 1 / FAINTEST^2 would overflow
@@ -248,7 +244,7 @@ def path_covariances(
             gains = element_gains(plan.array_gains)
             covariance = covariance * gains[:, None] * gains.conj()
         trace = jnp.trace(covariance).real
-        return covariance / jnp.maximum(trace, FAINTEST_SUM), trace / len(covariance) * strongest**2
+        return covariance / jnp.maximum(trace, faintest_sum), trace / len(covariance) * strongest**2
 
     found: Any = jax.vmap(one)(paths, arrived, frequency_hz)
     return found
@@ -267,7 +263,9 @@ def phase_blind_pas(params: WaveParams, plan: WavePlan, paths: TracedPaths, link
 def slabs_at(params: WaveParams, plan: WavePlan, frequency_hz: Float[Array, ""]) -> Slabs:
     """Returns the slabs of all facets at one frequency."""
     m, material = params.materials, plan.surfaces.facets.material
-    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), LARGEST_LOG_CONDUCTIVITY))
+    # The largest conductivity (S/m): beyond it every material is a perfect mirror, and single precision overflows.
+    largest_log = float(np.log(1e6))
+    sigma = jnp.exp(jnp.minimum(m.log_conductivity + m.slope * jnp.log(frequency_hz / 1e9), largest_log))
     permittivity = complex_permittivity(1 + jnp.exp(m.log_susceptibility), sigma, frequency_hz)
     thickness = jnp.where(plan.known_thickness > 0, plan.known_thickness, jnp.exp(m.log_thickness))
     return Slabs(permittivity[material], thickness[material], params.thick)
@@ -302,8 +300,9 @@ def arrivals_at(params: WaveParams, plan: WavePlan, paths: TracedPaths, link: Qu
 
 
 def transparent_grid(shape: tuple[int, int, int]) -> Float[Array, "x y z 2"]:
-    """Returns the initial `WaveParams.clutter`, which is nearly transparent (`THIN`)."""
-    return stored(jnp.full((*shape, len(DENSITIES_HZ)), THIN, jnp.float32))
+    """Returns the initial `WaveParams.clutter`, which is nearly transparent."""
+    thin = 1e-3  # initial density of the absorption grid, nepers per metre: a tenth of a decibel across a room
+    return stored(jnp.full((*shape, len(DENSITIES_HZ)), thin, jnp.float32))
 
 
 def densities(stored_density: Float[Array, "x y z 2"]) -> Float[Array, "x y z 2"]:
@@ -336,10 +335,6 @@ def _corrections(params: WaveParams, paths: PathGeometry) -> Complex[Array, " k"
     return jnp.exp(total[:, 0] - losses + 1j * total[:, 1])
 
 
-TRACED_AT_ONCE = 16
-"""Number of transmitters that are traced together."""
-
-
 def prepare_paths(links: Links, plan_of: Callable[[int], WavePlan]) -> PreparedPaths:
     """Returns the paths between the transmitters and receivers of links (host).
 
@@ -369,7 +364,8 @@ def trace(plan: WavePlan, tx_position: Float[Array, "b 3"]) -> TracedPaths:
 
 
 def _traced_in_blocks(plan: WavePlan, positions: Float[np.ndarray, "n 3"]) -> Any:
-    return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, TRACED_AT_ONCE)
+    traced_at_once = 16  # number of transmitters that are traced together
+    return map_blocks(lambda block: trace(plan, jnp.asarray(block)), positions, traced_at_once)
 
 
 def _stacked(some: list[PathGeometry]) -> PathGeometry:

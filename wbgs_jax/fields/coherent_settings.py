@@ -7,9 +7,6 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.config import PRESETS as COMMON
 from wbgs_jax.config import CalibrationConfig, Settings, check_positive
 
-MAX_FACETS = 100_000
-"""Largest number of facets that has been tested; each may reflect waves and obstruct all other paths."""
-
 
 @dataclass(frozen=True)
 class WaveConfig:
@@ -78,8 +75,10 @@ class WaveConfig:
 
     def check(self, name: str) -> None:
         """Raises a `UserError` for invalid settings; the message names the option with the field's `name`."""
-        if self.max_facets > MAX_FACETS:
-            raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {MAX_FACETS}")
+        # Largest number of facets that has been tested; each may reflect waves and obstruct all other paths.
+        max_facets = 100_000
+        if self.max_facets > max_facets:
+            raise UserError(f"--{name}.max-facets is {self.max_facets}; the most is {max_facets}")
         check_positive({f"{name}.ssim-stride": self.ssim_stride})
         if self.clutter_cells < 1 or self.clutter_cell <= 0:
             raise UserError(

@@ -33,8 +33,6 @@ RELATIVE_FEATURES, GIVEN_FEATURES = 7, 3
 """Numbers of relative inputs (`WidebandConfig.relative`) and of inputs from a conditioning spectrum (`given_features`)."""
 DARK = 0.02
 """Offset that keeps the logarithm of dark pixels finite."""
-POWER_UNIT_DB = 10.0
-"""Unit of the power network's output, dB."""
 Weights = dict[str, Any]
 """Weights of all networks, by name."""
 
@@ -149,7 +147,8 @@ def received_power_db(
     frequency = [scale_frequency(query.frequency_hz)[:, None]] if config.sees_frequency else []
     parts = [summary, positional_encoding(scaled_tx, config.tx_octaves), *frequency]
     correction: Any = make_networks(config)[2].apply(weights["power"], parts)
-    return free_space_db(distance, query.frequency_hz) + POWER_UNIT_DB * correction
+    power_unit_db = 10.0  # unit of the power network's output, dB
+    return free_space_db(distance, query.frequency_hz) + power_unit_db * correction
 
 
 def _query_inputs(

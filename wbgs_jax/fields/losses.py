@@ -13,25 +13,22 @@ from jaxtyping import Array, Complex, Float
 from wbgs_jax.radio.array import EXACT, squared_magnitude
 from wbgs_jax.radio.channel import unit_snapshots
 
-_WINDOW, _SIGMA = 11, 1.5
-FAINTEST = 1e-12
-"""Power relative to that of the truth that is added to predictions: a prediction close to zero has no useful gradient."""
 GOOD_MATCH = 2e-3
 """One minus the squared correlation below which calibration treats two snapshots as equal."""
 UNEXPLAINED = 0.1
 """Power of noise relative to the power of the model, in `surprise`: it stands for paths that are missing from the model."""
-_C1, _C2 = 0.01**2, 0.03**2
 
 
 @functools.lru_cache
 def _blur_matrix(size: int) -> Float[np.ndarray, "valid size"]:
     """Returns the banded matrix that blurs one axis, for the valid region only."""
-    offset = np.arange(_WINDOW) - _WINDOW // 2
-    window = np.exp(-(offset**2) / (2 * _SIGMA**2))
+    width, sigma = 11, 1.5
+    offset = np.arange(width) - width // 2
+    window = np.exp(-(offset**2) / (2 * sigma**2))
     window /= window.sum()
-    matrix = np.zeros((size - _WINDOW + 1, size))
+    matrix = np.zeros((size - width + 1, size))
     for row in range(len(matrix)):
-        matrix[row, row : row + _WINDOW] = window
+        matrix[row, row : row + width] = window
     return matrix
 
 
@@ -84,8 +81,9 @@ def _structural_similarity(
 ) -> Float[Array, "*n"]:
     """Returns the mean SSIM from local means of two images, of the sum of their squares, and of their product."""
     squared_means, product_of_means = mean_a**2 + mean_b**2, mean_a * mean_b
-    luminance = (2 * product_of_means + _C1) / (squared_means + _C1)
-    structure = (2 * (product - product_of_means) + _C2) / (squares - squared_means + _C2)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * product_of_means + c1) / (squared_means + c1)
+    structure = (2 * (product - product_of_means) + c2) / (squares - squared_means + c2)
     return jnp.mean(luminance * structure, axis=(-2, -1))
 
 
@@ -136,7 +134,9 @@ def _correlation_and_power(
     unit_truth, scale = unit_snapshots(truth)
     received = scale[..., 0] > 0
     relative = predicted / jnp.where(scale > 0, scale, 1)
-    power = jnp.sum(squared_magnitude(relative), -1) + FAINTEST
+    # Power relative to that of the truth that is added to predictions: a prediction close to zero has no useful gradient.
+    faintest = 1e-12
+    power = jnp.sum(squared_magnitude(relative), -1) + faintest
     squared_correlation = squared_magnitude(jnp.sum(unit_truth.conj() * relative, -1)) / power
     return jnp.where(received, squared_correlation, 1), jnp.where(received, power, 1)
 

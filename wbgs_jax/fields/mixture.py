@@ -47,16 +47,6 @@ SHARES = np.linspace(0, 1, 21)
 """Weights of the first of two experts at which links are scored."""
 FEATURES = 7
 """Number of features z of a query."""
-FOLDS = 5
-"""Folds of the cross-validation over transmitters."""
-RIDGE = 5e-3
-"""Penalty on the squared coefficients, relative to the range of the scores over the weights."""
-STEPS, RATE = 400, 0.03
-"""Steps and learning rate of Adam, which fits the coefficients."""
-BLOCK = 48
-"""Number of spectra that are compared at once."""
-FAINTEST_DB = 60.0
-"""Received powers are clipped at this number of decibels below free space."""
 
 
 @pytree
@@ -170,10 +160,11 @@ def features(
     """
     octave = jnp.log2(query.frequency_hz / 1e10)
     link = query.tx_position, rx_position, query.frequency_hz
+    faintest_db = 60.0  # received powers are clipped at this number of decibels below free space
     beyond = [
         jnp.zeros_like(octave)
         if seen.power_db is None
-        else jnp.clip(beyond_free_space_db(seen.power_db, *link), -FAINTEST_DB, 0.0)
+        else jnp.clip(beyond_free_space_db(seen.power_db, *link), -faintest_db, 0.0)
         for seen in (coherent, own)
     ]
     brightness = [jnp.log(jnp.mean(seen.pas, (-2, -1)) + 1e-3) for seen in (coherent, own)]
@@ -211,7 +202,8 @@ def similarity(truth: Float[np.ndarray, "n 90 360"], one: Any, other: Any) -> Fl
 def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360"]) -> Float[np.ndarray, "n tried"]:
     """Returns the values of a function of N spectra, evaluated in blocks to limit device memory; several arrays of spectra are
     passed together."""
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(spectra[0]), BLOCK)]
+    block_size = 48  # number of spectra that are compared at once
+    blocks = [slice(start, start + block_size) for start in range(0, len(spectra[0]), block_size)]
     return np.concatenate([np.asarray(score(*(each[block] for each in spectra))) for block in blocks])
 
 
@@ -231,11 +223,12 @@ def learn_share(known: Scored) -> Share:
     """Returns the weight that fits links best (host): the same for all, unless the features improve on it by more than a
     standard error in cross-validation."""
     common = constant(_best(known.scores))
-    folds = np.unique(known.tx_index, return_inverse=True)[1] % FOLDS
-    if len(np.unique(known.tx_index)) < 2 * FOLDS:
+    number_of_folds = 5  # folds of the cross-validation over transmitters
+    folds = np.unique(known.tx_index, return_inverse=True)[1] % number_of_folds
+    if len(np.unique(known.tx_index)) < 2 * number_of_folds:
         return common
     gains = np.zeros(len(folds))
-    for fold in range(FOLDS):
+    for fold in range(number_of_folds):
         own, rest = (jax.tree.map(lambda a, keep=keep: a[keep], known) for keep in (folds == fold, folds != fold))
         by_features, by_all = _fit(rest), constant(_best(rest.scores))
         gains[folds == fold] = _worth(by_features, own) - _worth(by_all, own)
@@ -279,32 +272,32 @@ def _ascend(
     def with_learned(learned: tuple[Array, Array]) -> Share:
         return Share(learned[0], learned[1] * used, start.mean, start.scale)
 
+    ridge = 5e-3  # penalty on the squared coefficients, relative to the range of the scores over the weights
+
     def loss(learned: tuple[Array, Array]) -> Float[Array, ""]:
         worth = score_at(scores, share_of(with_learned(learned), features))
-        return RIDGE * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
+        return ridge * jnp.sum(learned[1] ** 2) - jnp.mean(worth)
+
+    steps, rate = 400, 0.03  # steps and learning rate of Adam, which fits the coefficients
 
     def step(i: Int[Array, ""], carry: Any) -> Any:
         learned, first, second = carry
         gradient = jax.grad(loss)(learned)
         first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, gradient)
         second = jax.tree.map(lambda v, g: 0.99 * v + 0.01 * g**2, second, gradient)
-        size = RATE * jnp.sqrt(1 - 0.99 ** (i + 1.0)) / (1 - 0.9 ** (i + 1.0))
+        size = rate * jnp.sqrt(1 - 0.99 ** (i + 1.0)) / (1 - 0.9 ** (i + 1.0))
         learned = jax.tree.map(lambda p, m, v: p - size * m / (jnp.sqrt(v) + 1e-8), learned, first, second)
         return learned, first, second
 
     learned = start.bias, start.weights
     zeros = jax.tree.map(jnp.zeros_like, learned)
-    return with_learned(jax.lax.fori_loop(0, STEPS, step, (learned, zeros, zeros))[0])
+    return with_learned(jax.lax.fori_loop(0, steps, step, (learned, zeros, zeros))[0])
 
 
 LEVELS = np.concatenate([[0], np.geomspace(1e-4, 0.1, 31)])
 """Floors that are tried, relative to the largest square of a spectrum; lower ones are hardly visible in spectra."""
 SURE = 2.0
 """Improvement of the similarity by a floor that is significant, in standard errors over transmitters."""
-HARMLESS = 1.0
-"""Loss of similarity that is accepted when learned spectra are raised to the floor, in standard errors over transmitters."""
-DARKEST = 0.05
-"""Fraction of the pixels of learned spectra that may be darker than the floor."""
 FEWEST_TX = 10
 """Minimum number of transmitters for an estimate."""
 COMPARED = 240
@@ -354,8 +347,11 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
         return 0.0
     raised = in_blocks(_raised, learned, observed)
     losses = [standard_error(raised[:, 0] - with_level, tx_index) for with_level in raised.T]
-    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= HARMLESS * error)
-    return float(min(LEVELS[best], harmless, np.quantile(learned**2, DARKEST)))
+    # Loss of similarity that is accepted when learned spectra are raised to the floor, in standard errors over transmitters.
+    accepted = 1.0
+    harmless = max(level for level, (loss, error) in zip(LEVELS, losses, strict=True) if loss <= accepted * error)
+    darkest = 0.05  # fraction of the pixels of learned spectra that may be darker than the floor
+    return float(min(LEVELS[best], harmless, np.quantile(learned**2, darkest)))
 
 
 def observed_predictions(predicted: ExpertPredictions, floor: float) -> ExpertPredictions:

@@ -35,8 +35,6 @@ from wbgs_jax.radio.geometry import rotation_matrix, smooth_length, to_local
 from wbgs_jax.types import Batch, Query, Receiver, Scene, Transmitter, check_query, check_receiver
 
 PIXELS = PAS_HEIGHT * PAS_WIDTH
-MIN_LENGTH = 1e-3
-"""Minimum length of a ray, metres."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +195,8 @@ def make_rays(box: Float[Array, "2 3"], receiver: Receiver, local: Float[Array, 
     ahead = jnp.where(world > 0, box[1], box[0]) - receiver.position
     parallel = jnp.abs(world) < 1e-9
     exits = jnp.where(parallel, jnp.inf, ahead / jnp.where(parallel, 1.0, world))
-    return Rays(local, world, jnp.maximum(exits.min(-1), MIN_LENGTH))
+    min_length = 1e-3  # minimum length of a ray, metres
+    return Rays(local, world, jnp.maximum(exits.min(-1), min_length))
 
 
 def render(params: Weights, plan: Nerf2Plan, query: Query) -> Float[Array, "b 90 360"]:

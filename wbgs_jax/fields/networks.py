@@ -30,8 +30,6 @@ GaussianSums = tuple[Float[Array, "... width"], Float[Array, "... width"] | None
 """Sums of layers `fusion` and `skip` before the query enters; the second is None unless `skip` is after `fusion`."""
 Precision = Literal["device", "float32", "tf32", "bfloat16"]
 """Precision of the factors in products; sums are float32. "device" means TF32 on GPUs that support it, else float32."""
-TF32_BITS = 8, 10
-"""Bits of exponent and mantissa."""
 
 
 def product(a: Any, b: Any, dimension_numbers: Any, precision: Precision = "device") -> Any:
@@ -42,8 +40,9 @@ def product(a: Any, b: Any, dimension_numbers: Any, precision: Precision = "devi
     if precision == "bfloat16":
         a, b = a.astype(jnp.bfloat16), b.astype(jnp.bfloat16)
         return lax.dot_general(a, b, dimension_numbers, preferred_element_type=jnp.float32)
+    tf32_bits = 8, 10  # bits of exponent and mantissa
     if precision == "tf32":
-        a, b = (lax.reduce_precision(array, *TF32_BITS) for array in (a, b))
+        a, b = (lax.reduce_precision(array, *tf32_bits) for array in (a, b))
     exact = lax.Precision.HIGHEST if precision == "float32" else None
     return lax.dot_general(a, b, dimension_numbers, precision=exact)
 

@@ -59,15 +59,8 @@ from wbgs_jax.types import (
     check_surface,
 )
 
-FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM = 500, 16
-"""The initial number of Gaussians is at most 16 per training spectrum, but this limit is never below 500."""
-SPARE = 16
-"""One slot in so many is free at first: most scenes need few Gaussians more than they begin with, and another number of slots
-is another program to compile."""
 INITIAL_ATTENUATION = 0.3
 """Initial attenuation of every Gaussian."""
-TILE_SLACK = 1.4
-"""Capacity of the tile lists relative to what is needed, because footprints grow during training."""
 
 
 @pytree
@@ -113,7 +106,9 @@ class WidebandField(Field):
     @classmethod
     def build(cls, config: WidebandConfig, scene: Scene, seed: int) -> "WidebandField":
         """Returns the field whose Gaussians start on the surfaces of a scene."""
-        count = min(config.gaussians, max(FEWEST_GAUSSIANS, GAUSSIANS_A_SPECTRUM * scene.spectra))
+        # The initial number of Gaussians is at most 16 per training spectrum, but this limit is never below 500.
+        fewest_gaussians, gaussians_a_spectrum = 500, 16
+        count = min(config.gaussians, max(fewest_gaussians, gaussians_a_spectrum * scene.spectra))
         return make_field(scene.surface(count, seed, config.sampling), config, cls)
 
     def init(self, key: Key[Array, ""], given: bool = False) -> WidebandParams:
@@ -202,7 +197,8 @@ class WidebandField(Field):
                 receiver = jax.tree.map(lambda leaf, i=i: leaf[i], receivers)
                 jobs = geometry_plan(params.gaussians, receiver, None, self.config.projection).jobs
                 required = np.maximum(required, [int(jobs.required_entries), int(jobs.required_jobs)])
-        return fit_limits(int(required[0]), int(required[1]), TILE_SLACK)
+        tile_slack = 1.4  # capacity of the tile lists relative to what is needed, because footprints grow during training
+        return fit_limits(int(required[0]), int(required[1]), tile_slack)
 
     def inspect(self, params: WidebandParams, plan: WidebandPlan | None = None, links: Query | None = None) -> Inspection:
         """Returns the number of Gaussians, and their state for B links."""
@@ -245,7 +241,10 @@ def _init(field: WidebandField, key: Key[Array, ""], given: bool) -> WidebandPar
 def _initial_gaussians(surface: Surface, features: int) -> Gaussians:
     points = surface.points
     n = points.shape[0]
-    slots = slots_for(n + n // SPARE)
+    # One slot in so many is free at first: most scenes need few Gaussians more than they begin with, and another number of
+    # slots is another program to compile.
+    spare = 16
+    slots = slots_for(n + n // spare)
     pad = slots - n
     log_scales = jnp.broadcast_to(jnp.log(jnp.maximum(surface.spacing, 1e-3))[:, None], (n, 3))
     logit = jnp.log(INITIAL_ATTENUATION / (MAX_ATTENUATION - INITIAL_ATTENUATION))

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.compilation import cache_folder, load_program, source_digest, trace_program
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import atomic_write, opened_archive
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.inference.domain import Domain
 from wbgs_jax.inference.quantities import COMPILED, QUANTITIES
 from wbgs_jax.inference.queries import Product, flatten
@@ -31,10 +31,6 @@ if TYPE_CHECKING:
 
 MOST = 16
 """Maximum number of queries per call."""
-LARGEST = 200e6
-"""Maximum size of the stored arrays, bytes; reading more takes as long as preparing the receiver."""
-FOLDER = "ready"
-META = "meta"
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,7 @@ def load_cached(run: Path, rx: str, what: str, count: int, lowest_hz: float) -> 
         return None
     try:
         with opened_archive(path, "", "") as archive:
-            meta = json.loads(str(archive[META]))
+            meta = json.loads(str(archive["meta"]))
             if what not in meta["what"] or lowest_hz < meta["lowest_hz"] or meta["state"] != _state(meta["watched"]):
                 return None
             arrays = tuple(archive[str(i)] for i in range(meta["arrays"]))
@@ -117,7 +113,8 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
     names = frozen_outputs(trained, loaded.dataset)
     leaves, structure = jax.tree.flatten(freeze(trained, loaded.receiver))
     arrays = tuple(np.asarray(leaf) for leaf in leaves)
-    if sum(array.nbytes for array in arrays) > LARGEST:
+    largest = 200e6  # maximum size of the stored arrays, bytes; reading more takes as long as preparing the receiver
+    if sum(array.nbytes for array in arrays) > largest:
         return None
 
     def answer(*arrays: Any) -> dict[str, Any]:
@@ -148,7 +145,7 @@ def make_cached(run: Path, rx: str, count: int, loaded: "LoadedField", watched: 
 def _place(run: Path, rx: str, count: int) -> Path | None:
     folder = cache_folder()
     words = os.fsencode(run.resolve()) + f"\n{rx}\n{size_for(count)}".encode()
-    return None if folder is None else folder / FOLDER / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
+    return None if folder is None else folder / "ready" / f"{hashlib.sha256(words).hexdigest()[:32]}.npz"
 
 
 def _state(watched: Sequence[Path | str]) -> str:

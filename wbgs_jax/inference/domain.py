@@ -8,11 +8,9 @@ from jaxtyping import Bool, Float
 from wbgs_jax._util.cli import point_words
 from wbgs_jax._util.pytree import AnyArray
 from wbgs_jax.inference.quantities import INTERVALS
-from wbgs_jax.mesh.solids import ClosedBody, inside
+from wbgs_jax.mesh.bodies import ClosedBody, inside
 from wbgs_jax.types import MIN_FREQUENCY_HZ
 
-NEAR = 1e-3
-"""Tolerance of the box, metres."""
 ROUNDED = 1e-6
 """Relative tolerance of frequencies, which users give in rounded gigahertz."""
 
@@ -48,7 +46,8 @@ class Domain(NamedTuple):
         `xp` is the module of the arrays: NumPy, or `jax.numpy` in compiled code."""
         low, high = self.box
         away = xp.linalg.norm(xp.maximum(xp.maximum(low - positions, positions - high), 0), axis=-1)
-        result = away > self.beyond + NEAR
+        near = 1e-3  # tolerance of the box, metres
+        result = away > self.beyond + near
         for body in self.bodies:
             result = result | inside(body, positions, xp)
         return result

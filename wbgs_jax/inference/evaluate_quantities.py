@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 import wbgs_jax
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.errors import UserError
+from wbgs_jax._util.pytree import map_blocks
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.scene import DatasetScene, closed_bodies
 from wbgs_jax.fields import Field, field_names, get_field

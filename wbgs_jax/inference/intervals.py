@@ -19,10 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from wbgs_jax._util.arrays import read_tree, write_tree
-from wbgs_jax._util.blocks import map_blocks
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.files import read_tree, write_tree
+from wbgs_jax._util.pytree import map_blocks, pytree
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import beyond_free_space_db
 from wbgs_jax.types import Query, Transmitter
@@ -31,16 +30,10 @@ MARGIN = 0.02
 """Keeps the logarithm of a perfect score finite."""
 LEVEL = 0.9
 """Nominal coverage of the intervals."""
-AT_ONCE = 16
-"""Number of predictions evaluated at a time."""
-AT_RECEIVER_M = 0.1
-"""Distance up to which a transmitter counts as being at the receiver, where none can be measured and intervals do not hold."""
 POWER_MARGIN_DB = 0.1
 """Keeps the logarithm of a zero error finite."""
 FILE, POWER_FILE = "confidence.npz", "power_confidence.npz"
 FEATURES, POWER_FEATURES = 6, 4
-BEYOND_FREE_SPACE_DB = -100.0, 30.0
-"""Limits of the received power relative to free space: without any path, the depth of the shadow is undefined."""
 
 
 @pytree
@@ -144,13 +137,15 @@ def _octave(query: Query) -> Float[Array, " b"]:
 
 
 def _beyond(power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]) -> Float[Array, " b"]:
-    return jnp.clip(beyond_free_space_db(power_db, query.tx_position, rx_position, query.frequency_hz), *BEYOND_FREE_SPACE_DB)
+    # Limits of the received power relative to free space: without any path, the depth of the shadow is undefined.
+    limits_db = -100.0, 30.0
+    return jnp.clip(beyond_free_space_db(power_db, query.tx_position, rx_position, query.frequency_hz), *limits_db)
 
 
 def expected_ssim(
     confidence: Confidence, pas: Float[Array, "b 90 360"], query: Query, power_db: Float[Array, " b"] | None = None
 ) -> Expected:
-    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver (`AT_RECEIVER_M`).
+    """Returns the expected SSIM of predicted spectra, with intervals; NaN for a transmitter at the receiver.
 
     Args:
         confidence: the regression, for the queried receiver.
@@ -175,7 +170,7 @@ def expected_power(
     confidence: PowerConfidence, power_db: Float[Array, " b"], query: Query, rx_position: Float[Array, "*#b 3"]
 ) -> ExpectedPower:
     """Returns the expected errors of received powers (dB) that a field predicts for B queries; NaN for a transmitter at the
-    receiver (`AT_RECEIVER_M`).
+    receiver.
 
     Args:
         confidence: the regression.
@@ -194,7 +189,8 @@ def expected_power(
 
 def _apart(query: Query, rx_position: Float[Array, "*#b 3"]) -> Bool[Array, " b"]:
     """Returns which transmitters are not at the receiver."""
-    return jnp.sum((query.tx_position - rx_position) ** 2, -1) > AT_RECEIVER_M**2
+    at_receiver_m = 0.1  # up to this distance none can be measured and intervals do not hold
+    return jnp.sum((query.tx_position - rx_position) ** 2, -1) > at_receiver_m**2
 
 
 def _log_error(confidence: Confidence | PowerConfidence, known: Float[Array, "b k"]) -> Float[Array, " b"]:
@@ -218,7 +214,8 @@ def expect_many(
 
     rows = (pas, tx_position, frequency_hz, power_db)
     rows = jax.tree.map(lambda values: np.asarray(values, np.float32), rows)
-    found: Expected = map_blocks(of_block, rows, AT_ONCE, full=True)
+    at_once = 16  # number of predictions evaluated at a time
+    found: Expected = map_blocks(of_block, rows, at_once, full=True)
     return found
 
 

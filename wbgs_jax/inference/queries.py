@@ -16,16 +16,8 @@ from wbgs_jax._util.cli import parse_vector
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_text
 
-MOST = 1_000_000
-"""Maximum number of queries."""
 COLUMNS = ("x", "y", "z", "ghz")
 """Columns of a file of queries."""
-AXES = "xyz"
-UNIT = "metres"
-SHOWN = 12
-"""Maximum number of queries in a figure."""
-MOST_ELEMENTS = 1024
-"""Maximum number of elements of an array."""
 
 
 class Product(NamedTuple):
@@ -109,21 +101,23 @@ def flatten(
 
 
 def shown_rows(count: int) -> Int[np.ndarray, " k"]:
-    """Returns the indices of the queries in a figure: all, or `SHOWN` evenly spaced ones."""
-    return np.unique(np.linspace(0, count - 1, min(count, SHOWN)).round().astype(int))
+    """Returns the indices of the queries in a figure: all, or twelve evenly spaced ones."""
+    return np.unique(np.linspace(0, count - 1, min(count, 12)).round().astype(int))
 
 
 def check_count(count: int, source: str) -> None:
-    """Raises a `UserError` for more than `MOST` queries."""
-    if count > MOST:
-        raise UserError(f"{source} gives {count:,} queries; at most {MOST:,} are possible at a time")
+    """Raises a `UserError` for too many queries."""
+    most = 1_000_000  # maximum number of queries
+    if count > most:
+        raise UserError(f"{source} gives {count:,} queries; at most {most:,} are possible at a time")
 
 
 def parse_line(word: str) -> Float[np.ndarray, "tx 3"]:
     """Returns equally spaced positions (metres), including both ends, parsed from "x,y,z:x,y,z:NUMBER"."""
     start, end, number = _three(word, "--line", "0,0,1.5:4,0,1.5:41")
     count = _number(number, "--line", word)
-    return np.linspace(parse_vector(start, "--line", "position", UNIT), parse_vector(end, "--line", "position", UNIT), count)
+    first, last = (parse_vector(place, "--line", "position", "metres") for place in (start, end))
+    return np.linspace(first, last, count)
 
 
 def parse_grid(word: str) -> Float[np.ndarray, "tx 3"]:
@@ -132,12 +126,12 @@ def parse_grid(word: str) -> Float[np.ndarray, "tx 3"]:
     example = "-2,-2,1.5:2,2,1.5:9x9x1"
     low, high, number = _three(word, "--grid", example)
     counts = [_number(part, "--grid", word) for part in number.split("x")]
-    if len(counts) != len(AXES):
+    if len(counts) != 3:
         raise UserError(
             f"--grid {word[:60]} lacks three numbers of points after the corners; give x,y,z:x,y,z:NXxNYxNZ, such as {example}"
         )
     check_count(int(np.prod(counts)), "--grid")
-    corners = [parse_vector(corner, "--grid", "position", UNIT) for corner in (low, high)]
+    corners = [parse_vector(corner, "--grid", "position", "metres") for corner in (low, high)]
     axes = [np.linspace(a, b, n) for a, b, n in zip(*corners, counts, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     return np.stack([x, y, z], -1).reshape(-1, 3)
@@ -160,8 +154,9 @@ def parse_array(word: str, option: str = "--tx-array") -> tuple[int, int]:
     """Returns the numbers of rows and columns, parsed from "4x2"; anything else is a `UserError`."""
     found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
     rows, columns = (int(number) for number in found.groups()) if found else (0, 0)
-    if not 0 < rows * columns <= MOST_ELEMENTS:
-        raise UserError(f"{option} {word} is not an array; give ROWSxCOLUMNS, such as 4x2, at most {MOST_ELEMENTS} elements")
+    most_elements = 1024  # maximum number of elements of an array
+    if not 0 < rows * columns <= most_elements:
+        raise UserError(f"{option} {word} is not an array; give ROWSxCOLUMNS, such as 4x2, at most {most_elements} elements")
     return rows, columns
 
 
@@ -197,7 +192,7 @@ def _read_columns(path: Path, columns: tuple[str, ...], name: str) -> Float[np.n
     if not found:
         raise UserError(f"{path} has no {name}; give one per row below the line {needed}")
     for values in found:
-        parse_vector(",".join(map(str, values[:3])), str(path), "position", UNIT)
+        parse_vector(",".join(map(str, values[:3])), str(path), "position", "metres")
     return np.array(found)
 
 

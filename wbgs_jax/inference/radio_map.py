@@ -16,10 +16,6 @@ from wbgs_jax.radio.array import codebook, pas_directions
 from wbgs_jax.radio.geometry import direction_to_angles
 from wbgs_jax.radio.network import noise_dbm, sinr_db, throughput_bps
 
-BEST_BEAM = "best-beam"
-AT_ONCE = 512
-"""Links evaluated, and kept in memory, per step of the progress bar."""
-
 
 @dataclass(frozen=True)
 class Plane:
@@ -71,7 +67,7 @@ def evaluate_plane(
     for name in parts[0]:
         values = np.moveaxis(np.concatenate([part[name] for part in parts]), 1, 0)
         maps[name] = values.reshape(len(frequencies_hz), *shape, *values.shape[2:])
-    more = beam_angles() if what == BEST_BEAM else {}
+    more = beam_angles() if what == "best-beam" else {}
     return maps | more | {"xs": plane.xs, "ys": plane.ys, "height": np.array(plane.height), "frequencies_hz": frequencies_hz}
 
 
@@ -114,7 +110,8 @@ def evaluate_network(
 def pieces(plane: Plane, frequencies_hz: Float[np.ndarray, " freq"]) -> int:
     """Returns the number of pieces into which the work is divided."""
     places = len(plane.xs) * len(plane.ys)
-    return -(-places // max(AT_ONCE // len(frequencies_hz), 1))
+    at_once = 512  # links evaluated, and kept in memory, per step of the progress bar
+    return -(-places // max(at_once // len(frequencies_hz), 1))
 
 
 def beam_angles() -> dict[str, np.ndarray]:

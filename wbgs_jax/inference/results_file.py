@@ -20,9 +20,6 @@ from wbgs_jax._util.files import atomic_write, opened_archive, read_json, told, 
 from wbgs_jax.inference.quantities import QUANTITIES
 from wbgs_jax.inference.queries import COLUMNS, Queries, shown_rows
 
-QUESTION = "question.json"
-QUICK = 1
-"""Compression level; higher levels make spectra hardly smaller."""
 SHARED = ("offsets_hz", "delays_s", "tx_elements")
 """Arrays common to all queries; all others have one row per query (or several: tables of paths)."""
 
@@ -124,19 +121,19 @@ def open_parts(target: Path, question: dict[str, Any], resume: bool) -> PartFile
         UserError: there are blocks without `resume`, or the blocks belong to other queries.
     """
     folder = part_folder(target)
-    done = 0
+    asked, done = folder / "question.json", 0
     while _file(folder, done).exists():
         done += 1
     if done and not resume:
         raise UserError(
             f"{folder} contains results of an interrupted command; add --resume to continue it, or remove the folder"
         )
-    if done and (changed := _difference(read_json(folder / QUESTION), question)):
+    if done and (changed := _difference(read_json(asked), question)):
         raise UserError(
             f"{folder} contains results of another command ({changed} changed); remove the folder, or choose another --out"
         )
     if not done:
-        write_json(folder / QUESTION, question)
+        write_json(asked, question)
     return PartFiles(folder, done)
 
 
@@ -153,7 +150,8 @@ def write_archive(
         source: provenance, stored as JSON text in `meta`.
     """
     single = {**answers.shared(), **known, "meta": np.array(json.dumps(source))}
-    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=QUICK) as archive:
+    quick = 1  # compression level; higher levels make spectra hardly smaller
+    with atomic_write(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=quick) as archive:
         for name in answers.names():
             shapes, dtypes = zip(*((piece.shape, piece.dtype) for piece in answers.pieces(name)), strict=True)
             count, dtype = sum(one[0] for one in shapes), np.result_type(*dtypes)
@@ -188,8 +186,6 @@ def _difference(before: Any, now: dict[str, Any]) -> str:
     return ", ".join(key for key in now if before.get(key) != json.loads(json.dumps(now[key])))
 
 
-TWO = ("azimuth", "zenith")
-"""Prefixes of the column names of pairs of angles."""
 DIGITS = ".7g"
 
 
@@ -209,12 +205,13 @@ def query_rows(answers: Answers, queries: Queries) -> Iterator[list[Any]]:
     """Yields a header, then one row per query with x, y, z, ghz and the predicted numbers."""
     names = answers.names()
     columns = []
+    two = ("azimuth", "zenith")  # prefixes of the column names of pairs of angles
     for name in names:
         values = answers.whole(name)
         if values.ndim == 1:
             columns.append((name, values))
         else:
-            columns += [(f"{TWO[i]}_{name}", values[:, i]) for i in range(values.shape[1])]
+            columns += [(f"{two[i]}_{name}", values[:, i]) for i in range(values.shape[1])]
     yield [*COLUMNS, *(name for name, _ in columns)]
     positions, frequencies = queries.flat()
     for i, (position, frequency) in enumerate(zip(positions, frequencies, strict=True)):
@@ -232,11 +229,6 @@ def table_rows(answers: Answers) -> Iterator[list[Any]]:
                 yield [format(value, DIGITS) if isinstance(value, np.floating) else value for value in row]
 
 
-NO_CONFIDENCE = (
-    "no prediction interval (outside of the scene or of the trained band, at the receiver, or where no antenna can be placed)"
-)
-
-
 def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any]) -> list[str]:
     """Returns lines with the expected quality of some of the predictions, if the run has prediction intervals. Their level is
     in `source` (`LoadedField.source`)."""
@@ -246,10 +238,12 @@ def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any])
     positions, frequencies = (part[shown] for part in queries.flat())
     where = [link_words(position, float(frequency)) for position, frequency in zip(positions, frequencies, strict=True)]
     level = f"{100 * source['interval_level' if what == 'spectra' else 'power_interval_level']:.0f} %"
+    places = "outside of the scene or of the trained band, at the receiver, or where no antenna can be placed"
+    no_confidence = f"no prediction interval ({places})"
     if what == "spectra":
         expected = zip(where, answers.rows("expected", shown), strict=True)
         return [
-            f"{link}: {NO_CONFIDENCE}"
+            f"{link}: {no_confidence}"
             if np.isnan(ssim)
             else f"{link}: expected SSIM {ssim:.2f}, {level} between {low:.2f} and {high:.2f}"
             for link, (ssim, low, high) in expected
@@ -257,6 +251,6 @@ def lines(what: str, answers: Answers, queries: Queries, source: dict[str, Any])
     columns = (answers.rows(name, shown) for name in ("power_db", "expected_error_db", "within_db"))
     return [
         f"{link}: {power:.1f} dB relative to the transmitted power; "
-        + (NO_CONFIDENCE if np.isnan(error) else f"expected error {error:.1f} dB, {level} within {within:.1f} dB")
+        + (no_confidence if np.isnan(error) else f"expected error {error:.1f} dB, {level} within {within:.1f} dB")
         for link, power, error, within in zip(where, *columns, strict=True)
     ]

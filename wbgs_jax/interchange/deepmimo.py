@@ -28,8 +28,6 @@ from wbgs_jax.interchange.ray_paths import DIFFRACTION, DIFFUSE, NONE, REFRACTIO
 
 FILE = re.compile(r"(?P<name>[a-z_]+?)_t(?P<set>\d+)_tx(?P<tx>\d+)_r(?P<rx>\d+)\.(npz|mat)")
 PARAMETERS = "params.json"
-VERSION = "4.0.0"
-"""Version of DeepMIMO that defines this format."""
 
 
 class Pair(NamedTuple):
@@ -121,9 +119,10 @@ def write_pair(folder: Path, pair: Pair, arrays: dict[str, np.ndarray], frequenc
         "max_path_depth": max(map(len, digits), default=0),
         **dict(zip(("max_reflections", "max_diffractions", "max_scattering", "max_transmissions"), most.values(), strict=True)),
     }
+    version = "4.0.0"  # version of DeepMIMO that defines this format
     write_json(
         folder / PARAMETERS,
-        {"version": VERSION, "rt_params": tracing, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets},
+        {"version": version, "rt_params": tracing, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets},
     )
 
 
@@ -152,15 +151,7 @@ def _size(folder: Path, pair: Pair) -> int:
 PATHS = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 NEEDED = (*PATHS, "rx_pos", "tx_pos")
 ANGLES = {"theta_t": "aod_el", "phi_t": "aod_az", "theta_r": "aoa_el", "phi_r": "aoa_az"}
-IN_DEGREES, MANY = ("phase", "aod_el", "aoa_el"), 8
-"""Arrays whose values are not confined to three degrees, and how many different values are needed to test this."""
 DIGITS = {SPECULAR: 1, DIFFRACTION: 2, DIFFUSE: 3, REFRACTION: 4}
-MOST_INTERACTIONS = 10
-WITHOUT_PROPAGATION = ("sionna",)
-"""Ray tracers whose phases DeepMIMO's converters copy without the propagation."""
-ALIKE, DIFFERENT, FEWEST = 0.99, 0.6, 5
-"""Length of the mean phasor of lines of sight above which their phases agree and below which they differ; and how many are
-needed."""
 
 
 def read_deepmimo(
@@ -221,7 +212,8 @@ def load_deepmimo(
     if any(not np.array_equal(one["rx_pos"], every[0]["rx_pos"], equal_nan=True) for one in every[1:]):
         choices = ", ".join(str(pair.tx) for pair in pairs)
         raise UserError(f"{path}: its {len(every)} transmitters have different users; choose one, --tx-index {choices}")
-    lacks = any(name in str(tracing.get("raytracer_name", "")).lower() for name in WITHOUT_PROPAGATION)
+    without_propagation = ("sionna",)  # ray tracers whose phases DeepMIMO's converters copy without the propagation
+    lacks = any(name in str(tracing.get("raytracer_name", "")).lower() for name in without_propagation)
     return joined([from_deepmimo(one, frequency, not lacks) for one in every])
 
 
@@ -275,13 +267,15 @@ def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def _check_units(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Raises a `UserError` for powers that are not decibels, and for phases or elevations that are probably radians."""
-    finite = {name: np.asarray(arrays[name], np.float64) for name in ("power", *IN_DEGREES)}
+    # Arrays whose values are not confined to three degrees, and how many different values are needed to test this.
+    in_degrees, many = ("phase", "aod_el", "aoa_el"), 8
+    finite = {name: np.asarray(arrays[name], np.float64) for name in ("power", *in_degrees)}
     finite = {name: values[np.isfinite(values)] for name, values in finite.items()}
     if len(finite["power"]) and finite["power"].min() >= 0:
         low, high = finite["power"].min(), finite["power"].max()
         raise UserError(f"power in {path} is {low:.3g} to {high:.3g}; give decibels, 10 log10 of the power")
-    for name in IN_DEGREES:
-        if len(np.unique(finite[name])) >= MANY and np.abs(finite[name]).max() <= np.pi + 1e-3:
+    for name in in_degrees:
+        if len(np.unique(finite[name])) >= many and np.abs(finite[name]).max() <= np.pi + 1e-3:
             raise UserError(
                 f"{name} in {path} is {finite[name].min():.3g} to {finite[name].max():.3g}; give degrees, not radians"
             )
@@ -356,12 +350,15 @@ def _includes_propagation(
     phase: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "n k"], direct: Bool[np.ndarray, "n k"], otherwise: bool
 ) -> bool:
     """Returns whether phases include the propagation; without it, those of lines of sight are all equal."""
-    if direct.sum() < FEWEST:
+    # Length of the mean phasor of lines of sight above which their phases agree and below which they differ; and how many are
+    # needed.
+    alike, different, fewest = 0.99, 0.6, 5
+    if direct.sum() < fewest:
         return otherwise
     without, with_it = (abs(np.exp(1j * own[direct]).mean()) for own in (phase, phase + turns))
-    if without > ALIKE and with_it < DIFFERENT:
+    if without > alike and with_it < different:
         return False
-    return True if with_it > ALIKE and without < DIFFERENT else otherwise
+    return True if with_it > alike and without < different else otherwise
 
 
 def as_deepmimo(paths: RayPaths, transmitter: int = 0) -> dict[str, np.ndarray]:
@@ -410,7 +407,7 @@ def _digits(codes: np.ndarray) -> np.ndarray:
         kinds[digit] = kind
     text = np.round(codes).astype(np.int64)
     depth = max((len(str(number)) for number in np.unique(text)), default=0)
-    met = np.zeros((min(depth, MOST_INTERACTIONS), *codes.shape), np.int32)
+    met = np.zeros((min(depth, 10), *codes.shape), np.int32)
     length = np.where(text > 0, np.floor(np.log10(np.maximum(text, 1))).astype(int) + 1, 0)
     for i in range(len(met)):
         digit = text // 10 ** np.maximum(length - 1 - i, 0) % 10

@@ -17,18 +17,12 @@ from wbgs_jax.types import Gaussians
 
 SH_CONSTANT = 0.28209479177387814
 """Y_0^0; a colour is 0.5 + SH_CONSTANT * f_dc."""
-RESTS = 45
-"""Coefficients beyond the constant that viewers expect: three degrees for three colours."""
-SHORTEST = 1e-12
-"""Lower bound on the length of a quaternion."""
-MOST_CERTAIN = 1e-6
-"""Minimum distance of opacities from 0 and 1."""
 PLACE, COLOUR, SCALE, TURN = (
     ("x", "y", "z"),
     ("f_dc_0", "f_dc_1", "f_dc_2"),
     *(tuple(f"{name}_{i}" for i in range(count)) for name, count in (("scale", 3), ("rot", 4))),
 )
-NAMES = (*PLACE, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(RESTS)), "opacity", *SCALE, *TURN)
+NAMES = (*PLACE, "nx", "ny", "nz", *COLOUR, *(f"f_rest_{i}" for i in range(45)), "opacity", *SCALE, *TURN)
 NEEDED = (*PLACE, *COLOUR, "opacity", *SCALE, *TURN)
 
 
@@ -54,13 +48,15 @@ def write_gaussians(
     """
     alive = np.asarray(gaussians.alive)
     logits = np.asarray(gaussians.opacity_logits, np.float32)
+    most_certain = 1e-6  # minimum distance of opacities from 0 and 1
     if opacity is not None:
-        share = np.clip(opacity, MOST_CERTAIN, 1 - MOST_CERTAIN)
+        share = np.clip(opacity, most_certain, 1 - most_certain)
         logits = np.log(share / (1 - share))
     rgb = np.full((len(alive), 3), 0.5) if colours is None else np.clip(colours, 0, 1)
     parts = {PLACE: gaussians.means, COLOUR: (rgb - 0.5) / SH_CONSTANT, ("opacity",): logits[:, None]}
     length = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)  # some viewers do not normalise quaternions
-    parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats / np.maximum(length, SHORTEST)}
+    shortest = 1e-12  # lower bound on the length of a quaternion
+    parts |= {SCALE: gaussians.log_scales, TURN: gaussians.quats / np.maximum(length, shortest)}
     rows = np.zeros(int(alive.sum()), [(name, "<f4") for name in NAMES])
     for names, values in parts.items():
         for name, column in zip(names, np.asarray(values, np.float32)[alive].T, strict=True):

@@ -19,9 +19,6 @@ STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"
 """NumPy types of data elements."""
 CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 """NumPy types of arrays; characters, cells and structures are skipped."""
-COMPLEX = 0x08
-MOST_AXES = 16
-ADVICE = "give a .mat file of version 5 (MATLAB: save -v7), or an .npz file"
 
 
 class Element(NamedTuple):
@@ -37,8 +34,9 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is missing, damaged, or of another version.
     """
-    with told(str(path), ADVICE):
-        check_file(path, str(path), ADVICE)
+    advice = "give a .mat file of version 5 (MATLAB: save -v7), or an .npz file"
+    with told(str(path), advice):
+        check_file(path, str(path), advice)
         whole = memoryview(path.read_bytes())
         order = {b"IM": "<", b"MI": ">"}.get(bytes(whole[126:HEADER]))
         if order is None:
@@ -85,9 +83,11 @@ def _array(content: memoryview, order: str) -> tuple[str, np.ndarray] | None:
     if dtype is None:
         return None
     shape = np.frombuffer(sizes.content, f"{order}i4").tolist()
-    if not 2 <= len(shape) <= MOST_AXES or min(shape) < 0:
-        raise ValueError(f"an array in it has the shape {shape[:MOST_AXES]}")
-    values = [_numbers(part, order, dtype, shape) for part in parts[: 1 + bool(kind >> 8 & COMPLEX)]]
+    most_axes = 16
+    if not 2 <= len(shape) <= most_axes or min(shape) < 0:
+        raise ValueError(f"an array in it has the shape {shape[:most_axes]}")
+    is_complex = bool(kind >> 8 & 0x08)  # then a second part has the imaginary numbers
+    values = [_numbers(part, order, dtype, shape) for part in parts[: 1 + is_complex]]
     label = bytes(name.content).decode("ascii", errors="replace")
     return label, values[0] if len(values) == 1 else values[0] + 1j * values[1]
 

@@ -319,16 +319,8 @@ def _vertices(interaction: Int[np.ndarray, "t k d"], points: Any) -> Float[np.nd
     return np.where(has_place[..., None], placed, found)
 
 
-LONGEST_M = 1e6
-"""Maximum length of a path."""
 SLACK, SLACK_M = 1e-3, 0.1
 """Relative and absolute amount by which a path may be shorter than the straight line, for rounding and off-centre elements."""
-SAME, SAME_M = 1e-4, 0.01
-"""Relative and absolute tolerance within which a path counts as the line of sight."""
-ASIDE_DEGREES, NEAREST_M = 10.0, 0.5
-"""Maximum deviation of the angles of lines of sight from those of their ends, and minimum distance between these."""
-LARGEST_GAIN = 3.0
-"""Maximum amplitude of a path, for antennas a hand's breadth apart."""
 
 
 def check_paths(paths: RayPaths, name: str) -> None:
@@ -341,7 +333,8 @@ def check_paths(paths: RayPaths, name: str) -> None:
     valid = paths.valid
     if not valid.any():
         raise UserError(f"{name} has no valid path")
-    if not np.isfinite(paths.a[valid]).all() or (gain := np.abs(paths.a[valid]).max()) > LARGEST_GAIN:
+    largest_gain = 3.0  # maximum amplitude of a path, for antennas a hand's breadth apart
+    if not np.isfinite(paths.a[valid]).all() or (gain := np.abs(paths.a[valid]).max()) > largest_gain:
         found = "not finite" if not np.isfinite(paths.a[valid]).all() else f"{gain:.3g}"
         raise UserError(f"{name}: a path amplifies (|a| is {found}); give amplitudes, not decibels")
     for angle in ("theta_t", "phi_t", "theta_r", "phi_r"):
@@ -349,7 +342,8 @@ def check_paths(paths: RayPaths, name: str) -> None:
         if not largest <= 2 * np.pi + 1e-3:
             raise UserError(f"{name}: {angle} is {largest:.3g}; give radians, not degrees")
     length = SPEED_OF_LIGHT * paths.tau
-    if (longest := length[valid].max()) > LONGEST_M:
+    longest_m = 1e6  # maximum length of a path
+    if (longest := length[valid].max()) > longest_m:
         raise UserError(f"{name}: a path is {longest:.3g} m long (tau {paths.tau[valid].max():.3g}); give delays in seconds")
     straight = np.linalg.norm(paths.targets[:, None] - paths.sources[None], axis=-1)
     short = valid & (length < straight[..., None] * (1 - SLACK) - SLACK_M)
@@ -389,14 +383,17 @@ def _check_line_of_sight(
     paths: RayPaths, name: str, length: Float[np.ndarray, "r t k"], straight: Float[np.ndarray, "r t 1"]
 ) -> None:
     """Raises a `UserError` if lines of sight do not arrive from the other end."""
-    sight = paths.valid & (np.abs(length - straight) <= straight * SAME + SAME_M) & (straight > NEAREST_M)
+    same, same_m = 1e-4, 0.01  # relative and absolute tolerance within which a path counts as the line of sight
+    # Maximum deviation of the angles of lines of sight from those of their ends, and minimum distance between these.
+    aside_degrees, nearest_m = 10.0, 0.5
+    sight = paths.valid & (np.abs(length - straight) <= straight * same + same_m) & (straight > nearest_m)
     if not sight.any():
         return
-    towards = (paths.sources - paths.targets[:, None])[:, :, None] / np.maximum(straight, NEAREST_M)[..., None]
+    towards = (paths.sources - paths.targets[:, None])[:, :, None] / np.maximum(straight, nearest_m)[..., None]
     for end, sign in (("r", 1), ("t", -1)):
         found = directions_of(getattr(paths, f"theta_{end}"), getattr(paths, f"phi_{end}"))
         cosine = np.sum(found * sign * towards, -1)[sight]
-        if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > ASIDE_DEGREES:
+        if (aside := np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) > aside_degrees:
             raise UserError(
                 f"{name}: theta_{end}, phi_{end} of lines of sight deviate {aside:.0f} degrees from the other end; give angles "
                 "in the frame of the positions, theta from +z, phi from +x, outwards at both ends"

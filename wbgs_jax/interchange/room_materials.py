@@ -69,7 +69,6 @@ class Law(NamedTuple):
     d: float
 
 
-MAX_EXPONENT = 10.0
 _NUMBER = r"[-+\d.e]+"
 _OWN = re.compile(rf"[\w-]+\(({_NUMBER}), ({_NUMBER}), ({_NUMBER}), ({_NUMBER})\)")
 
@@ -82,7 +81,7 @@ def own_material(name: str, law: Law) -> str:
     """
     if name in ITU or not re.fullmatch(r"[\w-]+", name):
         raise UserError(f"material {name!r} needs another name: letters, digits, _ and -, and not one of ITU-R P.2040")
-    gentle = math.isfinite(law.a) and math.isfinite(law.c) and max(abs(law.b), abs(law.d)) <= MAX_EXPONENT
+    gentle = math.isfinite(law.a) and math.isfinite(law.c) and max(abs(law.b), abs(law.d)) <= 10.0
     if not gentle or law.c < 0 or min(law.a * ghz**law.b for ghz in (1.0, 100.0)) < 1:
         raise UserError(f"material {name!r} needs a relative permittivity of 1 or more and a conductivity of 0 S/m or more")
     return f"{name}({', '.join(f'{value:.9g}' for value in law)})"
@@ -132,8 +131,6 @@ def check_material_frequencies(materials: Iterable[str], frequencies_hz: Iterabl
             )
 
 
-MAX_THICKNESS = 2.0
-"""Metres: a larger thickness was probably given in millimetres."""
 HELP = "see docs/own_scene.md"
 
 
@@ -236,6 +233,7 @@ def _slab(value: Any, own: dict[str, Slab], where: str) -> Slab:
 
 
 def _thickness(value: Any, where: str) -> float:
-    if not isinstance(value, int | float) or not 0 < value <= MAX_THICKNESS:
-        raise UserError(f"{where} has a thickness of {value}; give metres, more than 0 and at most {MAX_THICKNESS:g}")
+    max_thickness = 2.0  # metres: a larger thickness was probably given in millimetres
+    if not isinstance(value, int | float) or not 0 < value <= max_thickness:
+        raise UserError(f"{where} has a thickness of {value}; give metres, more than 0 and at most {max_thickness:g}")
     return float(value)

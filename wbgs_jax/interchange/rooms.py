@@ -8,25 +8,14 @@ import numpy as np
 import trimesh
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.room_file import Room, load_room
+from wbgs_jax.data.scene_file import Room, load_room
 from wbgs_jax.interchange.room_materials import Slab, slabs_of
 from wbgs_jax.mesh.importers import FileObject, read_objects
 from wbgs_jax.mesh.walls import walls_as_sheets
 
-EXTENT = (0.5, 200.0)
-"""Metres: range of the largest side of a scene; outside it the unit is probably not the metre, unless the scale is given,
-..."""
-GIVEN_EXTENT = (0.01, 20_000.0)
-"""... in which case this range applies. A scene.xml of Sionna RT is always in metres."""
-USUAL = 10.0
-"""Metres: typical size of a room, used to guess a unit."""
 MAX_TRIANGLES = 2_000_000
-MANY_TRIANGLES = 20_000
-"""Number of triangles from which finding paths takes long; furniture in such detail does not change the paths."""
 SHOWN = 40
 """Maximum number of objects that are listed."""
-UNKNOWN = 0.0
-"""Thickness in a room file that marks an unmeasured one."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +49,13 @@ def read_room(
         UserError: the file or the materials cannot be read, or the size is not that of a room.
     """
     objects, simulated = read_objects(file, up, 1.0 if scale is None else scale), file.suffix.lower() == ".xml"
-    _check_size(file, objects, GIVEN_EXTENT if simulated or scale is not None else EXTENT)
+    # Range of the largest side, metres: outside it the unit is probably not the metre. It is wider if the scale is given; a
+    # scene.xml of Sionna RT is always in metres.
+    _check_size(file, objects, (0.01, 20_000.0) if simulated or scale is not None else (0.5, 200.0))
     if named or materials is not None or simulated:
         slabs = slabs_of(file, objects, materials)
     else:
-        slabs = [Slab(one.name, UNKNOWN) for one in objects]
+        slabs = [Slab(one.name, 0.0) for one in objects]  # of unknown thickness
     found = [RoomObject(one.name, one.mesh, slab) for one, slab in zip(objects, slabs, strict=True)]
     if simulated:
         return found
@@ -104,7 +95,9 @@ def describe_room(objects: Sequence[RoomObject], sorts: Sequence[str]) -> str:
     if len(rows) < len(objects):
         lines.append(f"... and {len(objects) - len(rows)} smaller objects")
     total = sum(len(one.mesh.faces) for one in objects)
-    if total > MANY_TRIANGLES:
+    # Number of triangles from which finding paths takes long; furniture in such detail does not change the paths.
+    many_triangles = 20_000
+    if total > many_triangles:
         lines.append(
             f"warning: {total} triangles: simplify furniture and scans to some thousands before training (Blender: Decimate; "
             "MeshLab: Quadric Edge Collapse)"
@@ -127,8 +120,9 @@ def _check_size(file: Path, objects: Sequence[FileObject], extent: tuple[float, 
     corners = np.concatenate([o.mesh.bounds for o in objects])
     size = np.ptp(corners, axis=0)
     largest = float(size.max())
+    usual = 10.0  # metres: typical size of a room, used to guess a unit
     if not extent[0] <= largest <= extent[1]:
-        factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / USUAL)))
+        factor = min((0.001, 0.01, 10.0, 100.0, 1000.0), key=lambda f: abs(np.log(largest * f / usual)))
         sides = " x ".join(f"{side:.4g}" for side in size)
         raise UserError(
             f"{file} measures {sides} m; give its unit in metres, perhaps --scale {factor:g}, or --scale 1 if this is right"

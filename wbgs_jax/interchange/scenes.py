@@ -6,12 +6,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.room_file import Room
-from wbgs_jax.data.scene_file import TEST, TRAIN, SceneFile
+from wbgs_jax.data.scene_file import TEST, TRAIN, Room, SceneFile
 from wbgs_jax.data.splits import group_transmitters, tx_disjoint_split
 from wbgs_jax.interchange.ray_paths import RayPaths, carrier, directions_of
 
-TEST_SHARE = 0.2
 FEWEST = 5
 """Minimum number of transmitters."""
 
@@ -115,7 +113,7 @@ def scene_of_snapshots(
     if (places := len(np.unique(transmitter))) < FEWEST:
         raise UserError(f"{name} has {places} transmitters, but training needs {FEWEST}")
     split = np.full(count, TRAIN, np.int8)
-    split[tx_disjoint_split(transmitter, TEST_SHARE, seed)[1]] = TEST
+    split[tx_disjoint_split(transmitter, test_fraction=0.2, seed=seed)[1]] = TEST
     surfaces = room or _one_surface(vertices, faces)
     return SceneFile(
         name=name,

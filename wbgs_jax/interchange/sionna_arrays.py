@@ -16,8 +16,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.spatial.transform import Rotation
 
 from wbgs_jax._util.errors import UserError
-from wbgs_jax.data.room_file import Room
-from wbgs_jax.data.scene_file import SceneFile
+from wbgs_jax.data.scene_file import Room, SceneFile
 from wbgs_jax.interchange.ray_paths import (
     ARRAYS,
     OF_PATHS,
@@ -37,15 +36,6 @@ from wbgs_jax.types import Receiver
 
 DEFAULT = 4, 4
 """Rows and columns of the default array."""
-FITS = 0.995
-"""Minimum correlation of a path's coefficients with the steering vector of an array."""
-WRAPPED = 0.95
-"""Direction cosine between neighbours (phase in half turns) beyond which the phase may have wrapped."""
-OFF_WAVELENGTHS = 0.02
-"""Maximum distance of antenna positions from those of a planar array, wavelengths."""
-SPAN = 1e-3
-"""Smallest singular value of the directions of paths; below it they lie in a plane and determine at most two axes of an
-array."""
 
 Shape = tuple[int, int]
 
@@ -229,13 +219,14 @@ def _by_places(
     own = places.reshape(receivers, -1, 3)[:, :antennas]
     centres = own.mean(1)
     offsets = (own - centres[:, None]) / wavelength
+    off_wavelengths = 0.02  # maximum distance of antenna positions from those of a planar array, wavelengths
     if shape is not None:
         regular = planar_array(*shape)
         turns = [Rotation.align_vectors(one, regular)[0] for one in offsets]
         worst = max(np.abs(turn.apply(regular) - one).max() for turn, one in zip(turns, offsets, strict=True))
-        if worst < OFF_WAVELENGTHS:
+        if worst < off_wavelengths:
             return [_Device(place, _quaternion(turn), regular) for place, turn in zip(centres, turns, strict=True)]
-    if np.abs(offsets - offsets[0]).max() > OFF_WAVELENGTHS:
+    if np.abs(offsets - offsets[0]).max() > off_wavelengths:
         raise UserError(f"the receivers of {name} have arrays of different shapes or orientations; give --array ROWSxCOLUMNS")
     level = np.array([1.0, 0, 0, 0])
     return [_Device(place, level, offsets[0]) for place in centres]
@@ -256,12 +247,14 @@ def _orientation(
     turn = _turn(measured, towards, np.abs(own[0, 0]))
     candidates = [Rotation.identity(), *([] if turn is None else [turn])]
     fits = [_fit(own.reshape(rows * columns, -1), towards, one.apply(planar_array(rows, columns))) for one in candidates]
-    if max(fits) < FITS:
+    least_fit = 0.995  # minimum correlation of a path's coefficients with the steering vector of an array
+    if max(fits) < least_fit:
         raise UserError(
             f"the phases of {name} do not fit a {rows}x{columns} array of half a wavelength (correlation {max(fits):.3f}); "
             "give its shape, --array ROWSxCOLUMNS, or trace with synthetic_array=False"
         )
-    return _quaternion(candidates[0] if fits[0] >= FITS and fits[0] >= max(fits) - 1e-4 else candidates[int(np.argmax(fits))])
+    unrotated = fits[0] >= least_fit and fits[0] >= max(fits) - 1e-4
+    return _quaternion(candidates[0 if unrotated else int(np.argmax(fits))])
 
 
 def _turn(
@@ -269,10 +262,14 @@ def _turn(
 ) -> Rotation | None:
     """Returns the rotation whose axes have the measured direction cosines; None if the directions do not determine it."""
     axes, found = [], []
+    wrapped = 0.95  # direction cosine between neighbours (phase in half turns) beyond which the phase may have wrapped
+    # Smallest singular value of the directions of paths; below it they lie in a plane and determine at most two axes of an
+    # array.
+    span = 1e-3
     for axis, cosine in measured:
-        reliable = np.abs(cosine) < WRAPPED
+        reliable = np.abs(cosine) < wrapped
         scale = np.sqrt(weight[reliable] / max(weight[reliable].max(initial=0), 1e-300))[:, None]
-        if reliable.sum() < 3 or np.linalg.svd(scale * towards[reliable], compute_uv=False)[-1] < SPAN:
+        if reliable.sum() < 3 or np.linalg.svd(scale * towards[reliable], compute_uv=False)[-1] < span:
             return None
         solution = np.linalg.lstsq(scale * towards[reliable], scale[:, 0] * cosine[reliable], rcond=None)[0]
         axes.append(np.eye(3)[axis])

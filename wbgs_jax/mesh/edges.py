@@ -21,15 +21,6 @@ from scipy.spatial import cKDTree
 from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax.mesh.facets import CORNERS, WELD, Facets, half_planes_of
 
-SHARPEST = 0.05
-"""Radians: edges with a smaller angle between their normals are part of a smooth surface."""
-GAP = 0.006
-"""Metres: surfaces nearer than this are joined."""
-FACETS_AT_ONCE = 256
-"""Facets whose neighbourhood is searched for edges together."""
-ODD = 0.137
-"""Offset added before rounding, so that round coordinates do not lie on a rounding boundary."""
-
 
 @pytree
 class Edges:
@@ -108,7 +99,8 @@ def _line(point: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tuple
     first = along[np.argmax(np.abs(along) > 1e-3)]
     along = along if first > 0 else -along
     foot = point - (point @ along) * along
-    return tuple(int(i) for i in np.round(np.concatenate([along, foot]) * 1e3 + ODD))
+    odd = 0.137  # offset added before rounding, so that round coordinates do not lie on a rounding boundary
+    return tuple(int(i) for i in np.round(np.concatenate([along, foot]) * 1e3 + odd))
 
 
 def _wedge(
@@ -120,7 +112,8 @@ def _wedge(
     j, c, d = second
     turn = np.arccos(np.clip(normal[i] @ normal[j], -1, 1))
     outward = (centre[j] - centre[i]) @ normal[i] < 0 and (centre[i] - centre[j]) @ normal[j] < 0
-    if turn <= SHARPEST or not outward:
+    sharpest = 0.05  # radians: edges with a smaller angle between their normals are part of a smooth surface
+    if turn <= sharpest or not outward:
         return []
     length = np.linalg.norm(b - a)
     along = (b - a) / length
@@ -142,29 +135,28 @@ def _covered(edges: Edges, facets: Facets) -> Bool[np.ndarray, " e"]:
     middle = edges.start + edges.direction * edges.length[:, None] / 2
     corners, half_planes = np.asarray(facets.corners), half_planes_of(facets)
     centre, covered = corners.mean(1), np.zeros(len(middle), bool)
-    radius = np.linalg.norm(corners - centre[:, None], axis=-1).max(1) + 2 * GAP
+    gap = 0.006  # metres: surfaces nearer than this are joined
+    radius = np.linalg.norm(corners - centre[:, None], axis=-1).max(1) + 2 * gap
     tree = cKDTree(middle)
-    for first in range(0, len(centre) if len(middle) else 0, FACETS_AT_ONCE):
-        some = np.arange(first, min(first + FACETS_AT_ONCE, len(centre)))
+    facets_at_once = 256  # facets whose neighbourhood is searched for edges together
+    for first in range(0, len(centre) if len(middle) else 0, facets_at_once):
+        some = np.arange(first, min(first + facets_at_once, len(centre)))
         near = tree.query_ball_point(centre[some], radius[some], return_sorted=False)
         facet, edge = np.repeat(some, [len(found) for found in near]), np.concatenate([*near, []]).astype(int)
         normal, point, way = np.asarray(facets.normal)[facet], middle[edge], out[edge]
         height, along = np.sum(normal * point, -1) - np.asarray(facets.offset)[facet], np.sum(normal * way, -1)
         distance = -height / np.where(along == 0, 1, along)
-        ahead = np.flatnonzero((along != 0) & (distance > WELD) & (distance < GAP))
+        ahead = np.flatnonzero((along != 0) & (distance > WELD) & (distance < gap))
         facet, edge, there = facet[ahead], edge[ahead], (point + distance[:, None] * way)[ahead]
         inside = (np.sum(half_planes.inward[facet] * there[:, None], -1) >= half_planes.offset[facet]).all(-1)
         covered[edge[inside]] = True
     return covered
 
 
-PARTS = 8
-"""Sizes between consecutive powers of two: at most an eighth of the padded arrays is padding."""
-
-
 def padded_size(count: int) -> int:
     """Returns the next larger size of the padding scheme; 0 for 0."""
-    step = max(2 ** (count.bit_length() - 1) // PARTS, 1)
+    parts = 8  # sizes between consecutive powers of two: at most an eighth of the padded arrays is padding
+    step = max(2 ** (count.bit_length() - 1) // parts, 1)
     return -(-count // step) * step
 
 

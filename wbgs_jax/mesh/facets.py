@@ -23,8 +23,6 @@ from wbgs_jax.types import Mesh
 CORNERS = 4
 WELD = 1e-5
 """Metres: corners nearer than this are merged."""
-SMALLEST_AREA = 1e-10
-"""Square metres: smaller triangles are ignored."""
 FLAT = 1e-4
 """Sine of the largest angle between normals of one plane, and between sides of one straight line."""
 Polygon = list[int]
@@ -73,7 +71,8 @@ def facets_from_mesh(mesh: Mesh) -> Facets:
     body = _bodies(triangles, piece, pieces[:, 1])
     rigid_body = _rigid_bodies(triangles, body)
     normal, area = _normals(points, triangles)
-    keep = area > SMALLEST_AREA
+    smallest_area = 1e-10  # square metres: smaller triangles are ignored
+    keep = area > smallest_area
     if not keep.any():
         raise UserError("the mesh has no triangle with an area; omit the mesh, or provide one with surfaces")
     triangles, normal, body, material, rigid_body = (a[keep] for a in (triangles, normal, body, material, rigid_body))

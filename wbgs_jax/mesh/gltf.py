@@ -20,7 +20,6 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax.mesh.bodies import Body, joined
 from wbgs_jax.mesh.ply import Ragged, strip_triangles
 
-MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -34,10 +33,6 @@ SUPPORTED = {
 """Extensions that may be required: supported ones that concern geometry, and ones that concern appearance and do not matter."""
 APPEARANCE = ("KHR_materials_", "KHR_texture_", "MSFT_texture_", "EXT_texture_", "EXT_lights_")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-MOST = 20_000_000
-"""Maximum number of rows of an accessor."""
-DEEPEST = 200
-"""Maximum depth of the node hierarchy."""
 
 
 class _File:
@@ -47,7 +42,7 @@ class _File:
         content = file.read_bytes()
         self.file, self.binary = file, b""
         text = content
-        if content[:4] == MAGIC:
+        if content[:4] == b"glTF":
             text, self.binary = _chunks(content)
         self.document = json.loads(text.decode("utf-8-sig"))
         self.buffers: dict[int, bytes] = {}
@@ -87,7 +82,7 @@ class _File:
         """
         entry = self.of("accessors", number)
         count, width = int(entry["count"]), WIDTHS[entry["type"]]
-        if count > MOST:
+        if count > 20_000_000:  # more than any room
             raise ValueError(f"it declares {count} vertices")
         kind = np.dtype(COMPONENTS[entry["componentType"]])
         if "bufferView" in entry:
@@ -159,7 +154,7 @@ def _roots(document: dict[str, Any]) -> list[int]:
 def _node(opened: _File, number: int, above: Float[np.ndarray, "4 4"], bodies: list[Body], depth: int) -> None:
     """Adds the bodies of a node and of its descendants."""
     node = opened.of("nodes", number)
-    if depth > DEEPEST:
+    if depth > 200:
         raise ValueError("its nodes form a cycle")
     placed = above @ _matrix(node)
     if "mesh" in node:
@@ -257,9 +252,9 @@ def _chunks(content: bytes) -> tuple[bytes, bytes]:
         chunk = content[place + 8 : place + 8 + size]
         if len(chunk) < size:
             raise ValueError("it is truncated")
-        if kind == JSON_CHUNK and not text:
+        if kind == int.from_bytes(b"JSON", "little") and not text:
             text = chunk
-        elif kind == BINARY_CHUNK and not binary:
+        elif kind == int.from_bytes(b"BIN\0", "little") and not binary:
             binary = chunk
         place += 8 + size + -size % 4
     return text, binary

@@ -22,8 +22,6 @@ from wbgs_jax.types import LARGEST_COORDINATE_M
 
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 """Transform of a y-up file: (x, y, z) becomes (x, -z, y), as in Blender."""
-MERGE_DIGITS = 5
-"""Vertices that agree to this many decimal places, in metres, are merged."""
 OTHERS = {
     ".ifc": "a building model: export it as glTF, OBJ or scene.xml",
     ".dxf": "a drawing: export meshes, as OBJ",
@@ -76,7 +74,7 @@ def read_objects(file: Path, up: str | None = None, scale: float = 1.0) -> list[
         raise UserError(f"--up is {up!r}; give y or z, the axis that points up in {file}")
     if not 0 < scale < float("inf"):
         raise UserError(f"--scale is {scale}; give the metres per unit of {file}, such as 0.001 for millimetres")
-    turn = Y_UP if (up or _UP.get(suffix, "z")) == "y" else np.eye(4)
+    turn = Y_UP if (up or ("y" if suffix in (".glb", ".gltf") else "z")) == "y" else np.eye(4)
     turn = trimesh.transformations.scale_matrix(scale) @ turn
     objects = [FileObject(body.name, _clean(body, turn, file), body.material) for body in _read(file, READERS[suffix])]
     objects = sorted((o for o in objects if len(o.mesh.faces)), key=lambda o: o.name)
@@ -114,7 +112,8 @@ def _clean(body: Body, turn: Float[np.ndarray, "4 4"], file: Path) -> trimesh.Tr
     if not np.isfinite(vertices).all():
         raise UserError(f"object {body.name!r} of {file} has vertex coordinates that are not finite; export it again")
     mesh = trimesh.Trimesh(vertices, faces.reshape(-1, 3), process=False)
-    mesh.merge_vertices(digits_vertex=MERGE_DIGITS)
+    merge_digits = 5  # vertices that agree to this many decimal places, in metres, are merged
+    mesh.merge_vertices(digits_vertex=merge_digits)
     mesh.update_faces(mesh.unique_faces() & mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
     return mesh
@@ -130,4 +129,3 @@ def _read_ply(file: Path) -> list[Body]:
 READERS: dict[str, Callable[[Path], list[Body]]] = {
     ".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj, ".ply": _read_ply, ".xml": read_mitsuba
 }  # fmt: skip
-_UP = {".glb": "y", ".gltf": "y"}

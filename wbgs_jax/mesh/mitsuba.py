@@ -14,14 +14,8 @@ from wbgs_jax.mesh.bodies import Body, RadioMaterial, joined
 from wbgs_jax.mesh.ply import read_mesh
 from wbgs_jax.mesh.wavefront import read_obj
 
-THICKNESS = 0.1
-"""Metres: Sionna RT's default."""
 SECTIONS = 64
 """Number of segments that approximate a circle."""
-POINTS = ("point", "vector")
-"""Tags of positions: common usage, and Mitsuba's own."""
-MOVED = ("to_world", "toWorld")
-"""Names of a shape's transform, since version 2 and before."""
 
 
 def read_mitsuba(file: Path) -> list[Body]:
@@ -63,7 +57,8 @@ def _body(shape: ET.Element, number: int, materials: dict[str | None, RadioMater
         vertices, faces = np.asarray(made.vertices, np.float64), np.asarray(made.faces)
     else:
         raise UserError(f"shape {name!r} of {file} has the unsupported type {kind!r}; export it as ply or obj")
-    moved = next((one for one in shape.findall("transform") if one.get("name") in MOVED), None)
+    transforms = ("to_world", "toWorld")  # names of a shape's transform, since version 2 and before
+    moved = next((one for one in shape.findall("transform") if one.get("name") in transforms), None)
     matrix = _transform(moved, name, file)
     vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     named = [materials.get(reference.get("id")) for reference in shape.findall("ref")]
@@ -136,7 +131,8 @@ def _value(shape: ET.Element, name: str, missing: float) -> float:
 
 
 def _point(shape: ET.Element, name: str, missing: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
-    found = next((one for one in shape if one.tag in POINTS and one.get("name") == name), None)
+    points = ("point", "vector")  # tags of positions: common usage, and Mitsuba's own
+    found = next((one for one in shape if one.tag in points and one.get("name") == name), None)
     return np.array(missing, np.float64) if found is None else np.array(_vector(found, 0.0))
 
 
@@ -177,7 +173,8 @@ def _material(bsdf: ET.Element) -> RadioMaterial | None:
         return missing if found is None else type(missing)(found.get("value", missing))
 
     name = (bsdf.get("id") or "").removeprefix("mat-")
-    thickness = value("float", "thickness", THICKNESS)
+    usual = 0.1  # metres: Sionna RT's default
+    thickness = value("float", "thickness", usual)
     if bsdf.get("type") == "itu-radio-material" or name.startswith(("itu_", "itu-")):
         return RadioMaterial(value("string", "type", name[4:]), thickness)
     if bsdf.get("type") == "radio-material":

@@ -22,10 +22,6 @@ TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float32": "f4", "float64": "f8"},
 }
-FORMATS = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}
-"""Byte orders; empty for text."""
-LONGEST_HEADER = 1 << 16
-"""Bytes."""
 
 
 class Ragged(NamedTuple):
@@ -131,11 +127,13 @@ def write_elements(path: Path | str, elements: Mapping[str, np.ndarray]) -> None
 
 def _header(content: bytes) -> tuple[str, list[_Element], bytes]:
     """Returns the byte order (empty for text), the elements, and the rest of the content."""
-    end = content.find(b"end_header", 0, LONGEST_HEADER)
+    longest_header = 1 << 16  # bytes
+    end = content.find(b"end_header", 0, longest_header)
     lines = [line.split() for line in content[: max(end, 0)].splitlines()]
-    if len(lines) < 2 or lines[0] != [b"ply"] or len(lines[1]) != 3 or lines[1][1] not in FORMATS:
+    formats = {b"ascii": "", b"binary_little_endian": "<", b"binary_big_endian": ">"}  # byte orders; empty for text
+    if len(lines) < 2 or lines[0] != [b"ply"] or len(lines[1]) != 3 or lines[1][1] not in formats:
         raise _Damaged("it has no valid header")
-    order, elements = FORMATS[lines[1][1]], list[_Element]()
+    order, elements = formats[lines[1][1]], list[_Element]()
     for words in lines[2:]:
         match words:
             case [] | [b"comment" | b"obj_info", *_]:
@@ -243,8 +241,6 @@ def _varying_rows(element: _Element, body: _Body, start: int, rows: int) -> Walk
 
 CORNERS = ("vertex_indices", "vertex_index")
 """Names that exporters use for the corners of faces."""
-STRIPS = "tristrips"
-"""Element whose lists are triangle strips: each corner makes a triangle with the two before it; -1 begins a new strip."""
 
 
 def read_ply(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
@@ -282,7 +278,8 @@ def read_mesh(path: Path | str) -> tuple[Float[np.ndarray, "vertices 3"], Int[np
     faces = np.zeros((0, 3), np.int64)
     if corners is not None:
         faces = triangulate(vertices, np.asarray(corners.values, np.int64), corners.sizes)
-    strips = elements.get(STRIPS, {})
+    # Lists of this element are triangle strips: each corner makes a triangle with the two before it; -1 begins a new strip.
+    strips = elements.get("tristrips", {})
     for own in (strips[name] for name in CORNERS if name in strips):
         if isinstance(own, Ragged):
             faces = np.concatenate([faces, strip_triangles(own)])

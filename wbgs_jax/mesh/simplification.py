@@ -20,19 +20,6 @@ from scipy.sparse import coo_array
 from wbgs_jax.mesh.facets import Facets, areas, facets_from_mesh
 from wbgs_jax.types import Mesh
 
-WELD = 1e-5
-"""Metres: corners of one object that are nearer than this are merged."""
-BORDER = 10.0
-"""Weight of a border's perpendicular plane, whose area is the square of the border's length."""
-SHORT = 1e-16
-"""Extra cost of a side: this factor times the fourth power of its length and a random factor of 1 to 2. Flat pieces lose their
-short sides first, in a random order in which many can be collapsed at once."""
-TURNED = 0.2
-"""Cosine of the largest angle by which a triangle may be rotated in one step."""
-AT_ONCE = 0.5
-"""Fraction of the vertices (the cheapest) that may be collapsed in one step."""
-FINE = 300_000
-"""Triangles: larger meshes are simplified before coplanar triangles are merged, which would take longer."""
 FEW = 3000
 """Number of facets that cost little time: at least this many of the existing ones are kept (and this many of a simplified
 mesh), ..."""
@@ -40,9 +27,6 @@ KEPT = 0.98
 """... and as many of the largest ones as make up this fraction of the surface."""
 LEFT_OUT = 0.1
 """Fraction of the surface that may be omitted as its smallest facets before the mesh is simplified instead."""
-TRIES = 4
-PROBES = 1000
-"""Points on the mesh whose distances from the simplified mesh are measured."""
 
 Quadrics = Float[np.ndarray, "v 10"]
 """Coefficients xx, xy, xz, yy, yz, zz, x, y, z and 1 of the sum of squared distances from planes, relative to the vertex:
@@ -71,7 +55,8 @@ def facets_that_fit(mesh: Mesh, most: int) -> Facets:
     """Returns at most `most` facets: the largest of the mesh, as many as matter (`FEW`, `KEPT`), or those of a simplified mesh
     if the largest would omit too much of the surface (`LEFT_OUT`). A warning then states the deviation from the original
     mesh."""
-    if len(mesh.faces) <= FINE:
+    fine = 300_000  # triangles: larger meshes are simplified before coplanar triangles are merged, which would take longer
+    if len(mesh.faces) <= fine:
         found = facets_from_mesh(mesh)
         share = np.cumsum(areas(found)) / areas(found).sum()
         if share[min(most, len(share)) - 1] >= 1 - LEFT_OUT:
@@ -79,7 +64,7 @@ def facets_that_fit(mesh: Mesh, most: int) -> Facets:
             return jax.tree.map(lambda leaf: leaf[: min(most, enough)], found)
     most = min(most, FEW)
     count = 2 * most  # pairs of triangles often make one facet
-    for _ in range(TRIES):
+    for _ in range(4):
         small, what = simplified(mesh, count)
         found = facets_from_mesh(small)
         if len(found.offset) <= most:
@@ -118,7 +103,8 @@ def welded(
     corners: Float[np.ndarray, "t 3 3"], piece: Int[np.ndarray, " t"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
     """Returns the corners of every piece without duplicates, and the indices of all triangles' corners among them."""
-    grid = np.round(corners.reshape(-1, 3) / WELD).astype(np.int64)
+    weld = 1e-5  # metres: corners of one object that are nearer than this are merged
+    grid = np.round(corners.reshape(-1, 3) / weld).astype(np.int64)
     keys = np.ascontiguousarray(np.column_stack([np.repeat(piece, 3), grid]))
     rows = keys.view([("", keys.dtype)] * 4).reshape(-1)
     _, first, which = np.unique(rows, return_index=True, return_inverse=True)
@@ -164,7 +150,8 @@ def vertex_quadrics(points: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray,
     border = np.flatnonzero(_multiplicity(sides, len(points)) == 1)
     u, v = sides[border].T
     upright, length = _unit(np.cross(points[v] - points[u], normal[border // 3]))
-    walls = BORDER * _plane(upright) * (length**2)[:, None]
+    weight = 10.0  # weight of a border's perpendicular plane, whose area is the square of the border's length
+    walls = weight * _plane(upright) * (length**2)[:, None]
     for corner in (u, v):
         np.add.at(quadrics, corner, walls)
     return quadrics
@@ -174,8 +161,9 @@ def distances(corners: Float[np.ndarray, "t 3 3"], others: Float[np.ndarray, "f 
     """Returns the distances (metres) of points drawn at random on triangles from other triangles."""
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     rng = np.random.default_rng(seed)
-    one = corners[rng.choice(len(corners), PROBES, p=area / area.sum())]
-    probes = np.sum(one * rng.dirichlet(np.ones(3), PROBES)[..., None], 1)
+    number = 1000  # points on the mesh whose distances from the simplified mesh are measured
+    one = corners[rng.choice(len(corners), number, p=area / area.sum())]
+    probes = np.sum(one * rng.dirichlet(np.ones(3), number)[..., None], 1)
     return np.array([distance_from(probe, others) for probe in probes])
 
 
@@ -212,7 +200,10 @@ class _Sides:
         names = names[np.append(True, np.diff(names) > 0)]
         u, v = names // len(points), names % len(points)
         way = points[v] - points[u]
-        short = SHORT * np.sum(way**2, -1) ** 2
+        # Extra cost of a side: this factor times the fourth power of its length and a random factor of 1 to 2. Flat pieces lose
+        # their short sides first, in a random order in which many can be collapsed at once.
+        extra = 1e-16
+        short = extra * np.sum(way**2, -1) ** 2
         to_v, to_u = _at(quadrics[u], way) + quadrics[v, -1], _at(quadrics[v], -way) + quadrics[u, -1]
         cost = [np.maximum(one, 0) + short * rng.uniform(1, 2, len(u)) for one in (to_v, to_u)]
         start, end = np.concatenate([u, v]), np.concatenate([v, u])
@@ -232,7 +223,8 @@ class _Sides:
         rank[by_cost] = np.arange(len(points))
         lowest = np.full(len(points), len(points))
         np.minimum.at(lowest, self.start, rank[self.end])
-        cheap = np.isfinite(lowest_cost) & (rank <= AT_ONCE * np.isfinite(lowest_cost).sum())
+        at_once = 0.5  # fraction of the vertices (the cheapest) that may be collapsed in one step
+        cheap = np.isfinite(lowest_cost) & (rank <= at_once * np.isfinite(lowest_cost).sum())
         removed = np.flatnonzero(cheap & (rank < lowest))
         kept = self.end[best[removed]]
         fine = _keeps_shape(points, triangles, removed, kept) & self._keeps_topology(triangles, removed, kept, len(points))
@@ -270,7 +262,8 @@ def _keeps_shape(
     before, after, owner = before[stays], after[stays], own[touched][stays]
     (old, _), (new, twice) = (_unit(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])) for p in (points[before], points[after]))
     fine = np.ones(len(removed), bool)
-    fine[owner[(np.sum(old * new, -1) < TURNED) | (twice < 1e-12)]] = False
+    turned = 0.2  # cosine of the largest angle by which a triangle may be rotated in one step
+    fine[owner[(np.sum(old * new, -1) < turned) | (twice < 1e-12)]] = False
     return fine
 
 

@@ -14,16 +14,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 
-THICKEST = 0.6
-"""Maximum thickness of a wall or floor, metres."""
-THIN = 0.25
-"""Maximum ratio of the thickness to the smaller of the two other sides."""
-SMALLEST_WALL, SMALLEST_FLOOR = 0.5, 2.0
-"""Metres: minimum of the smaller side of a vertical and of a horizontal slab. A table top stays a body with edges."""
 MOST_FACES = 2_000
 """Maximum number of triangles of a wall."""
-UNEQUAL = 0.02
-"""Maximum relative difference between the areas of the two faces."""
 FLAT = 1e-3
 """Metres: maximum distance of corners from the plane of a face, and of the corners of a side from a line."""
 PARALLEL = 0.999
@@ -102,13 +94,18 @@ def _wall(body: trimesh.Trimesh, centre: Float[np.ndarray, "3"]) -> Sheet | None
     flat = np.ptp(heights, axis=1) < FLAT
     top, bottom = (flat & (np.abs(heights[:, 0] - level) < FLAT) for level in (heights.max(), heights.min()))
     thickness = float(np.ptp(heights))
-    if not 0 < thickness <= THICKEST or abs(areas[top].sum() - areas[bottom].sum()) > UNEQUAL * areas[top].sum():
+    thickest = 0.6  # maximum thickness of a wall or floor, metres
+    unequal = 0.02  # maximum relative difference between the areas of the two faces
+    if not 0 < thickness <= thickest or abs(areas[top].sum() - areas[bottom].sum()) > unequal * areas[top].sum():
         return None
     front = top if (centre - body.vertices.mean(0)) @ normal >= 0 else bottom
     sheet = _sheet(body, front, normal, thickness)
     side = float(np.ptp(sheet.vertices @ sheet.axes().T, axis=0).min())
-    smallest = SMALLEST_FLOOR if abs(normal[2]) > PARALLEL else SMALLEST_WALL
-    return sheet if side >= smallest and thickness <= THIN * side else None
+    # Metres: minimum of the smaller side of a vertical and of a horizontal slab. A table top stays a body with edges.
+    smallest_wall, smallest_floor = 0.5, 2.0
+    smallest = smallest_floor if abs(normal[2]) > PARALLEL else smallest_wall
+    thin = 0.25  # maximum ratio of the thickness to the smaller of the two other sides
+    return sheet if side >= smallest and thickness <= thin * side else None
 
 
 def _panels(mesh: trimesh.Trimesh) -> list[Sheet]:

@@ -21,7 +21,6 @@ NAMED = re.compile(r"\s*((o|g|usemtl|mtllib)\s|#)")
 COMMENT, REMARK = re.compile("#"), re.compile(r"(?:^|\s)#(?=\s|$)|^\s*#")
 """Patterns that begin a comment; after a name, which may itself contain `#`, the sign must stand alone."""
 LINES = re.compile(r"\r\n|\r|\n")
-WIDE = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 
 def read_obj(file: Path) -> list[Body]:
@@ -84,7 +83,8 @@ def _statements(text: str) -> Iterator[list[str]]:
 
 def _text(content: bytes) -> str:
     """Returns the text; bytes in an unknown encoding are mapped to distinct characters."""
-    coding = WIDE.get(content[:2], "utf-8-sig")
+    wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+    coding = wide.get(content[:2], "utf-8-sig")
     try:
         text = content.decode(coding)
     except UnicodeDecodeError:

@@ -31,10 +31,8 @@ LAW = np.array([-45.0, 2.0, 6.0])
 """Prior means of the power at one metre (dBm), the exponent and the loss of a wall (dB), ..."""
 LAW_WIDTH = np.array([30.0, 1.0, 4.0])
 """... and their prior standard deviations."""
-ALIKE = 1.0
-"""Metres: the readings within a square of this size count as one reading in the fit of the law, ..."""
 APART = 5.0
-"""... with this standard deviation of its error (dB)."""
+"""Standard deviation of the error of the law where readings within a metre count as one, dB."""
 NEAREST = 0.1
 """Metres: lower bound on distances."""
 MAX_PLACES = 1500
@@ -44,10 +42,6 @@ MIN_POWERS = 10
 LENGTH = 1.0
 """Correlation length of u and v, metres. It is not learned: the maximum-likelihood value in one room is longer and gives wrong
 predictions in the next."""
-LOOKED_AT = 400
-"""Positions of every receiver that are used to learn the scales."""
-WIDTH, STEPS = 0.5, 15
-"""Prior standard deviation of the logarithms of all scales, and the number of optimisation steps."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +164,8 @@ def _law_features(tx: Any, receivers: Any, walls: Walls) -> Any:
 
 def _law(readings: Readings, features: Float[np.ndarray, "n r 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Returns the law by least squares with a normal prior, and its covariance."""
-    _, square = np.unique(np.floor(readings.places / ALIKE).astype(int), axis=0, return_inverse=True)
+    side = 1.0  # metres: the readings within a square of this size count as one reading in the fit of the law
+    _, square = np.unique(np.floor(readings.places / side).astype(int), axis=0, return_inverse=True)
     received = np.isfinite(readings.powers)
     weights = np.zeros(readings.powers.shape)
     for r in range(len(readings.receivers)):
@@ -195,15 +190,18 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
     received = np.isfinite(readings.powers)
     outwards = np.argsort(np.linalg.norm(readings.places - readings.places[0], axis=-1), kind="stable")
     chosen = []
+    looked_at = 400  # positions of every receiver that are used to learn the scales
     for r in range(len(readings.receivers)):
-        own = outwards[received[outwards, r]][:LOOKED_AT]
+        own = outwards[received[outwards, r]][:looked_at]
         close = alike(readings.places[own], readings.places[own])
         by_walls = close * np.outer(root_walls[own, r], root_walls[own, r])
         chosen.append((close, by_walls, 1 / readings.counts[own, r], left[own, r]))
 
+    width, steps = 0.5, 15  # prior standard deviation of the logarithms of all scales, and the number of optimisation steps
+
     def negative_log_posterior(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        away = (logs - first) / WIDTH
-        total, gradient = 0.5 * np.sum(away**2), away / WIDTH
+        away = (logs - first) / width
+        total, gradient = 0.5 * np.sum(away**2), away / width
         room, wall, place, reading = np.exp(2 * logs)
         for close, by_walls, shares, values in chosen:
             k = room * close + wall * by_walls
@@ -217,6 +215,6 @@ def learn_scales(readings: Readings, root_walls: Float[np.ndarray, "n r"], left:
         return float(total), gradient
 
     bounds = [(x - 2, x + 2) for x in first]
-    options = {"maxiter": STEPS}
+    options = {"maxiter": steps}
     found = minimize(negative_log_posterior, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     return Scales(*(float(x) for x in np.exp(found.x)))

@@ -27,8 +27,6 @@ BLOCK, FOLDS = 1.0, 40
 """Side of the held-out squares, metres; and the maximum number of folds, into which several squares are combined."""
 NINETY = 1.6449
 """Half width of the 90 % interval of a normal distribution, in standard deviations."""
-SURE = 2.0
-"""Standard errors over squares by which a floor plan must be better than its controls."""
 Parts = list[Bool[np.ndarray, " n"]]
 Rival = Callable[[Readings], Float[np.ndarray, "n r"]]
 
@@ -49,7 +47,7 @@ class Score:
     controls_db: dict[str, float]
     """Mean absolute errors with the floor plan turned and mirrored; empty without one."""
     plan_helps: bool | None
-    """Whether the plan is better than all controls and than none, by more than `SURE` standard errors; None without a plan, and
+    """Whether the plan is better than all controls and than none, by more than two standard errors; None without a plan, and
     for one that is the same turned and mirrored."""
 
 
@@ -110,9 +108,10 @@ def _score(name: str, parts: Parts, cells: Readings, walls: Walls) -> Score:
 
 
 def _surely_positive(gains: Float[np.ndarray, " n"], square: Int[np.ndarray, " n"]) -> bool:
-    """Returns whether the mean gain over squares is positive by more than `SURE` standard errors."""
+    """Returns whether the mean gain over squares is significantly positive."""
     gain, error = standard_error(gains, square)
-    return gain > SURE * error
+    n_sigma = 2.0  # standard errors over squares by which a floor plan must be better than its controls
+    return gain > n_sigma * error
 
 
 def wrong_plans(cells: Readings, walls: Walls) -> dict[str, Walls]:

@@ -21,10 +21,6 @@ SIDE = 1e-4
 """Metres: points nearer to a plane than this count as lying on neither side."""
 SLACK = 0.05
 """Metres by which facets are enlarged, so that rounding loses no sequence."""
-NO_LENGTH = 1e-12
-"""Square metres: lower bound on twice the area of the triangle of an image and a facet side that bounds a beam."""
-BEAMS_AT_ONCE = 64
-"""Beams tested together: few enough for a CPU's cache."""
 GROUP = 8
 """Reflection sequences in a group, which begin with the same facet."""
 MOST_TRIED = 10_000_000
@@ -250,8 +246,9 @@ def _inside_beams(source, before, window, candidates, corners, normal, offset, s
     lowest = np.array([SIDE] + [-slack] * CORNERS, np.float32)[:, None]
     points = candidates.swapaxes(0, 1).reshape(-1, 3).astype(np.float32)
     inside = np.zeros((len(source), len(candidates)), bool)
-    for start in range(0, len(source), BEAMS_AT_ONCE):
-        some = slice(start, start + BEAMS_AT_ONCE)
+    beams_at_once = 64  # beams tested together: few enough for a CPU's cache
+    for start in range(0, len(source), beams_at_once):
+        some = slice(start, start + beams_at_once)
         height = planes[some].astype(np.float32) @ points.T - distances[some, :, None].astype(np.float32)
         highest = height.reshape(*height.shape[:2], CORNERS, -1).max(-2)
         inside[some] = (highest > lowest).all(1)
@@ -266,7 +263,9 @@ def _beams(source, before, window, corners, normal, offset):
     across = np.cross(first - source[:, None], np.roll(first, -1, 1) - source[:, None])
     length = np.linalg.norm(across, axis=-1, keepdims=True)
     inward = np.sign(np.sum(across * (first.mean(1) - source)[:, None], -1, keepdims=True))
-    across = np.where(length > NO_LENGTH, across * np.where(inward > 0, 1, -1) / np.maximum(length, NO_LENGTH), 0)
-    distance = np.where(length[..., 0] > NO_LENGTH, np.sum(across * source[:, None], -1), -1)
+    # Square metres: lower bound on twice the area of the triangle of an image and a facet side that bounds a beam.
+    no_length = 1e-12
+    across = np.where(length > no_length, across * np.where(inward > 0, 1, -1) / np.maximum(length, no_length), 0)
+    distance = np.where(length[..., 0] > no_length, np.sum(across * source[:, None], -1), -1)
     planes = np.concatenate([(side[:, None] * own)[:, None], across], 1)
     return planes, np.concatenate([(side * offset[window])[:, None], distance], 1)

@@ -10,8 +10,6 @@ from wbgs_jax._util.complex_math import phasor, quotient, root
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 
-VACUUM_PERMITTIVITY = 8.8541878128e-12
-"""Farads per metre."""
 DAMPING = 1 - 1e-4
 """Loss factor per passage, too small to measure: resonances of lossless slabs at grazing incidence stay finite."""
 
@@ -41,7 +39,8 @@ def complex_permittivity(
     permittivity: Float[Array, "*#n"], conductivity: Float[Array, "*#n"], frequency_hz: Float[Array, "*#n"]
 ) -> Complex[Array, "*#n"]:
     """Returns the relative permittivity eps_r - j sigma / (eps_0 omega), with the conductivity sigma in S/m."""
-    return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * VACUUM_PERMITTIVITY)
+    vacuum_permittivity = 8.8541878128e-12  # farads per metre
+    return permittivity - 1j * conductivity / (2 * jnp.pi * frequency_hz * vacuum_permittivity)
 
 
 @jax.jit

@@ -28,16 +28,8 @@ LEAF = 8
 """Facets per leaf."""
 NOWHERE = 1.0
 """Offset (metres) of padding: a plane without a normal, which nothing crosses."""
-FAR = 1e9
-"""Coordinates (metres) of the boxes of padding, which no segment reaches."""
-MARGIN = 2e-3, 1e-5
-"""Metres, and fraction of the largest coordinate, by which boxes are enlarged, so that rounding loses no intersection."""
-NO_EXTENT = 1e-12
-"""Metres: smallest extent of a segment along an axis, since it is divided by."""
 FEW_BLOCKS = 8
 """Blocks up to which all leaves are tested: fewer steps."""
-BLOCKS_AT_ONCE, LEAVES_AT_ONCE = 512, 1024
-"""Visits in a chunk."""
 
 
 @pytree
@@ -114,13 +106,15 @@ def _boxes(
 ]:
     """Returns lowest and highest corners of blocks, then of leaves (`FacetHierarchy`). `there` excludes padding; `xp` is the
     module of the arrays."""
-    margin, own, real = MARGIN[0] + MARGIN[1] * xp.max(xp.abs(corners)), corners[facet], there[..., None]
-    low = xp.where(real, own.min(2) - margin, FAR).min(1).reshape(-1, WORD, 3)
-    high = xp.where(real, own.max(2) + margin, -FAR).max(1).reshape(-1, WORD, 3)
+    # Boxes are enlarged by millimetres and by a fraction of the largest coordinate, so that rounding loses no intersection.
+    margin, own, real = 2e-3 + 1e-5 * xp.max(xp.abs(corners)), corners[facet], there[..., None]
+    far = 1e9  # coordinates (metres) of the boxes of padding, which no segment reaches
+    low = xp.where(real, own.min(2) - margin, far).min(1).reshape(-1, WORD, 3)
+    high = xp.where(real, own.max(2) + margin, -far).max(1).reshape(-1, WORD, 3)
     both = (low.min(1), high.max(1)), (low, high)
-    of_blocks, of_leaves = ((lowest, xp.where(highest < lowest, FAR, highest)) for lowest, highest in both)  # padding: nowhere
+    of_blocks, of_leaves = ((lowest, xp.where(highest < lowest, far, highest)) for lowest, highest in both)  # padding: nowhere
     missing = (0, -len(low) % WORD), (0, 0)
-    block_low, block_high = (xp.pad(box, missing, constant_values=FAR).T for box in of_blocks)
+    block_low, block_high = (xp.pad(box, missing, constant_values=far).T for box in of_blocks)
     leaf_low, leaf_high = (box.swapaxes(1, 2) for box in of_leaves)
     return block_low, block_high, leaf_low, leaf_high
 
@@ -153,6 +147,8 @@ def crossings(
     start, end = points[:, :-1].reshape(-1, 3), points[:, 1:].reshape(-1, 3)
     real = jnp.repeat(living, each) & jnp.any(start != end, -1)
 
+    blocks_at_once, leaves_at_once = 512, 1024  # visits in a chunk
+
     def in_leaves(visits: Members, place: _Place, found: _Found) -> _Found:
         def further(word: Array, bit: Array, there: Array, found: _Found) -> _Found:
             own, leaf = place(word, bit)
@@ -160,7 +156,7 @@ def crossings(
             hit = _inside(start[own, :, None], end[own, :, None], planes, near) & there[:, None]
             return _noted(found, own // each, own % each * leaves + leaf, packed(hit, LEAF)[:, 0])
 
-        return in_chunks(visits, LEAVES_AT_ONCE, further, found)
+        return in_chunks(visits, leaves_at_once, further, found)
 
     def in_blocks(visits: Members, place: _Place, found: _Found) -> _Found:
         def further(word: Array, bit: Array, there: Array, found: _Found) -> _Found:
@@ -168,7 +164,7 @@ def crossings(
             met = _meets(start[own], end[own], hierarchy.leaf_low[block], hierarchy.leaf_high[block]) & there[:, None]
             return in_leaves(members(packed(met)[:, 0]), lambda word, bit: (own[word], block[word] * WORD + bit), found)
 
-        return in_chunks(visits, BLOCKS_AT_ONCE, further, found)
+        return in_chunks(visits, blocks_at_once, further, found)
 
     low, high, visit = hierarchy.block_low, hierarchy.block_high, in_blocks
     if len(hierarchy.leaf_low) <= FEW_BLOCKS:
@@ -222,7 +218,8 @@ def _meets(
 ) -> Bool[Array, "s b"]:
     """Returns which segments meet which boxes: those that are inside between all three pairs of planes at once."""
     extent = end - start
-    inverse = 1 / jnp.where(jnp.abs(extent) < NO_EXTENT, NO_EXTENT, extent)
+    no_extent = 1e-12  # metres: smallest extent of a segment along an axis, since it is divided by
+    inverse = 1 / jnp.where(jnp.abs(extent) < no_extent, no_extent, extent)
     enter, leave = jnp.zeros((), start.dtype), jnp.ones((), start.dtype)
     for axis in range(3):
         sides = [(side[..., axis, :] - start[:, axis, None]) * inverse[:, axis, None] for side in (low, high)]

@@ -30,8 +30,6 @@ MAX_ORDER = 3
 """Maximum number of reflections and diffractions of a path."""
 MAX_INTERACTIONS = 5
 """Maximum number of facets and edges that a path interacts with; a wave that has crossed more of them is negligible."""
-BEHIND = 1e-6
-"""Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start."""
 FEW_ROWS, SCORED_AT_ONCE = 4096, 512
 """Rows up to which all are scored, and candidates scored together where there are more."""
 SLACK = 5e-3
@@ -405,7 +403,9 @@ def _in_order(candidate: Candidates, crossed, facets: Facets):
     segment, facet, crosses = crossed
     share = crossing_share(candidate.points[segment], candidate.points[segment + 1], facet, facets)
     vertex, types = jnp.arange(MAX_ORDER), candidate.interaction_type
-    crossing = jnp.where(crosses, segment + jnp.clip(share, BEHIND, 1), jnp.inf)
+    # Smallest fraction of a segment at which a crossing counts, so that it comes after the interaction at the segment's start.
+    behind = 1e-6
+    crossing = jnp.where(crosses, segment + jnp.clip(share, behind, 1), jnp.inf)
     order = jnp.argsort(jnp.concatenate([crossing, jnp.where(types != NONE, vertex + 1.0, jnp.inf)]))[:MAX_INTERACTIONS]
     interactions = jnp.where(crosses, TRANSMITTED, NONE), types
     met = jnp.where(crosses, facet, 0), candidate.interaction_facet

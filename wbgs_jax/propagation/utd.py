@@ -15,8 +15,6 @@ from jaxtyping import Array, Complex, Float
 
 from wbgs_jax._util.complex_math import quotient
 
-_TERMS = 16
-
 
 def _weideman(terms: int) -> tuple[float, np.ndarray]:
     """Returns scale and polynomial of Weideman's rational approximation of w(z) (SIAM J. Numer. Anal. 31, 1994)."""
@@ -27,7 +25,7 @@ def _weideman(terms: int) -> tuple[float, np.ndarray]:
     return scale, np.flipud(np.real(np.fft.fft(np.fft.fftshift(f)))[1 : terms + 1] / (2 * m))
 
 
-_SCALE, _POLYNOMIAL = _weideman(_TERMS)
+_SCALE, _POLYNOMIAL = _weideman(16)
 
 
 def faddeeva(z: Complex[Array, "*n"]) -> Complex[Array, "*n"]:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Inexact, Int
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.pytree import pytree
 from wbgs_jax.radio.array import EXACT
-from wbgs_jax.radio.geometry import angles_to_direction, direction_to_angles, quaternion_product, rotation_matrix, to_local
+from wbgs_jax.radio.geometry import direction_to_angles, quaternion_product, rotation_matrix, to_local
 
 PATTERN_EXPONENTS = {
     "": (0.0, 0.0),  # unknown
@@ -31,17 +31,17 @@ PATTERN_EXPONENTS = {
     "hw_dipole": (0.0, 1.2),  # within 0.41 dB wherever the half-wave dipole is above -10 dB
 }
 """Exponents of the directional element and of the dipole, by pattern name."""
-SPELLINGS = {"isotropic": "iso", "tr38901": "tr38901", "38901": "tr38901", "3gpp38901": "tr38901"}
-SPELLINGS |= {
+SPELLINGS = {
+    "isotropic": "iso",
+    "tr38901": "tr38901",
+    "38901": "tr38901",
+    "3gpp38901": "tr38901",
     "3gpptr38901": "tr38901",
     "shortdipole": "dipole",
     "halfwavedipole": "hw_dipole",
     "halfwavelengthdipole": "hw_dipole",
-}
-SPELLINGS |= {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
+} | {re.sub("[^a-z0-9]", "", name): name for name in PATTERN_EXPONENTS}
 """Pattern names by their spellings in lower case without separators."""
-SMALLEST_TABLE = 4, 4
-"""Smallest number of zenith angles and azimuths of a tabulated pattern."""
 POLE = 1e-12
 """Squared sine of the zenith angle below which a direction counts as vertical."""
 
@@ -164,7 +164,7 @@ def tabulated(e_theta: Inexact[np.ndarray, "zenith azimuth"], e_phi: Inexact[np.
         ValueError: the table is too small, or has an odd number of azimuths.
     """
     rows, columns = e_theta.shape
-    if rows < SMALLEST_TABLE[0] or columns < SMALLEST_TABLE[1] or columns % 2:
+    if rows < 4 or columns < 4 or columns % 2:
         raise ValueError(f"{rows} zenith angles and {columns} azimuths; give at least 4 of both, azimuths in even number")
     if e_phi is None:
         values = np.array(e_theta)[..., None]
@@ -177,22 +177,6 @@ def tabulated(e_theta: Inexact[np.ndarray, "zenith azimuth"], e_phi: Inexact[np.
     values[[0, -1]] = values[[0, -1]].mean(1, keepdims=True)
     kind = np.complex64 if np.iscomplexobj(values) else np.float32
     return Antenna(None, jnp.zeros(2, jnp.float32), Pattern(jnp.asarray(values.astype(kind))))
-
-
-def mean_gain(antenna: Antenna, rows: int = 361) -> float:
-    """Returns the mean over the sphere of an antenna's power gain (host): its efficiency, 1 without losses, since directivity
-    integrates to 4 pi.
-
-    Args:
-        antenna: one antenna.
-        rows: zenith angles of the quadrature, 0..pi with both ends.
-    """
-    zenith = np.linspace(0, np.pi, rows)
-    azimuth = np.arange(2 * (rows - 1)) * (np.pi / (rows - 1))
-    azimuths, zeniths = (jnp.asarray(angle, jnp.float32) for angle in np.meshgrid(azimuth, zenith))
-    direction = angles_to_direction(azimuths, zeniths)
-    gain = np.sum(np.abs(np.asarray(antenna.field(direction), np.complex128)) ** 2, -1).mean(1)
-    return float(np.sum(gain * zenith_weights(rows)))
 
 
 def zenith_weights(rows: int) -> Float[np.ndarray, " rows"]:

@@ -31,10 +31,6 @@ EXACT = jax.lax.Precision.HIGHEST
 room."""
 
 
-FAINTEST_POWER = 1e-8
-"""Power of a pixel in the spectrum of a covariance of unit trace below which it counts as zero."""
-
-
 def planar_array(rows: int = 4, columns: int = 4, spacing: float = 0.5) -> Float[np.ndarray, "elements 3"]:
     """Returns the element positions (wavelengths, float64) of a planar array in the local y-z plane, centred on the origin.
 
@@ -221,7 +217,8 @@ def wide_covariance_to_pas(
 
 def _root(power: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Returns the square root of powers, 0 for the faintest, so that zero power has no infinite gradient."""
-    return jnp.sqrt(jnp.maximum(power, FAINTEST_POWER)) - FAINTEST_POWER**0.5
+    faintest_power = 1e-8  # power of a pixel in the spectrum of a covariance of unit trace below which it counts as zero
+    return jnp.sqrt(jnp.maximum(power, faintest_power)) - faintest_power**0.5
 
 
 def normalise(pas: Float[Array, "*n 90 360"]) -> Float[Array, "*n 90 360"]:
@@ -271,10 +268,6 @@ def squared_magnitude(z: Complex[Array, "*n"]) -> Float[Array, "*n"]:
     return z.real**2 + z.imag**2
 
 
-FLAT = 1e-4
-"""Largest extent of an array across its plane or line, relative to its size."""
-
-
 def peak_direction_error(
     predicted: Float[AnyArray, "*b 90 360"],
     truth: Float[AnyArray, "*b 90 360"],
@@ -312,7 +305,8 @@ def _not_resolved(element_positions: Float[AnyArray, "elements 3"]) -> Float[Any
     centred = positions - positions.mean(0)
     _, sizes, axes = xp.linalg.svd(centred, full_matrices=True)
     sizes = xp.pad(sizes, (0, 3))[:3]
-    return xp.where((sizes <= FLAT * sizes[0])[:, None], axes, 0)
+    flat = 1e-4  # largest extent of an array across its plane or line, relative to its size
+    return xp.where((sizes <= flat * sizes[0])[:, None], axes, 0)
 
 
 @jax.jit

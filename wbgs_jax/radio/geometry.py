@@ -91,14 +91,6 @@ def angles_to_pixel(
     return jnp.stack([(azimuth + jnp.pi) * sx, zenith * sy], -1)
 
 
-def pixel_to_angles(
-    pixels: Float[Array, "*n 2"], projection: Projection = "hemisphere"
-) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns azimuth and zenith (radians) of continuous pixel coordinates (x: column, y: row)."""
-    sx, sy = pixels_per_radian(projection)
-    return pixels[..., 0] / sx - jnp.pi, pixels[..., 1] / sy
-
-
 def smooth_length(v: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
     """Returns vector lengths (metres), smoothed on the scale of a millimetre so that they are differentiable everywhere."""
     return jnp.sqrt(jnp.sum(v * v, -1, keepdims=True) + 1e-6)

@@ -1,4 +1,4 @@
-"""Front-to-back alpha blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see reference.py).
+"""Front-to-back alpha blending of tile lists: I += T alpha Sig, T *= 1 - alpha (paper, equation 6; see `render.render_dense`).
 
 A job holds `CHUNK` Gaussians of one tile. Its footprints are computed once and shared by all queries; an unrolled chain of
 products blends them. There are two implementations of the same image, chosen by the platform that the code is lowered for
@@ -24,20 +24,18 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-from wbgs_jax._util.per_platform import per_platform
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
+from wbgs_jax.splat.per_platform import per_platform
 from wbgs_jax.splat.projection import footprint, mahalanobis2, windowed_exponential
 from wbgs_jax.splat.tiles import CHUNK, TileJobs, Tiling
 
-MESSAGE = (
-    "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, jax.jacfwd or "
-    "jax.linearize, and no second derivatives"
-)
-
 
 def _refuse(*_: Any, **__: Any) -> NoReturn:
-    raise TypeError(MESSAGE)
+    raise TypeError(
+        "splatting is differentiable in reverse mode only: use jax.grad, jax.vjp or jax.jacrev instead of jax.jvp, jax.jacfwd "
+        "or jax.linearize, and no second derivatives"
+    )
 
 
 _tangent = Primitive("reverse_mode_only")

@@ -100,10 +100,6 @@ GEOMETRY = 5
 """Numbers that describe a footprint: the first columns of a Gaussian's row. Attenuation and signal of all queries follow."""
 COLUMNS = 8
 """Columns of a row of footprint gradients; the last ones are zero."""
-ENTRIES = 16
-"""Slots of a Gaussian whose gradients are loaded at once."""
-MONOMIALS = 16
-"""Columns of the matrix of monomials 1, x, y, x^2, xy, y^2, padded with zeros to a size that tensor cores accept."""
 LOG2 = float(np.log(2))
 
 
@@ -197,7 +193,9 @@ def _columns(b: int) -> int:
 
 def _monomials(tiling: Tiling) -> Float[Array, "lanes monomials"]:
     table = tiling.monomials()
-    dead = tiling.lanes - tiling.pixels, MONOMIALS - table.shape[1]
+    # Columns of the matrix of monomials 1, x, y, x^2, xy, y^2, padded with zeros to a size that tensor cores accept.
+    monomials = 16
+    dead = tiling.lanes - tiling.pixels, monomials - table.shape[1]
     return jnp.asarray(np.pad(table, [(0, size) for size in dead]), jnp.float32)
 
 
@@ -298,7 +296,8 @@ def _backward_kernel(
 
 def _collect_kernel(gaussian_ref, end_ref, slot_ref, of_exponents_ref, of_features_ref, d_exponents_ref, d_features_ref):
     (blocks, _, columns), b, width = of_exponents_ref.shape, of_features_ref.shape[0], d_features_ref.shape[1] // 2
-    entry, column = lax.broadcasted_iota(jnp.int32, (ENTRIES,), 0), lax.broadcasted_iota(jnp.int32, (1, columns), 1)
+    entries = 16  # slots of a Gaussian whose gradients are loaded at once
+    entry, column = lax.broadcasted_iota(jnp.int32, (entries,), 0), lax.broadcasted_iota(jnp.int32, (1, columns), 1)
     feature = lax.broadcasted_iota(jnp.int32, (1, 2 * width), 1)
     query, kind = jnp.minimum(feature % width, b - 1), feature // width
 
@@ -307,7 +306,7 @@ def _collect_kernel(gaussian_ref, end_ref, slot_ref, of_exponents_ref, of_featur
 
         def of_entries(turn, state):
             d_exponents, d_features = state
-            number = begin + turn * ENTRIES + entry
+            number = begin + turn * entries + entry
             slot = plt.load(slot_ref.at[jnp.minimum(number, slot_ref.shape[0] - 1)])
             live = ((number < end) & (slot >= 0))[:, None]
             slot = jnp.where(live, slot[:, None], 0)
@@ -320,7 +319,7 @@ def _collect_kernel(gaussian_ref, end_ref, slot_ref, of_exponents_ref, of_featur
             return d_exponents, d_features + jnp.sum(jnp.where(live, found, 0.0), axis=0)
 
         blank = jnp.zeros(columns, jnp.float32), jnp.zeros(2 * width, jnp.float32)
-        d_exponents, d_features = lax.fori_loop(0, (end - begin + ENTRIES - 1) // ENTRIES, of_entries, blank)
+        d_exponents, d_features = lax.fori_loop(0, (end - begin + entries - 1) // entries, of_entries, blank)
         gaussian = plt.load(gaussian_ref.at[rank])
         plt.store(d_exponents_ref.at[gaussian, :], d_exponents)
         plt.store(d_features_ref.at[gaussian, :], d_features)

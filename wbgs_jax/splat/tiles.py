@@ -16,10 +16,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from wbgs_jax._util.per_platform import per_platform
 from wbgs_jax._util.pytree import pytree, static
 from wbgs_jax.radio.array import PAS_HEIGHT, PAS_WIDTH
 from wbgs_jax.radio.geometry import AZIMUTH_PERIOD
+from wbgs_jax.splat.per_platform import per_platform
 from wbgs_jax.splat.projection import CUT, TILE_ROOM, Splats
 
 CHUNK = 16

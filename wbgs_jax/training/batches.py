@@ -3,7 +3,7 @@ batch; and the check that a field can be trained on it.
 
 Virtual links keep a field without paths from overfitting a few spectra (host). Between a small number of transmitters the
 predictions of such a field are arbitrary. Half of every batch are therefore links of virtual transmitters between and around
-the measured ones, with spectra from ordinary kriging (`inference.mixture`): the field starts from the kriged spectra, and
+the measured ones, with spectra from ordinary kriging (`inference.kriging`): the field starts from the kriged spectra, and
 varies as smoothly with the transmitter's position as they do.
 """
 
@@ -24,10 +24,6 @@ from wbgs_jax.fields import Field, field_names, get_field
 from wbgs_jax.observation_kinds import KINDS, Observations, Observed, spectra_of
 from wbgs_jax.radio.array import pas_directions, steering_vector
 from wbgs_jax.types import Batch, Links, Receiver, Transmitter
-
-FAR_M = 500.0
-"""Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a wavelength
-at 100 GHz."""
 
 
 @pytree
@@ -118,7 +114,10 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
     if len(dataset.train) == 0:
         raise UserError(f"{dataset.name} has no training spectra; choose another split")
     far = max(float(np.abs(points).max(initial=0)) for points in (dataset.tx_positions, dataset.vertices))
-    if far > FAR_M:
+    # Distance from the origin, metres, at which single precision rounds positions to 30 micrometres, a hundredth of a
+    # wavelength at 100 GHz.
+    far_m = 500.0
+    if far > far_m:
         warnings.warn(
             f"{dataset.name} holds coordinates of {far:,.0f} m, where single precision is coarse; subtract one offset from "
             "mesh, transmitters and receivers",
@@ -131,13 +130,9 @@ def check_data(dataset: Dataset, field: type[Field]) -> None:
 
 FEW = 128
 """Number of training spectra from which on virtual links are not used."""
-COUNT = 4, 256
-"""Virtual links per training link, and their maximum number."""
 BEYOND, BESIDE = 0.3, 0.1
 """Range of virtual transmitters beyond two measured ones, relative to the distance between these, and r.m.s. displacement from
 the line through them, relative to the extent of all transmitters."""
-LENGTH, NUGGET = 0.5, 0.01
-"""Correlation length of the kriging, relative to the extent of all transmitters, and its nugget."""
 
 
 class VirtualLinks(NamedTuple):
@@ -160,16 +155,17 @@ def virtual_links(dataset: Dataset, seed: int) -> VirtualLinks | None:
     if len(train) >= FEW or extent == 0 or not dataset.has_spectra:
         return None
     rng = np.random.default_rng([seed, 7])
-    count = min(COUNT[0] * len(train), COUNT[1])
+    count = min(4 * len(train), 256)  # virtual links: four per training link, up to a maximum
     first, second = rng.integers(len(train), size=(2, count))
     along = rng.uniform(-BEYOND, 1 + BEYOND, (count, 1))
     places = positions[first] + along * (positions[second] - positions[first])
     places += rng.normal(0, BESIDE * extent / np.sqrt(3), places.shape)
     spectra, images = np.asarray(dataset.pas(train)), np.empty((count, 90, 360), np.uint8)
     frequency, receiver = dataset.frequencies_hz[train], dataset.receiver_index[train]
+    length, nugget = 0.5, 0.01  # correlation length of the kriging, relative to the extent of all transmitters, and its nugget
     for i in range(count):
         alike = np.flatnonzero((frequency == frequency[first[i]]) & (receiver == receiver[first[i]]))
-        weights = kriging_weights(positions[alike], places[i], LENGTH * extent, NUGGET)
+        weights = kriging_weights(positions[alike], places[i], length * extent, nugget)
         images[i] = (255 * np.clip(np.tensordot(weights, spectra[alike], 1), 0, 1)).round()
     return VirtualLinks(places, frequency[first], receiver[first], images)
 

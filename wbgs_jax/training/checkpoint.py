@@ -26,14 +26,6 @@ from wbgs_jax._util.devices import is_first
 from wbgs_jax._util.errors import UserError
 
 FIELD, EMPTY, DIGEST = "field", "empty", "sha256"
-MARGIN = 2**16
-"""Bytes of a checkpoint in addition to its arrays."""
-FILE_BYTES = 8 * 2**20
-"""Approximate size of a checkpoint's files, small enough for uploads that are limited in size."""
-STATE = "state"
-"""Folder of the arrays in a checkpoint."""
-REMOVED = ".removed"
-"""Suffix of a checkpoint that is being removed."""
 
 
 @dataclass(frozen=True)
@@ -116,18 +108,20 @@ def tidy(folder: Path, keep: int) -> None:
     A checkpoint is renamed before it is removed, so that a folder named by a number is always complete. Errors are ignored,
     since only the newest checkpoint matters and it exists.
     """
+    removed = ".removed"  # suffix of a checkpoint that is being removed
     for old in checkpoint_steps(folder)[:-keep]:
-        shutil.rmtree(folder / f"{old}{REMOVED}", ignore_errors=True)
+        shutil.rmtree(folder / f"{old}{removed}", ignore_errors=True)
         with contextlib.suppress(OSError):
-            (folder / str(old)).rename(folder / f"{old}{REMOVED}")
-    for left in folder.glob(f"*{REMOVED}"):
+            (folder / str(old)).rename(folder / f"{old}{removed}")
+    for left in folder.glob(f"*{removed}"):
         shutil.rmtree(left, ignore_errors=True)
 
 
 def _demand_room(folder: Path, arrays: dict[str, np.ndarray]) -> None:
     """Raises an `OSError` for lack of disk space before Orbax begins: its writes run concurrently, and after the first failure
     the threads of the others would print errors on stderr."""
-    if shutil.disk_usage(folder).free < sum(array.nbytes for array in arrays.values()) + MARGIN:
+    margin = 2**16  # bytes of a checkpoint in addition to its arrays
+    if shutil.disk_usage(folder).free < sum(array.nbytes for array in arrays.values()) + margin:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -140,9 +134,10 @@ def read(folder: Path, step: int) -> Saved:
     from orbax.checkpoint import v1 as ocp
 
     path = folder / str(step)
+    state = "state"  # folder of the arrays in a checkpoint
     with _explained(path), _quiet():
         with _alone(), _plain(path) as place:
-            _read_every_value(place / STATE)
+            _read_every_value(place / state)
             metadata = ocp.metadata(place).custom_metadata
             if not metadata:  # Orbax returns None for a file that it cannot read
                 raise ValueError("no metadata")
@@ -197,10 +192,11 @@ def _demand(fits: bool, saved: Saved) -> None:
 
 
 def _small_files() -> contextlib.AbstractContextManager[Any]:
-    """Makes Orbax write files of at most about `FILE_BYTES`, in the array format that allows this."""
+    """Makes Orbax write files of a limited size, in the array format that allows this."""
     from orbax.checkpoint import v1 as ocp
 
-    saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=FILE_BYTES)
+    file_bytes = 8 * 2**20  # approximate size of a checkpoint's files, small enough for uploads that are limited in size
+    saving = ocp.options.ArrayOptions.Saving(use_zarr3=True, ocdbt_target_data_file_size=file_bytes)
     context: contextlib.AbstractContextManager[Any] = ocp.Context(array_options=ocp.options.ArrayOptions(saving=saving))
     return context
 

@@ -1,7 +1,7 @@
 """Corrections of a trained field if few transmitters were measured: simple methods, the weight of the field, and prediction
 intervals, all from cross-validation (host).
 
-A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than `ENOUGH`, simple methods
+A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than 20, simple methods
 are part of the mixture from the start (training/fit_mixture.py). A field without paths is cross-validated over all
 transmitters, in blocks (`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A
 field with paths takes too long for that; only its predictions for the validation part are used.
@@ -28,7 +28,7 @@ from wbgs_jax.data.splits import training_links
 from wbgs_jax.fields import Field
 from wbgs_jax.fields.base import Params
 from wbgs_jax.inference.intervals import Confidence, features
-from wbgs_jax.inference.mixture import Mixture
+from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.inference.predictor import as_observed, predict_spectra
 from wbgs_jax.training.batches import knows_no_paths
 from wbgs_jax.training.fit_intervals import confidence_of
@@ -38,10 +38,6 @@ from wbgs_jax.training.loop import train
 
 FOLDS = 4
 """Number of blocks; if there are fewer transmitters, each is a block."""
-SHARE = 0.25
-"""Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse."""
-ANSWERED = 60
-"""Maximum number of links per block for which predictions are made."""
 FOLDER = "folds"
 
 
@@ -105,7 +101,8 @@ def _answers(
     devices: int,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 90 360"]]:
     """Returns links of a block, and their spectra predicted by a field that was trained without this block."""
-    index = np.sort(np.random.default_rng(4).permutation(known[left_out])[:ANSWERED])
+    answered = 60  # maximum number of links per block for which predictions are made
+    index = np.sort(np.random.default_rng(4).permutation(known[left_out])[:answered])
     done = place.with_suffix(".npz")
     if done.exists():
         return index, read_arrays(done, "cross-validation", "remove it; --resume creates it again")["pas"].astype(np.float32)
@@ -120,17 +117,15 @@ def _answers(
 
 
 def shortened(settings: Settings, steps: int) -> Settings:
-    """Returns settings with the fraction `SHARE` of a number of steps, rounded to whole epochs, without evaluation and with few
+    """Returns settings with a fraction of a number of steps, rounded to whole epochs, without evaluation and with few
     checkpoints."""
     block = settings.loop.epoch_steps
-    steps = max(round(SHARE * steps / block), 1) * block
+    # Steps of each of these trainings, relative to the whole training; a field that is trained for longer is not worse.
+    share = 0.25
+    steps = max(round(share * steps / block), 1) * block
     optim = dataclasses.replace(settings.optim, steps=steps, min_steps=0, max_epochs=1e9)
     loop = dataclasses.replace(settings.loop, evaluate_spectra=0, checkpoint_every=10 * steps)
     return dataclasses.replace(settings, optim=optim, loop=loop)
-
-
-ENOUGH = 20
-"""Number of validation transmitters from which on the validation part alone is sufficient."""
 
 
 class Training(NamedTuple):
@@ -159,7 +154,8 @@ class Few(NamedTuple):
 def is_few(dataset: Dataset) -> bool:
     """Returns whether a dataset has so few spectra that simple methods are part of the mixture."""
     validation = np.unique(dataset.tx_index[dataset.validation])
-    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < ENOUGH
+    enough = 20  # validation transmitters, from which on the validation part alone is sufficient
+    return dataset.has_spectra and dataset.n_receivers == 1 and len(validation) < enough
 
 
 def learn_few(field: Field, params: Params, dataset: Dataset, training: Training, say: Say) -> Few:

@@ -26,13 +26,6 @@ from wbgs_jax.splat.tiles import grown_slots
 from wbgs_jax.training.hooks import Context, Edit, Hook
 from wbgs_jax.types import Gaussians
 
-SPLIT_SHRINK = 1.6
-"""Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting)."""
-CLONE_STEP = 0.5
-"""Displacement of a clone, relative to its smallest standard deviation."""
-NEARLY_FULL = 0.9
-"""Fraction of used slots from which on the program for the next size is compiled."""
-
 
 @pytree
 class DensityStatistics:
@@ -112,7 +105,8 @@ class DensityControl(Hook):
         alive = int(np.asarray(params.gaussians.alive).sum())
         every, last = max(self.config.every, 1), self.config.stop_fraction * steps
         over = not self.config.every or (step // every + 1) * every > last
-        if over or slots >= most or alive < NEARLY_FULL * slots:
+        nearly_full = 0.9  # fraction of used slots from which on the program for the next size is compiled
+        if over or slots >= most or alive < nearly_full * slots:
             return None
         grown, shapes = grown_slots(slots, slots + 1, most), jax.eval_shape(lambda tree: tree, params)
         gaussians = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((grown, *leaf.shape[1:]), leaf.dtype), shapes.gaussians)
@@ -125,7 +119,7 @@ def control_density(params: Params, statistics: DensityStatistics, config: Densi
     statistics = jax.tree.map(np.asarray, statistics)
     keep, clone, split = choose(gaussians, statistics, config)
     source, fresh = _sources(keep, clone, split)
-    edited = _edit(gaussians, statistics, source, clone, split, int(keep.sum()), rng)
+    edited = _edit(gaussians, statistics, source, clone, int(keep.sum()), rng)
     slots = len(gaussians.means)
     pad = grown_slots(slots, len(source), config.max_gaussians) - len(source)
     source, fresh = np.pad(source, (0, pad)), np.pad(fresh, (0, pad), constant_values=True)
@@ -190,7 +184,7 @@ def _sources(keep, clone, split) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray
 
 
 def _edit(
-    gaussians: Gaussians, statistics: DensityStatistics, source, clone, split, n_kept: int, rng: np.random.Generator
+    gaussians: Gaussians, statistics: DensityStatistics, source, clone, n_kept: int, rng: np.random.Generator
 ) -> Gaussians:
     """Returns the resulting Gaussians, without empty slots: clones are displaced downhill, and the halves of a split are drawn
     from the Gaussian that they replace."""
@@ -201,10 +195,13 @@ def _edit(
     halves = slice(n_kept + int(clone.sum()), None)
     gradient = np.asarray(statistics.mean_gradient)[source[clones]]
     downhill = -gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-20)
-    means[clones] += CLONE_STEP * np.exp(log_scales[clones]).min(-1, keepdims=True) * downhill
+    clone_step = 0.5  # displacement of a clone, relative to its smallest standard deviation
+    means[clones] += clone_step * np.exp(log_scales[clones]).min(-1, keepdims=True) * downhill
     draw = rng.normal(size=means[halves].shape) * np.exp(log_scales[halves])
     rotation = np.asarray(rotation_matrix(jnp.asarray(quats[halves])))
     means[halves] += np.einsum("nij,nj->ni", rotation, draw).astype(means.dtype)
-    log_scales[halves] -= math.log(SPLIT_SHRINK)
+    # Standard deviations of the two halves, relative to the Gaussian they come from (as in 3D Gaussian splatting).
+    split_shrink = 1.6
+    log_scales[halves] -= math.log(split_shrink)
     features = None if gaussians.features is None else jnp.asarray(np.asarray(gaussians.features)[source])
     return dataclasses.replace(Gaussians(*map(jnp.asarray, (means, log_scales, quats, logits))), features=features)

@@ -32,17 +32,11 @@ from wbgs_jax.radio.channel import NO_PATH_DB
 
 FEWEST, MOST = 8, 1000
 """Minimum number of validation spectra for prediction intervals, and maximum number that is used."""
-DRAWS = 400
-"""Number of draws of one link per transmitter."""
 SETS = (0, 1, 3, 5, FEATURES)
 """Numbers of features that are tried: none; the distance; also the brightness of the prediction; also the frequency; also the
 power."""
 POWER_SETS = (0, 1, 2, POWER_FEATURES)
 """Numbers of features that are tried for received powers: none; the distance; also the power itself; also the frequency."""
-ENOUGH = 5
-"""Minimum number of transmitters per feature; with fewer the regression overfits."""
-RIDGE = 1.0
-"""Ridge penalty on the coefficients of scaled features, in units of the weight of one spectrum."""
 _features, _power_features = jax.jit(features), jax.jit(power_features)
 
 
@@ -143,7 +137,8 @@ def fit(
     """
     mean, scale = known.mean(0), known.std(0) + 1e-6
     scaled = (known - mean) / scale
-    sets = tuple(size for size in sets if ENOUGH * size <= len(np.unique(tx_index)))
+    enough = 5  # minimum number of transmitters per feature; with fewer the regression overfits
+    sets = tuple(size for size in sets if enough * size <= len(np.unique(tx_index)))
     rests = {size: left_out(scaled[:, :size], error, tx_index) for size in sets}
     chosen = sets[0]
     for size in sets[1:]:
@@ -158,7 +153,8 @@ def fit(
 def regress(scaled: Float[np.ndarray, "n k"], error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " k+1"]:
     """Returns the coefficients of the features and of the constant 1 (ridge regression; the constant is not penalised)."""
     columns = np.column_stack([scaled, np.ones(len(scaled))])
-    penalty = np.diag([RIDGE] * scaled.shape[1] + [0.0])
+    ridge = 1.0  # ridge penalty on the coefficients of scaled features, in units of the weight of one spectrum
+    penalty = np.diag([ridge] * scaled.shape[1] + [0.0])
     weights: np.ndarray = np.linalg.solve(columns.T @ columns + penalty, columns.T @ error)
     return weights
 
@@ -205,7 +201,8 @@ def upper_end(rest: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], ta
     if rank > len(owns):
         return np.inf
     rng = np.random.default_rng(5)
-    drawn = np.sort([rng.choice(own, DRAWS) for own in owns], axis=0)
+    draws = 400  # number of draws of one link per transmitter
+    drawn = np.sort([rng.choice(own, draws) for own in owns], axis=0)
     below = max(int(rank), 1)
     share, above = rank - below, min(below, len(owns) - 1)
     return float(np.mean((1 - share) * drawn[below - 1] + share * drawn[above]))

@@ -32,10 +32,6 @@ MOST_RESIDUALS = 1000
 fitted almost without residual."""
 SCORED = 60
 """Maximum number of validation spectra that are scored."""
-SPACINGS = (0.5, 1, 2, 4, 8, 16, 32)
-"""Correlation lengths that are tried, relative to the median distance between a training transmitter and the nearest other."""
-WEIGHTS = (0.5, 1.0)
-"""Weights of the kriged spectra that are tried."""
 SURE, WORTH = 2.0, 0.005
 """Minimum gain of the best choice, in standard errors and in SSIM."""
 
@@ -137,7 +133,10 @@ def choices(dataset: Dataset, known: Int[np.ndarray, " n"]) -> list[Choice]:
         return []
     metres = spacing(positions)
     kinds: tuple[Kind, ...] = ("residuals", "spectra") if len(known) <= MOST_RESIDUALS else ("spectra",)
-    return [Choice(kind, scale * metres, weight) for kind, scale, weight in itertools.product(kinds, SPACINGS, WEIGHTS)]
+    # Correlation lengths that are tried, relative to the median distance between a training transmitter and the nearest other.
+    spacings = (0.5, 1, 2, 4, 8, 16, 32)
+    weights = (0.5, 1.0)  # weights of the kriged spectra that are tried
+    return [Choice(kind, scale * metres, weight) for kind, scale, weight in itertools.product(kinds, spacings, weights)]
 
 
 def spacing(places: Float[np.ndarray, "n 3"]) -> float:

@@ -23,14 +23,11 @@ from scipy.special import expit, logit
 from wbgs_jax._util.statistics import by_transmitter, standard_error
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.fields.mixture import SHARES, score_at, similarity
-from wbgs_jax.inference.mixture import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled
+from wbgs_jax.inference.kriging import LOG_METRE, MEMBERS, Mixture, member_spectra, member_weights, scaled_distance
 from wbgs_jax.training.fit_kriging import spacing
 
 STRIDE = 8
 """Stride, in pixels, of the SSIM windows with which mixtures are compared."""
-STEPS, RATE = 200, 0.1
-"""Steps and learning rate of Adam, which fits the weights."""
-_C1, _C2 = 0.01**2, 0.03**2
 
 
 class Moments(NamedTuple):
@@ -62,8 +59,9 @@ def ssim_of(moments: Moments, weights: Float[Array, "n k"]) -> Float[Array, " n"
     cross = moments.products[..., :-1, :]
     own = jnp.einsum("nwkl,nk,nl->nw", cross[..., :-1], weights, weights)
     both = jnp.einsum("nwk,nk->nw", cross[..., -1], weights)
-    luminance = (2 * mean * truth + _C1) / (mean**2 + truth**2 + _C1)
-    structure = (2 * both + _C2) / (own + moments.products[..., -1, -1] + _C2)
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean * truth + c1) / (mean**2 + truth**2 + c1)
+    structure = (2 * both + c2) / (own + moments.products[..., -1, -1] + c2)
     return jnp.mean(luminance * structure, -1)
 
 
@@ -79,7 +77,8 @@ def fit_weights(
         prior: prior bias and slope of every logit.
         ridge: penalties, in SSIM, on their squared distances from the prior.
     """
-    optimizer = optax.adam(RATE)
+    steps, rate = 200, 0.1  # steps and learning rate of Adam, which fits the weights
+    optimizer = optax.adam(rate)
 
     def loss(logits: Float[Array, "k 2"]) -> Float[Array, ""]:
         weights = jax.nn.softmax(logits[:, 0] + logits[:, 1] * u[:, None], -1)
@@ -90,14 +89,12 @@ def fit_weights(
         updates, state = optimizer.update(jax.grad(loss)(logits), state)
         return (optax.apply_updates(logits, updates), state), None
 
-    (logits, _), _ = jax.lax.scan(step, (prior, optimizer.init(prior)), None, STEPS)
+    (logits, _), _ = jax.lax.scan(step, (prior, optimizer.init(prior)), None, steps)
     return logits
 
 
 LEFT_OUT = 160
 """Maximum number of cases in which a spectrum is left out, together with different numbers of other transmitters."""
-SHARES_LEFT_OUT = (0.0, 0.12, 0.25, 0.5)
-"""Fractions of the other transmitters, the nearest ones, that are left out together with a spectrum."""
 LENGTHS, NUGGETS = 7, (1e-2, 0.1, 1.0)
 """Number of correlation lengths of the kriging that are tried, from the spacing of transmitters to their largest distance, and
 nuggets that are tried."""
@@ -107,19 +104,9 @@ PRIOR, RIDGE, RIDGE_SLOPE = (-1.0, 0.0, 0.0, 2.0, 0.0), (0.03, 0.03, 0.03, 0.03,
 """Prior logits of the simple methods (kriging itself tends to a mean far from the data), and penalties, in SSIM of a single
 transmitter, on the squared distances from these and on squared slopes. A line of sight becomes apparent from few transmitters;
 the other methods differ little, and a few transmitters do not show which is best."""
-AVERAGED = 512
-"""Maximum number of measured spectra over which the mean is computed."""
 ERRORS, ERRORS_WITH_PATHS = 2.0, 1.0
 """Distance of the bound below the mean gain, in standard errors; smaller for fields with paths, which use more information
 than the spectra."""
-USUAL_SPREAD, USUAL_WEIGHT = 0.1, 2.0
-"""Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as."""
-SLOPES = (0.0, -1.0, 1.0)
-"""Slopes of the logit of the field's weight that are tried."""
-WORTH = 0.005
-"""Minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone."""
-UNUSED = 0.02
-"""Largest weight of the line of sight at which it is left out."""
 
 
 class Known(NamedTuple):
@@ -195,7 +182,7 @@ def share_scores(
     """Returns the SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`), and the scaled logarithms of
     their distances to measured transmitters; `simple` and `distance` are results of `simple_answers`."""
     truth = np.asarray(dataset.pas(held.links))
-    return similarity(truth, held.pas, simple), np.asarray(scaled(mixture, jnp.asarray(distance)))
+    return similarity(truth, held.pas, simple), np.asarray(scaled_distance(mixture, jnp.asarray(distance)))
 
 
 def simple_answers(
@@ -227,10 +214,11 @@ def learn_members(dataset: Dataset, known: Known) -> Mixture:
     mixture = dataclasses.replace(chosen, log_distance=range_)
     prior = jnp.asarray([[bias, 0.0] for bias in PRIOR], jnp.float32)
     ridge = jnp.asarray([[penalty, RIDGE_SLOPE] for penalty in RIDGE], jnp.float32) / len(np.unique(dataset.tx_index[index]))
-    logits = fit_weights(moments_of(spectra, truth), scaled(mixture, jnp.asarray(distance)), prior, ridge)
+    logits = fit_weights(moments_of(spectra, truth), scaled_distance(mixture, jnp.asarray(distance)), prior, ridge)
     mixture = dataclasses.replace(mixture, members=logits)
     used = np.asarray(member_weights(mixture, jnp.asarray(distance)))[:, MEMBERS.index("line_of_sight")]
-    if used.max() < UNUSED:
+    unused = 0.02  # largest weight of the line of sight at which it is left out
+    if used.max() < unused:
         nothing = logits.at[MEMBERS.index("line_of_sight")].set(jnp.array([-30.0, 0.0]))
         mixture = dataclasses.replace(mixture, members=nothing, elements=mixture.elements[:0])
     return mixture
@@ -261,10 +249,12 @@ def left_out(dataset: Dataset, known: Known) -> tuple[Int[np.ndarray, " n"], Boo
     positions, tx = dataset.tx_positions[known.links], dataset.tx_index[known.links]
     places = {number: positions[tx == number][0] for number in np.unique(tx)}
     chosen, kept = [], []
+    # Fractions of the other transmitters, the nearest ones, that are left out together with a spectrum.
+    shares_left_out = (0.0, 0.12, 0.25, 0.5)
     for place in _in_turn(tx, rng):
         others = sorted(places.keys() - {tx[place]}, key=lambda own: float(np.linalg.norm(places[own] - positions[place])))
         same = np.isclose(dataset.frequencies_hz[known.links], dataset.frequencies_hz[known.links[place]], rtol=1e-4)
-        for count in sorted({int(share * len(others)) for share in SHARES_LEFT_OUT}):
+        for count in sorted({int(share * len(others)) for share in shares_left_out}):
             use = np.isin(tx, others[count:])
             if (use & same).any():
                 chosen.append(known.links[place])
@@ -346,8 +336,9 @@ _member_spectra = jax.jit(member_spectra)
 
 
 def _means(known: Known, kept: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n 90 360"]:
-    """Returns the means of N subsets of at most `AVERAGED` of the measured spectra."""
-    sample = np.random.default_rng(3).permutation(len(known.links))[:AVERAGED]
+    """Returns the means of N subsets of a limited number of the measured spectra."""
+    averaged = 512  # maximum number of measured spectra over which the mean is computed
+    sample = np.random.default_rng(3).permutation(len(known.links))[:averaged]
     pixels = known.images[sample].reshape(len(sample), -1).astype(np.float32) / 255
     means = kept[:, sample] @ pixels / np.maximum(kept[:, sample].sum(1), 1)[:, None].astype(np.float32)
     return means.reshape(len(kept), *known.images.shape[1:])
@@ -363,34 +354,38 @@ def choose_share(
 
     Args:
         scores: SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`).
-        u: scaled logarithm of the distance to the nearest measured transmitter.
+        u: scaled_distance logarithm of the distance to the nearest measured transmitter.
         group: groups of links with correlated errors.
         errors: distance of the bound below the mean gain, in standard errors.
     """
     bound = functools.partial(lower_bound, group=group, errors=errors)
     best, found = 0.0, (-30.0, 0.0)
-    for slope in SLOPES:
+    slopes = (0.0, -1.0, 1.0)  # slopes of the logit of the field's weight that are tried
+    least_gain = 0.005  # minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone
+    for slope in slopes:
         for middle in SHARES[1:]:
             bias = float(logit(np.clip(middle, 1e-4, 1 - 1e-4)))
             share = expit(bias + slope * u) if slope else np.full(len(u), middle)
             worth = bound(_at(scores, share) - scores[:, 0], share=float(share.mean()))
-            if worth > best + (WORTH if slope and not found[1] else 0):
+            if worth > best + (least_gain if slope and not found[1] else 0):
                 best, found = worth, (bias, slope)
     chosen = expit(found[0] + found[1] * u)
     alone = (
         bound(scores[:, -1] - scores[:, 0], share=1.0) > 0
-        and standard_error(_at(scores, chosen) - scores[:, -1], group)[0] < WORTH
+        and standard_error(_at(scores, chosen) - scores[:, -1], group)[0] < least_gain
     )
     return found, bool(alone)
 
 
 def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:
     """Returns the lower confidence bound of a mean gain over groups. Their variance combines the observed one with a prior that
-    counts as `USUAL_WEIGHT` groups, so that a few groups that happen to agree are little evidence."""
+    counts as two groups, so that a few groups that happen to agree are little evidence."""
     by_group = by_transmitter(gains, group)
     n = len(by_group)
-    usual = (USUAL_SPREAD * share) ** 2
-    variance = (USUAL_WEIGHT * usual + np.sum((by_group - by_group.mean()) ** 2)) / (USUAL_WEIGHT + n - 1)
+    # Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as.
+    usual_spread, usual_weight = 0.1, 2.0
+    usual = (usual_spread * share) ** 2
+    variance = (usual_weight * usual + np.sum((by_group - by_group.mean()) ** 2)) / (usual_weight + n - 1)
     return float(by_group.mean() - errors * np.sqrt(variance / n))
 
 

@@ -39,9 +39,8 @@ from wbgs_jax.training.calibration.pipeline import Calibration
 from wbgs_jax.training.density import DensityControl
 from wbgs_jax.training.expert_weights import ExpertWeights
 from wbgs_jax.training.hooks import Context, Edit, Hook, OfPart, Say, map_moments, silent
-from wbgs_jax.training.optim import make_optimizer
 from wbgs_jax.training.progress import Interrupted, TrainingProgress, deferred_interrupt
-from wbgs_jax.training.step import EpochReport, TrainState, init_state, run_epoch
+from wbgs_jax.training.step import EpochReport, TrainState, init_state, make_optimizer, run_epoch
 from wbgs_jax.types import Batch
 
 

@@ -8,9 +8,14 @@ There is one training per folder: two would overwrite each other's curves and ch
 
 import contextlib
 import dataclasses
+import math
 import os
+import platform
+import types
+import typing
 import warnings
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +26,9 @@ import wbgs_jax
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import left_by_killed, read_json, write_json
 from wbgs_jax._util.pytree import replaced
-from wbgs_jax._util.typed import misfit
 from wbgs_jax.config import check, from_dict, sections, to_dict
 from wbgs_jax.data.load import source_paths
+from wbgs_jax.evaluation.report import provenance
 from wbgs_jax.fields import field_names, get_field
 from wbgs_jax.fields.base import check_config, field_from_arrays
 from wbgs_jax.inference import intervals, kriging
@@ -31,8 +36,6 @@ from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import read_neighbours
 from wbgs_jax.inference.trained_field import RunConfig, TrainedField
 from wbgs_jax.training import EXAMPLE, checkpoint
-
-FIRST_PRESET = "cpu"
 
 MANIFEST = "manifest.json"
 """File that is written last, when a training is finished."""
@@ -68,7 +71,7 @@ def read_config(folder: Path) -> RunConfig:
     if values["field"] not in field_names():
         raise UserError(f"{path} names an unknown field {str(values['field'])[:40]!r}; correct it, or train again")
     kind = get_field(values["field"])
-    settings = from_dict(values.pop("settings"), kind.presets[FIRST_PRESET], kind.name)
+    settings = from_dict(values.pop("settings"), kind.presets["cpu"], kind.name)
     for section, part in sections(settings, kind.name).items():
         _demand_types(path, part, f"{section}.")
     check(settings)
@@ -79,8 +82,40 @@ def read_config(folder: Path) -> RunConfig:
 
 
 def _demand_types(path: Path, value: Any, prefix: str) -> None:
-    if wrong := misfit(value):
+    if wrong := _misfit(value):
         raise UserError(f"{path} is damaged ({prefix}{wrong}); correct it, or train again")
+
+
+def _misfit(value: Any) -> str:
+    """Returns the first field of a dataclass whose value does not have the declared type, as "NAME is VALUE"; empty if all do.
+    Fields that are dataclasses or of any type are not checked; numbers must be finite."""
+    hints = typing.get_type_hints(type(value))
+    for field in dataclasses.fields(value):
+        content = getattr(value, field.name)
+        if not _fits(content, hints[field.name]):
+            return f"{field.name} is {repr(content)[:60]}"
+    return ""
+
+
+def _fits(value: Any, declared: Any) -> bool:
+    """Returns whether a value has a declared type: plain types, tuples, literals, and unions of these."""
+    origin, arguments = typing.get_origin(declared), typing.get_args(declared)
+    if declared is Any or dataclasses.is_dataclass(declared):
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is typing.Literal:
+        return value in arguments
+    if origin is tuple:
+        inner = arguments[:1] * len(value) if isinstance(value, tuple) and arguments[-1] is Ellipsis else arguments
+        return isinstance(value, tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+    if declared is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300 and math.isfinite(value)
+    if declared is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+    if declared is type(None):
+        return value is None
+    return isinstance(value, declared) if isinstance(declared, type) else True
 
 
 def prepare_folder(folder: Path, config: RunConfig, resume: bool) -> None:
@@ -186,3 +221,53 @@ def locked(folder: Path) -> Iterator[None]:
         stream.flush()
         yield
     (folder / FILE).unlink(missing_ok=True)
+
+
+def write_manifest(folder: Path, trained: TrainedField, report: dict[str, Any] | None = None) -> None:
+    """Writes or updates the manifest of a run folder: a summary of data, model, training, versions, device and scores.
+
+    Args:
+        folder: run folder.
+        trained: its field.
+        report: result of an evaluation (`evaluation.score.evaluate`) whose scores are added; earlier scores are kept unless the
+            run has been trained further since.
+    """
+    path = folder / MANIFEST
+    known: dict[str, Any] = {}
+    if path.exists():
+        before = read_json(path)
+        with contextlib.suppress(AttributeError, TypeError, ValueError):  # a file that is not a manifest has no scores
+            known = dict(before.get("scores", {})) if before.get("training", {}).get("steps") == trained.step else {}
+    config, origin = trained.config, provenance(trained)
+    scores = known | ({} if report is None else {report["part"]: _figures(report)})
+    write_json(
+        path,
+        {
+            "format": 1,
+            "data": {"source": config.source, "sha256": trained.data},
+            "model": {"field": config.field, "preset": config.preset, **trained.field.inspect(trained.params).sizes},
+            "training": {
+                "command": origin["command"],
+                "seed": config.seed,
+                "steps": trained.step,
+                "seconds": round(trained.seconds, 1),
+                "settings": origin["settings"],
+            },
+            "versions": {"wbgs_jax": origin["version"], "commit": origin["commit"], "python": platform.python_version()}
+            | {name: _version(name) for name in ("jax", "jaxlib", "numpy", "flax", "optax")},
+            "device": origin["device"],
+            "scores": scores,
+        },
+    )
+
+
+def _figures(report: dict[str, Any]) -> dict[str, Any]:
+    """Returns the scalar entries of a report."""
+    return {name: value for name, value in report.items() if isinstance(value, int | float) and not isinstance(value, bool)}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

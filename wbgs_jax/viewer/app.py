@@ -23,15 +23,6 @@ from wbgs_jax.viewer.page import Page, as_words
 from wbgs_jax.viewer.session import Answer, Session
 from wbgs_jax.viewer.surroundings import FIELD_OF_VIEW, SceneView
 
-STEPS_A_SECOND = 20
-"""Animation steps of a walk, per second."""
-WIDE = 1.2
-"""Aspect of a picture whose browser is not known."""
-SLOW_S = 0.7
-"""Seconds after which a prediction counts as slow."""
-PANEL_PX = 388
-"""Width of the panel, pixels."""
-
 
 class Latest:
     """Runs work in a separate thread for the newest request; older requests that are still waiting are dropped."""
@@ -188,7 +179,8 @@ class Viewer:
     def _look_in(self) -> None:
         """Shows the room to browsers that are, or will be, connected."""
         initial = self.server.initial_camera
-        initial.position, initial.look_at = (tuple(place) for place in self.view.camera(WIDE))
+        wide = 1.2  # aspect of a picture whose browser is not known
+        initial.position, initial.look_at = (tuple(place) for place in self.view.camera(wide))
         initial.fov = FIELD_OF_VIEW
         self.server.on_client_connect(self._aim)
         for client in self.server.get_clients().values():
@@ -197,7 +189,8 @@ class Viewer:
     def _aim(self, client: viser.ClientHandle) -> None:
         """Shows the room to a browser, whose picture loses the width of the panel if it is wide."""
         width, height = client.camera.image_width, client.camera.image_height
-        aspect = width / height if width < height else max(width - PANEL_PX, height) / height
+        panel_px = 388  # width of the panel, pixels
+        aspect = width / height if width < height else max(width - panel_px, height) / height
         client.camera.position, client.camera.look_at = self.view.camera(aspect)
 
     def _connect(self) -> None:
@@ -287,7 +280,8 @@ class Viewer:
     def _notice(self) -> Iterator[None]:
         """Shows a line if a prediction takes long, since the field is compiled for it."""
         line = as_words("The field is being compiled for this query ...")
-        timer = threading.Timer(SLOW_S, lambda: setattr(self.display.summary, "content", line))
+        slow_s = 0.7  # seconds after which a prediction counts as slow
+        timer = threading.Timer(slow_s, lambda: setattr(self.display.summary, "content", line))
         timer.start()
         try:
             yield
@@ -421,8 +415,9 @@ class Viewer:
             client.send_file_download(self.html.name, self.server.scene.as_html().encode(), save_immediately=True)
 
     def _walk(self) -> None:
+        steps_a_second = 20  # animation steps of a walk, per second
         while not self._ended:
-            time.sleep(1 / STEPS_A_SECOND)
+            time.sleep(1 / steps_a_second)
             if self.controls.play.value:
-                self._walked += float(self.controls.speed.value) / STEPS_A_SECOND
+                self._walked += float(self.controls.speed.value) / steps_a_second
                 self.move(walk.place_on(self._way, self._walked))

@@ -11,21 +11,11 @@ from wbgs_jax.radio.array import pas_directions
 
 COLORS, GAUSSIAN_COLORS = "viridis", "inferno"
 """Colormaps of spectra and maps, and of Gaussians."""
-DOME_STRIDE = 4
-"""Stride of the directions that are drawn at the receiver, along both axes."""
 PATH_RANGE_DB = 40.0
-"""Range of the colours of paths below the strongest one; weaker paths fade ..."""
-FADED_DB, FADED = 20.0, 0.85
-"""... over this range to this share of the background."""
-BACKGROUND = np.array([255, 255, 255], np.uint8)
+"""Range of the colours of paths below the strongest one; weaker paths fade."""
 BY_BOUNCES = np.array([[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167]], np.uint8)
 """Colours of paths with 0, 1, 2 and 3 reflections or diffractions (Okabe and Ito; distinguishable by the colour-blind)."""
 BOUNCE_WORDS = "none", "one", "two", "three"
-MATERIAL_COLORS = "tab20"
-MAP_MARGIN = 0.01
-"""Fraction of the values at either end that lie beyond the colours of a map."""
-OPAQUE, DIM = 230, 70
-"""Opacity of a map, and of an outdated one, of 255."""
 
 
 def colored(values: Float[np.ndarray, "*n"], low: float, high: float, name: str = COLORS) -> UInt8[np.ndarray, "*n 3"]:
@@ -45,8 +35,9 @@ def dome(
 ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
     """Returns points around the receiver (offsets in the world frame, metres), whose distance and brightness grow with the
     amplitude from their direction, and their colours. `rotation` rotates the local frame into the world frame."""
-    amplitude = pas[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1)
-    directions = pas_directions()[::DOME_STRIDE, ::DOME_STRIDE].reshape(-1, 3) @ rotation.T
+    dome_stride = 4  # stride of the directions that are drawn at the receiver, along both axes
+    amplitude = pas[::dome_stride, ::dome_stride].reshape(-1)
+    directions = pas_directions()[::dome_stride, ::dome_stride].reshape(-1, 3) @ rotation.T
     return (radius * (0.35 + 0.65 * amplitude))[:, None] * directions, colored(amplitude, 0.0, 1.0)
 
 
@@ -63,8 +54,9 @@ def path_colors(power_db: Float[np.ndarray, " k"], bounce: Int[np.ndarray, " k"]
         colors = colored(power_db, top - PATH_RANGE_DB, top + PATH_RANGE_DB / 5, "plasma")  # its last colours are pale
     else:
         colors = BY_BOUNCES[np.minimum(bounce, len(BY_BOUNCES) - 1)]
-    faded = FADED * np.clip((top - PATH_RANGE_DB - power_db) / FADED_DB, 0, 1)[:, None]
-    return ((1 - faded) * colors + faded * BACKGROUND).round().astype(np.uint8)
+    over_db, faintest = 20.0, 0.85  # weaker paths fade over this range to this share of the background
+    faded = faintest * np.clip((top - PATH_RANGE_DB - power_db) / over_db, 0, 1)[:, None]
+    return ((1 - faded) * colors + faded * 255).round().astype(np.uint8)
 
 
 def linear(colors: UInt8[np.ndarray, "*n 3"]) -> UInt8[np.ndarray, "*n 3"]:
@@ -89,7 +81,8 @@ def path_handles(points: Float[np.ndarray, "k 5 3"]) -> Float[np.ndarray, "k 3"]
 def map_range(values: Float[np.ndarray, "ny nx"]) -> tuple[float, float]:
     """Returns the values of the first and the last colour of a map (NaN where nothing is received)."""
     known = values[np.isfinite(values)]
-    low, high = np.quantile(known, [MAP_MARGIN, 1 - MAP_MARGIN]) if len(known) else (-100.0, 0.0)
+    map_margin = 0.01  # fraction of the values at either end that lie beyond the colours of a map
+    low, high = np.quantile(known, [map_margin, 1 - map_margin]) if len(known) else (-100.0, 0.0)
     return float(low), float(high)
 
 
@@ -97,12 +90,13 @@ def map_picture(values: Float[np.ndarray, "ny nx"], low: float, high: float, dim
     """Returns a map as an image, with the largest y at the top, transparent where the values are NaN. `low` and `high` are the
     values of the first and the last colour; `dim` shows it as an outdated one."""
     known = np.isfinite(values)
-    opacity = (DIM if dim else OPAQUE) * known[..., None].astype(np.uint8)
+    opaque, outdated = 230, 70  # opacity of a map, and of an outdated one, of 255
+    opacity = (outdated if dim else opaque) * known[..., None].astype(np.uint8)
     picture = np.concatenate([colored(np.where(known, values, low), low, high), opacity], -1)
     return np.ascontiguousarray(picture[::-1])
 
 
 def material_color(number: int) -> tuple[int, int, int]:
     """Returns the colour of a material's surfaces."""
-    red, green, blue = (int(255 * part) for part in colormaps[MATERIAL_COLORS](number % 20)[:3])
+    red, green, blue = (int(255 * part) for part in colormaps["tab20"](number % 20)[:3])
     return red, green, blue

@@ -20,15 +20,9 @@ from wbgs_jax.viewer.drawing import BOUNCE_WORDS, BY_BOUNCES, COLORS, color_tabl
 WIDTH = 350.0
 LEFT, RIGHT, TOP, BOTTOM = 40.0, 52.0, 15.0, 27.0
 """Margins of axes: labels at the left, a colour bar at the right, the value under the pointer at the top, labels below."""
-SPECTRUM_HEIGHT, CURVE_HEIGHT, MAP_HEIGHT = 76.0, 84.0, 168.0
-"""Heights of the axes; that of a map is the largest that its shape can have."""
+CURVE_HEIGHT = 84.0
 KNOTS = 33
 """Colours of a filter, between which the browser interpolates."""
-TICKS = 4
-"""Approximate number of ticks of an axis."""
-STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-LEVELS = 255
-"""Grey levels of an image."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +42,13 @@ class Axis:
         return (np.asarray(value, float) - self.low) / (self.high - self.low)
 
 
-def axis_over(low: float, high: float, label: str, count: int = TICKS) -> Axis:
+def axis_over(low: float, high: float, label: str, count: int = 4) -> Axis:
     """Returns an axis from `low` to `high` with about `count` round ticks."""
     high = high if high > low else low + 1.0
     rough = (high - low) / count
     power = 10 ** np.floor(np.log10(rough))
-    step = power * next(s for s in STEPS if s * power >= rough * (1 - 1e-9))
+    steps = (1.0, 2.0, 2.5, 5.0, 10.0)
+    step = power * next(s for s in steps if s * power >= rough * (1 - 1e-9))
     ticks = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1)
     return Axis(low, high, label, tuple((ticks + 0.0).tolist()))  # -0 becomes 0
 
@@ -66,7 +61,7 @@ AMPLITUDE = Axis(0.0, 1.0, "amplitude", (0.0, 0.5, 1.0))
 def spectrum(pas: Float[np.ndarray, "90 360"], name: str) -> str:
     """Returns a figure of a spectrum: azimuth to the right, zenith 0 at the top, amplitude relative to the maximum as colour.
     `name` distinguishes the figures of a page."""
-    box = LEFT, TOP, WIDTH - LEFT - RIGHT, SPECTRUM_HEIGHT
+    box = LEFT, TOP, WIDTH - LEFT - RIGHT, 76.0
     read = "azimuth {x}°, zenith {y}°: amplitude {v}"
     return _figure(
         [_image(pas, box, AMPLITUDE, name), _axes(box, AZIMUTH, ZENITH), _color_bar(box, AMPLITUDE, name)],
@@ -94,8 +89,8 @@ def power_map(
         marks: places (x, y) that are marked by their first letter, by name.
         dim: whether the map is shown as an outdated one.
     """
-    wide = WIDTH - LEFT - RIGHT
-    per_metre = min(wide / (x.high - x.low), MAP_HEIGHT / (y.high - y.low))
+    wide, highest = WIDTH - LEFT - RIGHT, 168.0
+    per_metre = min(wide / (x.high - x.low), highest / (y.high - y.low))
     box = LEFT, TOP, per_metre * (x.high - x.low), per_metre * (y.high - y.low)
     lines = "".join(
         f'<line x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}"/>'
@@ -217,12 +212,13 @@ def _place(points: Float[np.ndarray, "n 2"], box: tuple[float, ...], x: Axis, y:
 def _image(values: Float[np.ndarray, "h w"], box: tuple[float, ...], axis: Axis, name: str) -> str:
     """Returns an image of values, the first row at the top, transparent where they are NaN, with its filter of colours."""
     known = np.isfinite(values)
-    grey = (LEVELS * np.clip(axis.share(np.where(known, values, axis.low)), 0, 1)).round().astype(np.uint8)
+    levels = 255  # grey levels of an image
+    grey = (levels * np.clip(axis.share(np.where(known, values, axis.low)), 0, 1)).round().astype(np.uint8)
     stream = io.BytesIO()
     if known.all():
         picture = Image.fromarray(grey)
     else:
-        picture = Image.fromarray(np.stack([grey, LEVELS * known.astype(np.uint8)], -1), "LA")
+        picture = Image.fromarray(np.stack([grey, levels * known.astype(np.uint8)], -1), "LA")
     picture.save(stream, "png", compress_level=1)
     table = color_table(COLORS)[np.linspace(0, 255, KNOTS).astype(int)]
     channels = "".join(

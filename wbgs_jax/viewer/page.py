@@ -11,7 +11,6 @@ from typing import Any
 
 import viser
 
-TITLE = "wbgs-jax"
 STOPPED = (
     "The server has stopped or cannot be reached. This is the last picture that it sent. Start it again (wbgs-jax view); the "
     "page then continues by itself."
@@ -23,7 +22,7 @@ class Page:
 
     def __init__(self, host: str = "localhost", port: int = 8080):
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table; the command prints one line instead
-            self.server = viser.ViserServer(host=host, port=port, label=TITLE, verbose=False)
+            self.server = viser.ViserServer(host=host, port=port, label="wbgs-jax", verbose=False)
         gui = self.server.gui
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         if hasattr(gui, "main_panel"):  # viser 1.1; before it the panel floats over the picture

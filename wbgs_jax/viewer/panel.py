@@ -15,20 +15,10 @@ from wbgs_jax.viewer import drawing, figures
 from wbgs_jax.viewer.page import as_words
 from wbgs_jax.viewer.session import Answer, LinkBudget, PathList, Sample, Session
 
-MOST_PATHS = 200
 SHOWN_PATHS = 30
 """Number of paths that are drawn at first."""
-PERMITTIVITY, LOG_CONDUCTIVITY = (1.01, 12.0), (-6.0, 7.0)
-"""Ranges of the sliders; the conductivity as log10 of S/m."""
-THICKNESS_MM = (0.5, 500.0)
 LABEL_ROOM = 0.14
 """Minimum distance of two marks of the frequency slider that are labelled, relative to its range."""
-TRANSMITTER_DBM, NOISE_DBM = 20.0, -87.0
-"""Initial link budget; the noise is the thermal one of 100 MHz with a noise figure of 7 dB."""
-BAND_MHZ, POINTS = 100.0, 201
-"""Initial bandwidth of the frequency response, and its number of frequencies."""
-DYNAMIC_DB = 40.0
-"""Range of the axes of powers below the strongest value."""
 MOVED = "moved"
 
 
@@ -117,25 +107,28 @@ def make_panel(
     first = float(known[len(known) // 2])
     ghz = gui.add_slider("GHz", low, high, step=0.01, initial_value=first, marks=marks_at(known, low, high))
     tabs = gui.add_tab_group()
-    most = MOST_PATHS if session.has_paths else 0
+    most_paths = 200
+    most = most_paths if session.has_paths else 0
     with tabs.add_tab("Truth"):
         truth = gui.add_html("")
         samples = gui.add_checkbox("all transmitters", False, hint="Show the places of all transmitters of the data.")
+    # Initial link budget; the noise is the thermal one of 100 MHz with a noise figure of 7 dB.
+    transmitter_dbm, noise_dbm = 20.0, -87.0
     with tabs.add_tab("Channel"):
         off = not session.has_power
         dbm = gui.add_vector2(
             "TX, noise [dBm]",
-            (TRANSMITTER_DBM, NOISE_DBM),
+            (transmitter_dbm, noise_dbm),
             step=1.0,
             disabled=off,
             hint="Transmitted power, and noise floor of the receiver",
         )
-        band = gui.add_number("band [MHz]", BAND_MHZ, min=1.0, max=2000.0, step=10.0, disabled=not most)
-        channel = gui.add_html("" if most else as_words("This field does not predict paths."))
+        band = gui.add_number("band [MHz]", 100.0, min=1.0, max=2000.0, step=10.0, disabled=not most)
+        channel = gui.add_html("" if most else _without_paths(None))
     with tabs.add_tab("Paths"):
-        paths = gui.add_slider("strongest", 0, MOST_PATHS, step=1, initial_value=min(SHOWN_PATHS, most), disabled=not most)
+        paths = gui.add_slider("strongest", 0, most_paths, step=1, initial_value=min(SHOWN_PATHS, most), disabled=not most)
         by_power = gui.add_dropdown("color", ("by power", "by reflections"), disabled=not most)
-        path_table = gui.add_html("" if most else as_words("This field does not predict paths."))
+        path_table = gui.add_html("" if most else _without_paths(None))
     with tabs.add_tab("Map"):
         map_controls = _map_controls(gui, session)
     with tabs.add_tab("Room"):
@@ -191,14 +184,16 @@ def _material_controls(gui: viser.GuiApi, session: Session) -> MaterialControls 
         gui.add_html(as_words("This field has no materials."))
         return None
     names, properties = found
-    epsilon = round(float(np.clip(properties.permittivity[0], *PERMITTIVITY)), 2)
-    log_sigma = round(float(np.clip(np.log10(properties.conductivity[0]), *LOG_CONDUCTIVITY)), 2)
-    millimetres = float(np.clip(1e3 * properties.thickness[0], *THICKNESS_MM))
+    permittivity, log_conductivity = (1.01, 12.0), (-6.0, 7.0)  # ranges of the sliders; the conductivity as log10 of S/m
+    epsilon = round(float(np.clip(properties.permittivity[0], *permittivity)), 2)
+    log_sigma = round(float(np.clip(np.log10(properties.conductivity[0]), *log_conductivity)), 2)
+    thickness_mm = (0.5, 500.0)
+    millimetres = float(np.clip(1e3 * properties.thickness[0], *thickness_mm))
     return MaterialControls(
         gui.add_dropdown("material", tuple(f"{number}: {name}" for number, name in enumerate(names))),
-        gui.add_slider("permittivity", *PERMITTIVITY, step=0.01, initial_value=epsilon, hint="Relative, at 1 GHz"),
-        gui.add_slider("log10 S/m", *LOG_CONDUCTIVITY, step=0.01, initial_value=log_sigma, hint="Conductivity at 1 GHz"),
-        gui.add_slider("thickness [mm]", *THICKNESS_MM, step=0.5, initial_value=round(2 * millimetres) / 2),
+        gui.add_slider("permittivity", *permittivity, step=0.01, initial_value=epsilon, hint="Relative, at 1 GHz"),
+        gui.add_slider("log10 S/m", *log_conductivity, step=0.01, initial_value=log_sigma, hint="Conductivity at 1 GHz"),
+        gui.add_slider("thickness [mm]", *thickness_mm, step=0.5, initial_value=round(2 * millimetres) / 2),
         gui.add_button("as trained"),
     )
 
@@ -257,24 +252,30 @@ def truth_figure(sample: Sample | None) -> str:
     return figure("Spectrum at the receiver, observed", drawn + f'<div class="wbgs-words">{below}</div>')
 
 
+def _without_paths(paths: PathList | None) -> str:
+    """Returns why there are no paths to show."""
+    return as_words(
+        "This field does not predict paths." if paths is None else "No path carries power from here to the receiver."
+    )
+
+
 def channel_figures(paths: PathList | None, budget: LinkBudget, band_mhz: float) -> str:
     """Returns the frequency response of the link over a band around the carrier, and its impulse response."""
-    if paths is None:
-        return as_words("This field does not predict paths.")
-    if not len(paths.power_db):
-        return as_words("No path carries power from here to the receiver.")
-    offsets = np.linspace(-band_mhz / 2, band_mhz / 2, POINTS)
+    if paths is None or not len(paths.power_db):
+        return _without_paths(paths)
+    offsets = np.linspace(-band_mhz / 2, band_mhz / 2, 201)
     response = budget.received_dbm(paths.frequency_response_db(1e6 * offsets))
     x = figures.axis_over(-band_mhz / 2, band_mhz / 2, "offset from the carrier [MHz]")
     high = float(np.ceil(response.max() / 5) * 5)
-    low = float(np.floor(max(response.min(), high - DYNAMIC_DB) / 5) * 5)
+    dynamic_db = 40.0  # range of the axes of powers below the strongest value
+    low = float(np.floor(max(response.min(), high - dynamic_db) / 5) * 5)
     y = figures.axis_over(low, high, "power [dBm]", 3)
     frequency = figure("Frequency response", figures.curve(offsets, response, x, y))
     power, delay = budget.received_dbm(paths.power_db), paths.delay_ns
-    strong = power > power[0] - DYNAMIC_DB
+    strong = power > power[0] - dynamic_db
     x = figures.axis_over(0.0, float(np.ceil(1.05 * delay[strong].max() / 5) * 5), "delay [ns]")
     high = float(np.ceil((power[0] + 1) / 5) * 5)
-    y = figures.axis_over(high - DYNAMIC_DB - 5, high, "power [dBm]", 3)
+    y = figures.axis_over(high - dynamic_db - 5, high, "power [dBm]", 3)
     described = tuple(word for word, kept in zip(paths.words, strong, strict=True) if kept)
     return frequency + figure("Impulse response", figures.stems(delay[strong], power[strong], described, x, y))
 
@@ -288,10 +289,8 @@ def gaussian_legend(top: float, by: str) -> str:
 
 def path_list(paths: PathList | None, count: int, chosen: int | None, budget: LinkBudget, by_power: bool) -> str:
     """Returns the legend of the drawn paths and their table; `chosen` is the number of the path that is marked."""
-    if paths is None:
-        return as_words("This field does not predict paths.")
-    if not len(paths.power_db):
-        return as_words("No path carries power from here to the receiver.")
+    if paths is None or not len(paths.power_db):
+        return _without_paths(paths)
     power = budget.received_dbm(paths.power_db)
     legend = figures.bounce_legend()
     if by_power:

@@ -16,33 +16,10 @@ from wbgs_jax.types import Receiver
 from wbgs_jax.viewer import drawing
 from wbgs_jax.viewer.session import PathList
 
-CEILING_CUT = 0.02
-"""Fraction of the room's height that is initially cut off at the top, so that the interior is visible."""
-DOME_RADIUS = 0.4
-"""Radius of the spectrum around the receiver, relative to the shortest side of the room."""
-DOME_POINT = 0.045
-"""Size of a point of the spectrum, relative to that radius."""
-HANDLE_RADIUS = 0.04
-"""Radius of the clickable balls on paths, metres."""
-CHOSEN = np.array([[214, 39, 40]], np.uint8)
-"""Colour of the chosen path."""
 VALID, INVALID = (31, 97, 180), (214, 39, 40)
 """Colours of the transmitter where an antenna can stand and the field was trained, and elsewhere."""
-HANDLE_SHARE = 0.06
-"""Size of the arrows of transmitter and receiver, relative to that of the room."""
-AMBIENT = 2.0
-"""Intensity of the light from all sides."""
-BALL_M = 0.1
-ASIDE = (-0.08, -0.45, 0.6)
-"""Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes."""
 FIELD_OF_VIEW = float(np.radians(60))
 """Vertical, of the camera."""
-WIDE_WINDOW, TALL_WINDOW = (0.0, 0.0, 0.88, 0.88), (0.0, 0.52, 0.9, 0.4)
-"""Parts of the picture in which the room is seen: middle and half size, relative to half of the picture. On a tall screen the
-panel covers the lower half."""
-MOST_GAUSSIANS = 20_000
-SPHERE = 8
-"""Number of corners around a ball."""
 
 
 class SceneView:
@@ -58,7 +35,8 @@ class SceneView:
         # Shadows and reflections of the surroundings take four fifths of the time of a picture without a graphics card.
         self.scene.configure_default_lights(cast_shadow=False)
         self.scene.configure_environment_map(hdri=None)
-        self.scene.add_light_ambient("/light", intensity=AMBIENT)
+        ambient = 2.0  # intensity of the light from all sides
+        self.scene.add_light_ambient("/light", intensity=ambient)
         self._centroids = dataset.vertices[dataset.faces].mean(1) if len(dataset.faces) else np.zeros((0, 3))
         self._draw_fixed()
         self.receiver_frame = self.scene.add_frame("/receiver", axes_length=0.3, axes_radius=0.012)
@@ -69,19 +47,21 @@ class SceneView:
         self.transmitter = self.scene.add_transform_controls(
             "/transmitter", self.handle_size, disable_rotations=True, position=tuple(start)
         )
-        self._ball = self.scene.add_icosphere("/transmitter/ball", BALL_M, VALID)
+        self._ball = self.scene.add_icosphere("/transmitter/ball", 0.1, VALID)
         self.scene.add_label("/transmitter/name", "transmitter", position=(0, 0, 0.15))
         self.clip(*self.heights())
 
     @property
     def handle_size(self) -> float:
         """Length of the arrows of transmitter and receiver, metres."""
-        return HANDLE_SHARE * self.size
+        handle_share = 0.06  # size of the arrows of transmitter and receiver, relative to that of the room
+        return handle_share * self.size
 
     @property
     def dome_radius(self) -> float:
         """Largest distance of the drawn spectrum from the receiver, metres."""
-        return DOME_RADIUS * float(np.ptp(self.box, axis=0).min())
+        share = 0.4  # radius of the spectrum around the receiver, relative to the shortest side of the room
+        return share * float(np.ptp(self.box, axis=0).min())
 
     def show_receiver(self, receiver: Receiver) -> None:
         """Shows the receiver at its place."""
@@ -110,14 +90,21 @@ class SceneView:
             turned = int(np.ptp(self.box, axis=0)[flat].argmax()) == 0
         else:
             turned = False
-        aside = np.array([ASIDE[1], ASIDE[0], ASIDE[2]] if turned else ASIDE)
+        # Direction from the middle of the room to the camera, for z upwards; the second horizontal axis recedes.
+        from_middle = (-0.08, -0.45, 0.6)
+        aside = np.array([from_middle[1], from_middle[0], from_middle[2]] if turned else from_middle)
         direction = np.roll(aside, self.up - 2)
-        return camera_of(self.box, direction, np.eye(3)[self.up], aspect, TALL_WINDOW if aspect < 1 else WIDE_WINDOW)
+        # Parts of the picture in which the room is seen: middle and half size, relative to half of the picture. On a tall
+        # screen the panel covers the lower half.
+        wide_window, tall_window = (0.0, 0.0, 0.88, 0.88), (0.0, 0.52, 0.9, 0.4)
+        return camera_of(self.box, direction, np.eye(3)[self.up], aspect, tall_window if aspect < 1 else wide_window)
 
     def heights(self) -> tuple[float, float]:
         """Returns the initial range of drawn heights, which excludes the ceiling."""
         low, high = self.box[:, self.up]
-        return float(low), float(high - CEILING_CUT * (high - low))
+        # Fraction of the room's height that is initially cut off at the top, so that the interior is visible.
+        ceiling_cut = 0.02
+        return float(low), float(high - ceiling_cut * (high - low))
 
     def _draw_fixed(self) -> None:
         low, high = self.box
@@ -163,9 +150,10 @@ class SceneView:
         radius = self.dome_radius
         points, colors = drawing.dome(pas, self._rotation, radius)
         places = (points + self.rx).astype(np.float32)
+        dome_point = 0.045  # size of a point of the spectrum, relative to that radius
         if self._dome is None:
             self._dome = self.scene.add_point_cloud(
-                "/dome", places, colors, point_size=DOME_POINT * radius, point_shape="circle"
+                "/dome", places, colors, point_size=dome_point * radius, point_shape="circle"
             )
         else:  # changing the points is faster than drawing new ones
             self._dome.points, self._dome.colors = places, colors
@@ -183,7 +171,7 @@ class SceneView:
         self._draw_lines("/paths", points, colors, 2.0)
         self._draw_handles(drawing.path_handles(points), colors, on_click)
         if chosen is not None and chosen < len(points):
-            self._draw_lines("/chosen_path", points[chosen : chosen + 1], CHOSEN, 5.0)
+            self._draw_lines("/chosen_path", points[chosen : chosen + 1], np.array([[214, 39, 40]], np.uint8), 5.0)
         else:
             self.scene.remove_by_name("/chosen_path")
 
@@ -196,7 +184,8 @@ class SceneView:
     def _draw_handles(
         self, places: Float[np.ndarray, "k 3"], colors: UInt8[np.ndarray, "k 3"], on_click: Callable[[int], None]
     ) -> None:
-        vertices, faces = _ball(HANDLE_RADIUS)
+        handle_radius = 0.04  # radius of the clickable balls on paths, metres
+        vertices, faces = _ball(handle_radius)
         upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(places), 1))
         handle = self.scene.add_batched_meshes_simple(
             "/path_handles",
@@ -222,7 +211,7 @@ class SceneView:
             self.scene.remove_by_name("/gaussians")
             return 0.0
         gaussians = splatted.gaussians
-        alive = np.flatnonzero(np.asarray(gaussians.alive))[:MOST_GAUSSIANS]
+        alive = np.flatnonzero(np.asarray(gaussians.alive))[:20_000]
         attenuation, signal = (np.asarray(values)[alive, 0] for values in (splatted.attenuation, splatted.signal))
         shown = signal if by == "signal" else attenuation
         top = max(float(np.quantile(shown, 0.99)), 1e-6)
@@ -314,7 +303,8 @@ def camera_of(
 
 def _ball(radius: float) -> tuple[Float[np.ndarray, "v 3"], np.ndarray]:
     """Returns the vertices and faces of a ball with few triangles."""
-    zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, SPHERE // 2 + 1), np.linspace(0, 2 * np.pi, SPHERE + 1), indexing="ij")
+    sphere = 8  # number of corners around a ball
+    zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, sphere // 2 + 1), np.linspace(0, 2 * np.pi, sphere + 1), indexing="ij")
     vertices = radius * np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
     index = np.arange(zenith.size).reshape(zenith.shape)
     a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))

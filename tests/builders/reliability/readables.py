@@ -26,8 +26,8 @@ from wbgs_jax.data import load_dataset, save_scene
 from wbgs_jax.data.antenna_file import read_antenna
 from wbgs_jax.data.floor_plan import load_walls
 from wbgs_jax.data.image_folder import export_layout
-from wbgs_jax.data.room_file import Room, load_room, save_room
 from wbgs_jax.data.rssi_folder import cell_means, load_readings
+from wbgs_jax.data.scene_file import Room, load_room, save_room
 from wbgs_jax.inference.export import export_field, load_exported
 from wbgs_jax.inference.intervals import read_confidence, read_power_confidence
 from wbgs_jax.inference.kriging import read_neighbours
@@ -41,8 +41,7 @@ from wbgs_jax.interchange.sionna_arrays import scene_of_sionna
 from wbgs_jax.mesh.ply import read_ply, write_ply
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, planar_array
 from wbgs_jax.training import curves
-from wbgs_jax.training.manifest import write_manifest
-from wbgs_jax.training.run_folder import load_trained, read_config
+from wbgs_jax.training.run_folder import load_trained, read_config, write_manifest
 from wbgs_jax.types import Gaussians
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wbgs_jax._util.per_platform import per_platform
+from wbgs_jax.splat.per_platform import per_platform
 
 
 def same_shape(trees, *_):
