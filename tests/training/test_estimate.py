@@ -21,7 +21,14 @@ def test_the_probe_takes_a_moment():
 
 
 @pytest.mark.parametrize(
-    ("seconds", "words"), [(3.0, "about a minute"), (700.0, "about 12 minutes"), (14400.0, "about 4.0 hours")]
+    ("seconds", "words"),
+    [
+        (3.0, "about 10 seconds"),
+        (97.0, "about 100 seconds"),
+        (200.0, "about 3.5 minutes"),
+        (700.0, "about 12 minutes"),
+        (14400.0, "about 4.0 hours"),
+    ],
 )
 def test_words(seconds, words):
     assert duration_words(seconds) == words

@@ -116,10 +116,12 @@ def expected_seconds(field: type[Field], preset: str, share: float = 1.0) -> flo
 
 def duration_words(seconds: float) -> str:
     """Returns a duration in words, such as "about 12 minutes"."""
-    if seconds < 90:
-        return "about a minute"
     minutes = seconds / 60
-    return f"about {minutes:.0f} minutes" if minutes < 90 else f"about {minutes / 60:.1f} hours"
+    if minutes < 2:
+        return f"about {max(10 * round(seconds / 10), 10)} seconds"
+    if minutes < 90:
+        return f"about {round(2 * minutes) / 2 if minutes < 5 else round(minutes):g} minutes"
+    return f"about {minutes / 60:.1f} hours"
 
 
 def _probe() -> float:
