@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float, Int, Num
 
 from wbgs_jax._util.arrays import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
@@ -61,7 +61,11 @@ def without_asked(neighbours: Beside, query: Query) -> Beside:
     if neighbours is None:
         return None
     near = nearness(neighbours.tx_position, neighbours.frequency_hz, query.tx_position, query.frequency_hz, SAME_PLACE_M)
-    kept = np.flatnonzero(np.asarray(near).max(1, initial=0) < np.exp(-1))
+    return some_of(neighbours, np.flatnonzero(np.asarray(near).max(1, initial=0) < np.exp(-1)))
+
+
+def some_of(neighbours: Neighbours | Mixture, kept: Int[np.ndarray, " k"]) -> Beside:
+    """Returns some of the measurements, given by their indices (host); None if none remain."""
     if not len(kept):
         return None
     taken = {name: getattr(neighbours, name)[kept] for name in ("tx_position", "frequency_hz", "images")}
