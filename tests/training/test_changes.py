@@ -46,7 +46,7 @@ def run(tmp_path_factory):
 
 def evidence(rng, n_new, shift=0.0, objects=5, n_old=40):
     """Scores of which those of new transmitters are shifted."""
-    group = np.repeat([Group.CONTROL, Group.VALIDATION, Group.NEW], [20, n_old, n_new])
+    group = np.repeat([Group.OLD, Group.NEW], [n_old, n_new])
     new = group == Group.NEW
     gains = rng.standard_t(4, (objects, len(group))) - 1 + shift * new * (np.arange(objects) == 2)[:, None]
     score, power = rng.standard_t(3, len(group)) + shift * new, rng.normal(size=len(group))

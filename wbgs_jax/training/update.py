@@ -41,12 +41,12 @@ from wbgs_jax.training.calibration.changes import (
     Group,
     Notice,
     box_of,
-    common_gain_db,
     find_changes,
     gather,
     limit_of,
     notice,
     objects_of,
+    power_change_db,
 )
 from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.hooks import Say, silent
@@ -56,7 +56,9 @@ from wbgs_jax.training.step import TrainState
 from wbgs_jax.types import Receiver
 
 FEWEST_TX = 5
-"""Minimum number of new transmitters, and of those of the validation part."""
+"""Minimum number of new transmitters, and of old ones."""
+LEAST_GAIN_DB = 0.5
+"""Smallest change of a common gain that is corrected."""
 AFFECTED = 0.02
 """Change of a predicted spectrum, one minus its SSIM with the earlier prediction, from which on a place is affected."""
 MOST_TX = 256
@@ -88,7 +90,7 @@ class Update:
 
 
 class Joined(NamedTuple):
-    """Training, validation and new links as one dataset."""
+    """Old and new links as one dataset."""
 
     dataset: Dataset
     group: Int[np.ndarray, " n"]
@@ -134,37 +136,30 @@ def _like(receiver: Receiver, old: Dataset, name: str) -> int:
 
 def joined(old: Dataset, new: Dataset) -> tuple[Joined, list[str]]:
     """Returns the new links together with the old ones that they are compared with, and remarks. The lower half of the
-    frequencies of the new links is used, at which phases are known best. Old links are those of the validation part at these
-    frequencies and receivers, and those of the training transmitters next to these and to the new ones.
+    frequencies of the new links is used, at which phases are known best. Old links are those of the training or validation at
+    these frequencies and receivers whose transmitters are next to the new ones.
 
     Raises:
-        UserError: there are too few validation links.
+        UserError: there are too few old links.
     """
-    available = np.unique(old.frequencies_hz[old.validation])
-    hertz = np.unique(new.frequencies_hz)
+    learned = training_links(old)
+    learned = learned[np.isin(old.receiver_index[learned], new.receiver_index)]
+    available, hertz = np.unique(old.frequencies_hz[learned]), np.unique(new.frequencies_hz)
     hertz, partners, remarks = hertz[: -(-len(hertz) // 2)], list[float](), list[str]()
     for one in hertz if len(available) else ():
         partners.append(float(available[np.argmin(np.abs(np.log(available / one)))]))
         if not np.isclose(partners[-1], one, rtol=1e-6):
-            words = f"there are no validation links at {one / 1e9:g} GHz; those at {partners[-1] / 1e9:g} GHz take their place"
+            words = f"there are no old links at {one / 1e9:g} GHz; those at {partners[-1] / 1e9:g} GHz take their place"
             remarks.append(words)
-
-    def own(index: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
-        return index[np.isin(old.frequencies_hz[index], partners) & np.isin(old.receiver_index[index], new.receiver_index)]
-
+    learned = learned[np.isin(old.frequencies_hz[learned], partners)]
+    transmitters, first = np.unique(old.tx_index[learned], return_index=True)
+    if len(transmitters) < FEWEST_TX:
+        raise UserError(f"the run has {len(transmitters)} old transmitters to compare with; an update needs {FEWEST_TX}")
     new = some_links(new, np.flatnonzero(np.isin(new.frequencies_hz, hertz)))
-    validation, train = own(old.validation), own(old.train)
-    if (count := len(np.unique(old.tx_index[validation]))) < FEWEST_TX:
-        raise UserError(
-            f"the run has {count} validation transmitters to compare with, but {FEWEST_TX} are needed; train with a larger "
-            "--validation"
-        )
-    places = np.unique(np.concatenate([old.tx_positions[validation], new.tx_positions]), axis=0)
-    transmitters, first = np.unique(old.tx_index[train], return_index=True)
-    near = cKDTree(old.tx_positions[train[first]]).query(places, min(CONTROLS, len(first)))[1]
-    control = train[np.isin(old.tx_index[train], transmitters[np.unique(near)])]
-    kept = np.concatenate([control, validation])
-    groups = np.repeat([Group.CONTROL, Group.VALIDATION, Group.NEW], [len(control), len(validation), len(new)])
+    places = np.unique(new.tx_positions, axis=0)
+    near = cKDTree(old.tx_positions[learned[first]]).query(places, min(CONTROLS, len(first)))[1]
+    kept = learned[np.isin(old.tx_index[learned], transmitters[np.unique(near)])]
+    groups = np.repeat([Group.OLD, Group.NEW], [len(kept), len(new)])
     return Joined(with_links(old, kept, new), groups), remarks
 
 
@@ -314,8 +309,8 @@ def updated(trained: TrainedField, old: Dataset, new: Dataset, false_alarms: flo
     (both, group), remarks = joined(old, new)
     data, is_new = training_data(both), group == Group.NEW
     problem = CalibrationProblem(field, field.prepare(data.links, data.receivers), data, np.arange(len(both)))
-    counts = [len(np.unique(both.tx_index[group == one])) for one in (Group.NEW, Group.VALIDATION)]
-    say(f"{counts[0]} new transmitters are compared with {counts[1]} of the validation part")
+    counts = [len(np.unique(both.tx_index[group == one])) for one in (Group.NEW, Group.OLD)]
+    say(f"{counts[0]} new transmitters are compared with the {counts[1]} old ones next to them")
     evidence, rng = gather(problem, params, objects_of(field), group), np.random.default_rng(trained.config.seed)
     noticed = notice(evidence, rng)
     result = Update(noticed, [], 0.0, trained, old, np.zeros(len(old), bool), remarks)
@@ -324,8 +319,8 @@ def updated(trained: TrainedField, old: Dataset, new: Dataset, false_alarms: flo
     of_new = dataclasses.replace(problem, spectra=np.flatnonzero(is_new))
     now, own, changes = find_changes(of_new, params, limit_of(evidence, false_alarms, rng), say)
     gain_db = 0.0
-    if noticed.p_values["power"] <= false_alarms / len(STATISTICS) and evidence.power_db is not None:
-        gain_db = common_gain_db(of_new, now, own) - float(np.median(evidence.power_db[evidence.group == Group.VALIDATION]))
+    if noticed.p_values["power"] <= false_alarms / len(STATISTICS) and abs(power_change_db(evidence)) > LEAST_GAIN_DB:
+        gain_db = power_change_db(evidence)
         own = dataclasses.replace(own, log_gain=own.log_gain + jnp.float32(gain_db * np.log(10) / 20))
     if not changes and not gain_db:
         return result

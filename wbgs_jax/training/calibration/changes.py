@@ -1,18 +1,18 @@
 """Finds what has changed in a room since a field was trained, from a few new links (host).
 
-A change is noticed by a permutation test. If nothing has changed, the new transmitters are like those that were held out for
-validation, so that any division of both into two groups is equally likely. Several statistics see different changes: the mean
-score; the largest gain that removing one object brings, those transmitters at which it brings none counted as zero; the largest
-gain beyond that of the same removal at the nearest training transmitters, which shares the errors of the field there; and the
-median error of the received power, for a common gain. Each is compared with its own distribution over random divisions, and so
-is the smallest of the resulting probabilities: false alarms then have the given rate whatever the statistics are. Transmitters
-are divided, not links, since the links of one transmitter are correlated.
+A change is noticed by a permutation test within strata. If nothing has changed, a new transmitter is like those next to it that
+the field was trained with, so that any of them could be the new one. Several statistics see different changes: the mean score;
+the largest gain that making one object of air brings, with and without the transmitters at which it does harm; and the received
+power, for a common gain. All are relative to the mean of the stratum, so that they do not depend on where in the room the new
+transmitters are. Each is compared with its own distribution over random exchanges, and so is the smallest of the resulting
+probabilities: false alarms then have the given rate whatever the statistics are. Transmitters are exchanged, not links, since
+the links of one transmitter are correlated.
 
 What has changed is found object by object. The scores of all objects made of air need no tracing; for the objects that gain
 most, paths are traced again without the object and with the object in places around its own. The best place is refined in
 halved steps, during which the position uncertainty of the object shrinks as well: its paths are first compared by their power,
 and by their phase only when its position is known to a fraction of a wavelength. A change is kept if it improves the scores of
-the new links by more than the removal of any object improves those of validation links.
+the new links by more than the removal of any object improves those of old links.
 """
 
 import dataclasses
@@ -42,26 +42,27 @@ LARGEST_M = 4.0
 CLOSED = 1e-3
 """Largest sum of area vectors of a closed surface, relative to its area."""
 DRAWS = 4000
-"""Random divisions of transmitters."""
-STATISTICS = ("mean", "object", "beyond", "power")
+"""Random exchanges of transmitters."""
+STATISTICS = ("mean", "object", "signed object", "power")
 """Names of the statistics of the test."""
-CONTROLS = 4
-"""Number of training transmitters near a transmitter that the gains there are compared with."""
-NEAR_M = 0.3
-"""Distance up to which controls have about the same weight, metres."""
+CONTROLS = 6
+"""Maximum number of old transmitters in the stratum of a new one, the nearest ones."""
 NOTICED: Compared = "snapshots"
 """The quantity that is compared in the test; it needs no covariances, which take four times as long."""
 COMPARED: Compared = "covariances"
 """The quantity that is compared in the search, which accounts for the uncertainty of positions."""
 AT_ONCE = 8
 """Links whose received powers are predicted together."""
-LIKELY, LIKELIEST = 6, 2
+LIKELY, LIKELIEST = 4, 1
 """Number of objects that are tried nearby, those without which the new links fit best, and of those that are tried further
 away."""
 RINGS_M, DIRECTIONS = (0.45, 0.9), 8
 """Distances of the places that are tried, nearby and further away, and their number at each."""
-BEGIN_STD_M, FIRST_STEP_M, LAST_STEP_M = 0.2, 0.24, 0.01
+BEGIN_STD_M, FIRST_STEP_M, LAST_STEP_M = 0.2, 0.24, 0.015
 """Position uncertainty with which these are compared, and the first and the last step of the refinement."""
+STDS_M = 0.2, 0.03, 0.0075
+"""Position uncertainties with which an object in its place is compared with itself elsewhere: an uncertain object often fits
+better than a certain one, even where nothing has changed."""
 MOST_CHANGES = 12
 """Maximum number of changes."""
 
@@ -69,19 +70,18 @@ MOST_CHANGES = 12
 class Group(IntEnum):
     """Kinds of links in the test."""
 
-    CONTROL = 0
-    VALIDATION = 1
-    NEW = 2
+    OLD = 0
+    NEW = 1
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Scores of N transmitters, means over their links; lower is better."""
+    """Scores of N old and new transmitters, means over their links; lower is better."""
 
     score: Float[np.ndarray, " n"]
     """Scores of the field as it is."""
     without: Float[np.ndarray, "objects n"]
-    """Gains of one object made of air: reductions of the score."""
+    """Gains by one object made of air: reductions of the score."""
     without_worse: Float[np.ndarray, "objects n"]
     """The same, with links that get worse counted as zero."""
     power_db: Float[np.ndarray, " n"] | None
@@ -192,64 +192,60 @@ def notice(evidence: Evidence, rng: np.random.Generator) -> Notice:
     """Returns how probable the scores of new links are if nothing has changed.
 
     Args:
-        evidence: scores of control, validation and new transmitters.
-        rng: random numbers for the divisions of transmitters.
+        evidence: scores of old and new transmitters.
+        rng: random numbers for the exchanges of transmitters.
     """
-    compared = evidence.group != Group.CONTROL
-    new = evidence.group[compared] == Group.NEW
-    beyond = _beyond_controls(evidence)
-    power = None if evidence.power_db is None else evidence.power_db[compared]
-    arrays = evidence.score[compared], evidence.without_worse[:, compared], beyond, power
-    first = np.argsort(~new, kind="stable")  # the new ones come first
-    order = np.concatenate([first[None], rng.permuted(np.tile(first, (DRAWS, 1)), axis=1)])
-    return _of_statistics(_statistics(*arrays, *np.split(order, [new.sum()], axis=1)))
+    strata, sizes = strata_of(evidence)
+    count = len(sizes)
+    drawn = np.floor(rng.uniform(size=(DRAWS, count)) * sizes).astype(int)
+    exchanged = np.concatenate([np.zeros((1, count), int), drawn])
+
+    def means(values: Float[np.ndarray, "h n"]) -> Float[np.ndarray, "h draws"]:
+        own = values[:, strata]
+        own = own - (own * inside).sum(-1, keepdims=True) / sizes[:, None]
+        return own[:, np.arange(count), exchanged].mean(-1)
+
+    inside = np.arange(strata.shape[1]) < sizes[:, None]
+    power = np.zeros_like(evidence.score) if evidence.power_db is None else evidence.power_db
+    found = [
+        means(evidence.score[None])[0],
+        means(evidence.without_worse).max(0, initial=0),
+        means(evidence.without).max(0, initial=0),
+        np.abs(means(power[None]))[0],
+    ]
+    return _of_statistics(np.stack(found, 1))
 
 
-def _beyond_controls(evidence: Evidence) -> Float[np.ndarray, "objects n"]:
-    """Returns the gains of validation and new transmitters beyond those that the gains of the nearest training transmitters
-    predict, by a regression on the validation part."""
-    compared, control = evidence.group != Group.CONTROL, evidence.group == Group.CONTROL
-    if not control.any():
-        return evidence.without[:, compared]
-    distance, index = cKDTree(evidence.place[control]).query(evidence.place[compared], min(CONTROLS, control.sum()))
-    distance, index = (one.reshape(compared.sum(), -1) for one in (distance, index))
-    weight = 1 / (distance + NEAR_M) ** 2
-    weight /= weight.sum(1, keepdims=True)
-    nearby = (evidence.without[:, control][:, index] * weight).sum(-1)
-    own, old = evidence.without[:, compared], evidence.group[compared] == Group.VALIDATION
-    slope = np.sum(nearby[:, old] * own[:, old]) / max(np.sum(nearby[:, old] ** 2), np.finfo(float).tiny)
-    return own - np.clip(slope, 0, 1) * nearby
+def strata_of(evidence: Evidence) -> tuple[Int[np.ndarray, "new most"], Int[np.ndarray, " new"]]:
+    """Returns the indices of the transmitters of every stratum, and their number: a new one, then the old ones to which none of
+    the others is nearer, at most `CONTROLS`. A stratum is filled up with the new one. Strata share no transmitter, which keeps
+    their exchanges independent."""
+    new, old = (np.flatnonzero(evidence.group == one) for one in (Group.NEW, Group.OLD))
+    distance, owner = cKDTree(evidence.place[new]).query(evidence.place[old])
+    strata, sizes = np.tile(new[:, None], (1, CONTROLS + 1)), np.ones(len(new), int)
+    for one in np.argsort(distance):
+        if sizes[owner[one]] <= CONTROLS:
+            strata[owner[one], sizes[owner[one]]] = old[one]
+            sizes[owner[one]] += 1
+    return strata, sizes
+
+
+def power_change_db(evidence: Evidence) -> float:
+    """Returns the mean change of the received power of new transmitters relative to the old ones next to them, dB."""
+    strata, sizes = strata_of(evidence)
+    if evidence.power_db is None or not (sizes > 1).any():
+        return 0.0
+    own = evidence.power_db[strata][sizes > 1]
+    others = (own.sum(1) - own[:, 0] * (own.shape[1] - sizes[sizes > 1] + 1)) / (sizes[sizes > 1] - 1)
+    return float(np.mean(own[:, 0] - others))
 
 
 def limit_of(evidence: Evidence, level: float, rng: np.random.Generator) -> float:
     """Returns the gain that the removal of an object brings by chance with a probability of at most `level`: a quantile over
-    groups of validation transmitters, as many as there are new ones."""
-    gains = evidence.without_worse[:, evidence.group == Group.VALIDATION]
+    groups of old transmitters, as many as there are new ones."""
+    gains = evidence.without_worse[:, evidence.group == Group.OLD]
     drawn = rng.integers(gains.shape[1], size=(DRAWS, int(np.sum(evidence.group == Group.NEW))))
     return float(np.quantile(gains[:, drawn].mean(-1).max(0, initial=0), 1 - level))
-
-
-def common_gain_db(problem: CalibrationProblem, field: Calibratable, params: WaveParams) -> float:
-    """Returns the median of measured minus predicted received powers of new links, dB."""
-    prepared = field.prepare(jax.tree.map(lambda leaf: leaf[problem.spectra], problem.data.links), problem.data.receivers)
-    errors = _power_error_db(dataclasses.replace(problem, field=field, prepared=prepared), params)
-    return 0.0 if errors is None else float(np.median(errors))
-
-
-def _statistics(
-    score: Float[np.ndarray, " tx"],
-    gains: Float[np.ndarray, "objects tx"],
-    beyond: Float[np.ndarray, "objects tx"],
-    power_db: Float[np.ndarray, " tx"] | None,
-    chosen: Int[np.ndarray, "draws k"],
-    others: Int[np.ndarray, "draws l"],
-) -> Float[np.ndarray, "draws statistics"]:
-    """Returns the statistics of `STATISTICS` for groups of transmitters; larger values speak for a change."""
-    common = np.zeros(len(chosen))
-    if power_db is not None:
-        common = np.abs(np.median(power_db[chosen], 1) - np.median(power_db[others], 1))
-    largest = [one[:, chosen].mean(-1).max(0, initial=0) for one in (gains, beyond)]
-    return np.stack([score[chosen].mean(1), *largest, common], 1)
 
 
 def _of_statistics(found: Float[np.ndarray, "draws statistics"]) -> Notice:
@@ -355,7 +351,8 @@ def find_changes(
         if offset is not None:
             say("place of the object")
             best, offset = _refined(here, now, movers, offset)
-        gain = float(now.score.mean() - best.score.mean())
+        in_place = [now.score.mean(), *(_scores(here, _uncertain(now.params, movers, std)).mean() for std in STDS_M)]
+        gain = float(min(in_place) - best.score.mean())
         if gain <= limit:
             break
         before, size = middle_of(now.field, movers), np.ptp(box_of(now.field, movers), axis=0)
