@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 
 from data_gen.jobs import Job
-from data_gen.own_scene import own_scene, parse_point
+from data_gen.own_scene import own_scene, parse_point, parse_transmitters
 from data_gen.scenes import SceneSpec, get_scene
 from data_gen.scenes.base import FREQUENCIES_21_HZ
+from data_gen.scenes.changes import changed
 from data_gen.settings import ArraySettings, Solver, SolverSettings
 from wbgs_jax._util.errors import UserError
 from wbgs_jax.data.load import RELEASED
@@ -36,7 +37,12 @@ class SceneOptions:
     rx: str | None = None
     """Position of the receiver, x,y,z in metres; by default that of a numbered scene."""
     tx_grid: str | None = None
-    """Own scene: transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z."""
+    """Transmitters, x0,y0,z0:x1,y1,z1:nx,ny,nz in metres, or a .csv file with the header x,y,z; by default those of a numbered
+    scene."""
+    moved: tuple[str, ...] = ()
+    """Numbered scene: objects that are elsewhere, each as name:dx,dy or name:dx,dy,degrees (metres)."""
+    removed: tuple[str, ...] = ()
+    """Numbered scene: names of objects that are not there."""
     up: Literal["y", "z"] | None = None
     """Own scene: the file's vertical axis."""
     scale: float | None = None
@@ -59,14 +65,18 @@ class SceneOptions:
         return spec if self.rx_orientation is None else dataclasses.replace(spec, rx_orientation=_unit(self.rx_orientation))
 
     def _numbered_spec(self) -> SceneSpec:
-        if self.materials or self.tx_grid or self.up or self.scale is not None:
-            raise UserError("--materials, --tx-grid, --up and --scale are for your own scene; give its file with --scene")
-        spec = get_scene(int(self.scene))
+        if self.materials or self.up or self.scale is not None:
+            raise UserError("--materials, --up and --scale are for your own scene; give its file with --scene")
+        spec = changed(get_scene(int(self.scene)), self.moved, self.removed)
+        if self.tx_grid is not None:
+            spec = dataclasses.replace(spec, tx_grid=parse_transmitters(self.tx_grid))
         return spec if self.rx is None else dataclasses.replace(spec, rx_position=parse_point(self.rx, "--rx"))
 
     def _own_spec(self, frequencies_hz: tuple[float, ...]) -> SceneSpec:
         if self.rx is None or self.tx_grid is None:
             raise UserError("your own scene needs a receiver and transmitters: --rx x,y,z --tx-grid x0,y0,z0:x1,y1,z1:nx,ny,nz")
+        if self.moved or self.removed:
+            raise UserError("--moved and --removed are for a numbered scene; change the file of your own scene instead")
         return own_scene(
             Path(self.scene), self.materials, rx=self.rx, tx_grid=self.tx_grid, frequencies_hz=frequencies_hz, up=self.up,
             scale=self.scale,
@@ -121,7 +131,7 @@ class Options(SceneOptions):
         usual = Options()
         same = (
             "frequencies", "rx", "rx_orientation", "array", "samples", "max_tx", "depth", "diffraction", "solver", "scattering",
-            "seed", "ceilings",
+            "seed", "ceilings", "tx_grid", "moved", "removed",
         )  # fmt: skip
         if any(getattr(self, name) != getattr(usual, name) for name in same):
             raise UserError("with other settings the released file must not be replaced; give another one with --out")

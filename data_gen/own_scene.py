@@ -70,7 +70,7 @@ def own_scene(
     Raises:
         UserError: an error in the file, the materials, the frequencies, the receiver or the transmitters.
     """
-    position, candidates = parse_point(rx, "--rx"), _transmitters(tx_grid)
+    position, candidates = parse_point(rx, "--rx"), parse_transmitters(tx_grid)
     frequencies = tuple(frequencies_hz) or FREQUENCIES_HZ
     objects, simulated = read_room(file, materials, up, scale), file.suffix.lower() == ".xml"
     check_material_frequencies([one.slab.material for one in objects], frequencies)
@@ -126,7 +126,12 @@ def parse_point(text: str, option: str) -> Vec3:
     return x, y, z
 
 
-def _transmitters(text: str) -> Float[np.ndarray, "candidates 3"]:
+def parse_transmitters(text: str) -> Float[np.ndarray, "candidates 3"]:
+    """Returns candidate positions of transmitters (metres) from "x0,y0,z0:x1,y1,z1:nx,ny,nz" or the path of a .csv file.
+
+    Raises:
+        UserError: the text is not of this form, or the file cannot be read.
+    """
     if text.lower().endswith(".csv"):
         return _read_csv(Path(text))
     corners = text.split(":")

@@ -14,7 +14,7 @@ from wbgs_jax.mesh.edges import common_size
 from wbgs_jax.training.calibration import objective
 from wbgs_jax.training.calibration.material_fit import with_entry
 from wbgs_jax.training.calibration.objective import CalibrationProblem, make_scores, surely_better
-from wbgs_jax.training.calibration.obstacles import _carried, _each_by_itself
+from wbgs_jax.training.calibration.obstacles import _carried, each_by_itself
 from wbgs_jax.training.loop import Run
 
 N_TX, FREQUENCIES = 4, np.array([1e9, 6e9])
@@ -140,7 +140,7 @@ def test_similar_fields_share_a_program_and_score_alike(run):
     problem = CalibrationProblem(run.field, run.prepared, run.data, np.asarray(run.dataset.train))
     scores = problem.scores()([run.state.params])
     programs = objective._score._cache_size()
-    by_body, params = _each_by_itself(run.state.params, problem)
+    by_body, params = each_by_itself(run.state.params, problem)
     np.testing.assert_allclose(by_body.scores()([params]), scores, atol=1e-4)
     ideal = run.field.with_gains(np.ones(run.data.receivers.element_positions.shape[:2], complex))
     np.testing.assert_allclose(dataclasses.replace(problem, field=ideal).scores()([run.state.params]), scores, atol=1e-4)

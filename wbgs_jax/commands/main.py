@@ -26,6 +26,7 @@ COMMANDS = {
     "move": Entry("wbgs_jax.commands.move", "predict a channel over time while antennas, people or furniture move"),
     "view": Entry("wbgs_jax.commands.view", "show a trained field in a browser: drag the transmitter, see paths and maps"),
     "next": Entry("wbgs_jax.commands.next", "choose where to measure next: where the field is most uncertain"),
+    "update": Entry("wbgs_jax.commands.update", "find what has changed in a room from a few new links, and update its field"),
     "measure": Entry("wbgs_jax.commands.measure", "fit a map of received power to measured powers, and score it"),
     "convert": Entry("wbgs_jax.commands.convert", "write Gaussians or paths for other programs, or read theirs for training"),
     "layout": Entry("wbgs_jax.commands.export_folder", "write a scene file as a folder of the published layout"),

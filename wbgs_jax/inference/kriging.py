@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jaxtyping import Array, Bool, Float, Num, UInt8
+from jaxtyping import Array, Bool, Float, Int, Num, UInt8
 
 from wbgs_jax._util.files import read_tree, write_tree
 from wbgs_jax._util.pytree import pytree
@@ -113,7 +113,11 @@ def without_asked(neighbours: Beside, query: Query) -> Beside:
     if neighbours is None:
         return None
     near = nearness(neighbours.tx_position, neighbours.frequency_hz, query.tx_position, query.frequency_hz, SAME_PLACE_M)
-    kept = np.flatnonzero(np.asarray(near).max(1, initial=0) < np.exp(-1))
+    return some_of(neighbours, np.flatnonzero(np.asarray(near).max(1, initial=0) < np.exp(-1)))
+
+
+def some_of(neighbours: Neighbours | Mixture, kept: Int[np.ndarray, " k"]) -> Beside:
+    """Returns some of the measurements, given by their indices (host); None if none remain."""
     if not len(kept):
         return None
     taken = {name: getattr(neighbours, name)[kept] for name in ("tx_position", "frequency_hz", "images")}

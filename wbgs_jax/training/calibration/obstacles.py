@@ -117,18 +117,18 @@ def absent_movers(params: WaveParams, problem: CalibrationProblem, config: Calib
     low = problem.frequency_hz() <= highest
     if not low.any():
         return np.zeros(0, int)
-    own, params = _each_by_itself(params, problem)
+    own, params = each_by_itself(params, problem)
     own = dataclasses.replace(own, spectra=own.spectra[low][: config.spurious_spectra])
     score, tx = own.scores(), own.tx_index()
     _, first = np.unique(np.asarray(own.field.facets.mover), return_index=True)  # the largest facets come first
     tried = np.asarray(own.field.facets.mover)[np.sort(first)][:MOST].tolist()
-    without_one = score([_of_air(params, one) for one in tried], config.spurious_glance)
+    without_one = score([of_air(params, one) for one in tried], config.spurious_glance)
     gains = score([params], config.spurious_glance) - without_one
     likely = [tried[i] for i in np.argsort(-gains.mean(1))[:CLOSELY] if gains[i].mean() > 0]
     now, gone = score([params])[0], list[int]()
-    closely = (now - score([_of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)
+    closely = (now - score([of_air(params, one) for one in likely])).mean(1) if likely else np.zeros(0)
     for one in np.array(likely, int)[np.argsort(-closely)].tolist():
-        without = _of_air(params, one)
+        without = of_air(params, one)
         scores = score([without])[0]
         gain = now - scores
         if gain.mean() > LEAST and surely_better(gain, tx, SURE_OF_ONE) and len(gone) + 1 < len(first):
@@ -137,7 +137,7 @@ def absent_movers(params: WaveParams, problem: CalibrationProblem, config: Calib
     return np.sort(np.array(gone, int))
 
 
-def _each_by_itself(params: WaveParams, problem: CalibrationProblem) -> tuple[CalibrationProblem, WaveParams]:
+def each_by_itself(params: WaveParams, problem: CalibrationProblem) -> tuple[CalibrationProblem, WaveParams]:
     """Returns the field, its paths and its parameters with a separate material for every rigid body, equal to its current one
     but with a thickness that is a parameter."""
     facets = problem.field.facets
@@ -153,7 +153,7 @@ def _each_by_itself(params: WaveParams, problem: CalibrationProblem) -> tuple[Ca
     return dataclasses.replace(problem, field=field, prepared=prepared), replaced(params, materials=own)
 
 
-def _of_air(params: WaveParams, mover: int) -> WaveParams:
+def of_air(params: WaveParams, mover: int) -> WaveParams:
     return replaced(params, materials=with_properties(params.materials, mover, *AIR))
 
 
