@@ -50,8 +50,7 @@ from wbgs_jax.training.calibration.changes import (
 )
 from wbgs_jax.training.calibration.objective import CalibrationProblem
 from wbgs_jax.training.hooks import Say, silent
-from wbgs_jax.training.manifest import write_manifest
-from wbgs_jax.training.run_folder import load_trained, locked, prepare_folder
+from wbgs_jax.training.run_folder import load_trained, locked, prepare_folder, write_manifest
 from wbgs_jax.training.step import TrainState
 from wbgs_jax.types import Receiver
 
