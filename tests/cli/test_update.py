@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from builders.commands import assert_error_for_people, call
+from builders.synthetic import tiny_dataset
 
+from wbgs_jax._util.errors import UserError
 from wbgs_jax.commands.update import main
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
+from wbgs_jax.training.update import check_new
 
 
 def new_links(path, count, ghz=(2.4, 10.0), **changes) -> SceneFile:
@@ -60,6 +63,13 @@ def test_data_that_do_not_belong_to_the_run_are_refused(tmp_path, count, changes
     done = call(main, "--example", "--data", tmp_path / "new.npz", "--out", tmp_path / "out")
     assert_error_for_people(done, message)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_field_without_a_mesh_has_nothing_that_could_have_changed():
+    old = tiny_dataset()
+    bare = dataclasses.replace(old, vertices=old.vertices[:0], faces=old.faces[:0])
+    with pytest.raises(UserError, match="has no mesh"):
+        check_new(old, bare)
 
 
 @pytest.mark.heavy

@@ -102,12 +102,14 @@ def check_new(new: Dataset, old: Dataset) -> Dataset:
     Raises:
         UserError: they are of another kind, of receivers or arrays that the old data do not have, or too few.
     """
+    if not len(old.vertices):
+        raise UserError(f"{old.name} has no mesh, so that no object can be found to have changed; train on data with a mesh")
     if new.observed != old.observed:
         raise UserError(f"{new.name} holds {new.observed.words}, but the field was trained on {old.observed.words}")
     number = np.zeros(new.n_receivers, int)
     for i in np.unique(new.receiver_index):
         number[i] = _like(new.receiver(int(i)), old, f"receiver {i} of {new.name}")
-    if len(new.vertices) and len(old.vertices):
+    if len(new.vertices):
         now, before = (np.ptp(one.vertices, axis=0) for one in (new, old))
         if not np.allclose(now, before, rtol=0.1, atol=0.2):
             words = " and ".join(" x ".join(f"{x:.3g}" for x in span) for span in (now, before))
