@@ -67,7 +67,7 @@ def test_data_that_do_not_belong_to_the_run_are_refused(tmp_path, count, changes
 
 def test_a_field_without_a_mesh_has_nothing_that_could_have_changed():
     old = tiny_dataset()
-    bare = dataclasses.replace(old, vertices=old.vertices[:0], faces=old.faces[:0])
+    bare = dataclasses.replace(old, vertices=old.vertices[:0], faces=old.faces[:0], face_part=None, materials=None)
     with pytest.raises(UserError, match="has no mesh"):
         check_new(old, bare)
 
