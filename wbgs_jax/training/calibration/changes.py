@@ -48,12 +48,12 @@ STATISTICS = ("mean", "object", "signed object", "power")
 CONTROLS = 6
 """Maximum number of old transmitters in the stratum of a new one, the nearest ones."""
 NOTICED: Compared = "snapshots"
-"""The quantity that is compared in the test; it needs no covariances, which take four times as long."""
+"""The quantity that is compared in the test and to rank objects; covariances would take four times as long."""
 COMPARED: Compared = "covariances"
 """The quantity that is compared in the search, which accounts for the uncertainty of positions."""
 AT_ONCE = 8
 """Links whose received powers are predicted together."""
-LIKELY, LIKELIEST = 4, 1
+LIKELY, LIKELIEST = 6, 1
 """Number of objects that are tried nearby, those without which the new links fit best, and of those that are tried further
 away."""
 RINGS_M, DIRECTIONS = (0.45, 0.9), 8
@@ -338,7 +338,7 @@ def find_changes(
     for _ in range(MOST_CHANGES):
         objects = objects_of(now.field)
         here = dataclasses.replace(problem, field=now.field, prepared=now.prepared)
-        score, *without = _without_each(here, now.params, objects, COMPARED)
+        score, *without = _without_each(here, now.params, objects, NOTICED)
         gains = by_object(score, np.array(without), problem.tx_index())
         if not len(objects) or gains.max() <= 0:
             break
