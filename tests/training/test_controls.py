@@ -296,7 +296,8 @@ def test_long_work_before_the_first_step_is_shown_and_kept(dataset, tmp_path, mo
         patch.setattr(Run, "epoch", killed)
         with pytest.raises(KeyboardInterrupt):
             train(dataset, "layered", SETTINGS, SEED, tmp_path)
-    assert [line.split(" (")[0] for line in capsys.readouterr().err.splitlines()] == ["seeking", "found"]
+    stages = ["seeking", "found", "compiling; first steps"]
+    assert [line.split(" (")[0] for line in capsys.readouterr().err.splitlines()] == stages
     again = Run(dataset, "layered", SETTINGS, SEED, tmp_path)
     assert again.restore() and again.step == 0
     np.testing.assert_array_equal(again.state.params["tilt"], 0.25)
