@@ -131,7 +131,7 @@ experiments: setup  ## run what docs/results.md lacks: make experiments [PROFILE
 tables: setup  ## write docs/results.md and the marked numbers of all pages from the results that there are: make tables [PROFILE=]
 	$(PY) -m experiments.tables --profile $(PROFILE)
 
-example: setup  ## train the example field that comes with the package anew, score it: about ten minutes
+example: setup  ## train the example field that comes with the package anew, score it: about six minutes
 	$(PY) -m tools.example_field
 
 docs: setup  ## write docs/api.md from the docstrings, and check the spelling

@@ -25,7 +25,7 @@ from scipy.stats import rankdata
 from wbgs_jax import metrics
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json
-from wbgs_jax._util.progress_lines import CountProgress
+from wbgs_jax._util.progress_lines import CountProgress, Pulse
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import RELEASED
 from wbgs_jax.data.scene import in_sight
@@ -249,19 +249,20 @@ def evaluate(
     truth = np.asarray(dataset.pas(index))
     spectra, ssim = score_spectra(np.asarray(predictions.pas), truth, dataset, index, reference, shown)
     report |= spectra
-    noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
-    if not np.array_equal(noisy, predictions.pas):
-        ssim = metrics.ssim(noisy, truth)
-        report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
-    report |= own | ({"power": power} if power else {})
-    intervals = trained.intervals
-    if (
-        tested
-        and intervals is not None
-        and (expected := expectations(intervals, dataset, index, np.asarray(predictions.pas), power_db))
-    ):
-        report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
-    report |= time_queries(calls)
+    with Pulse(lambda: "prediction intervals, time of a query", shown):
+        noisy = as_observed(trained.field, trained.params, np.asarray(predictions.pas))
+        if not np.array_equal(noisy, predictions.pas):
+            ssim = metrics.ssim(noisy, truth)
+            report["as_observed"] = {"median_ssim": float(np.median(ssim)), "mean_ssim": float(np.mean(ssim))}
+        report |= own | ({"power": power} if power else {})
+        intervals = trained.intervals
+        if (
+            tested
+            and intervals is not None
+            and (expected := expectations(intervals, dataset, index, np.asarray(predictions.pas), power_db))
+        ):
+            report["confidence"] = calibration(expected, ssim, float(intervals.level))  # scored as it was fitted
+        report |= time_queries(calls)
     return report, np.asarray(predictions.pas)
 
 
