@@ -126,7 +126,7 @@ class Notice:
     """The same for each of the statistics alone."""
 
 
-def objects_of(field: Calibratable) -> list[Int[np.ndarray, " k"]]:
+def objects_of(field: Calibratable) -> list[Int[np.ndarray, " _"]]:
     """Returns the rigid bodies (`Facets.mover`) of every object that can be moved: the closed bodies of one object of the scene
     together, or each by itself if they are too far apart to be one."""
     facets = jax.tree.map(np.asarray, field.facets)
@@ -145,7 +145,7 @@ def objects_of(field: Calibratable) -> list[Int[np.ndarray, " k"]]:
 
 
 def gather(
-    problem: CalibrationProblem, params: WaveParams, objects: Sequence[Int[np.ndarray, " k"]], group: Int[np.ndarray, " n"]
+    problem: CalibrationProblem, params: WaveParams, objects: Sequence[Int[np.ndarray, " _"]], group: Int[np.ndarray, " n"]
 ) -> Evidence:
     """Returns the scores of all transmitters of a problem, with the field as it is and without each object.
 
@@ -175,7 +175,7 @@ def gather(
 
 
 def _without_each(
-    problem: CalibrationProblem, params: WaveParams, objects: Sequence[Int[np.ndarray, " k"]], compared: Compared
+    problem: CalibrationProblem, params: WaveParams, objects: Sequence[Int[np.ndarray, " _"]], compared: Compared
 ) -> Float[np.ndarray, "h n"]:
     """Returns the scores of the field as it is, then with each object made of air, without tracing paths again."""
     own, parted = each_by_itself(params, problem)
