@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from experiments.results import FOLDER, add_rows, read_lines, read_rows
+from experiments.results import FOLDER, SHARED, add_rows, read_lines, read_rows
 from wbgs_jax._util.cli import run_command
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import read_json, write_json
@@ -41,8 +41,6 @@ from wbgs_jax.training.loop import train
 from wbgs_jax.training.run_folder import load_trained, write_config
 
 ROWS = FOLDER / "few.jsonl"
-SHARED = Path("..") / "shared" / "data"
-"""Where published samples lie, beside the repository."""
 TESTED = 300
 """Test spectra that are scored, at most."""
 SIMPLE = ("mean_image", "nearest_tx", "inverse_distance", "line_of_sight", "kriging")

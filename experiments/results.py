@@ -27,6 +27,8 @@ from wbgs_jax._util.files import atomic_write, read_text
 from wbgs_jax.config import present_name
 
 FOLDER = Path(__file__).parent / "results"
+SHARED = Path("..") / "shared" / "data"
+"""Where published samples lie, beside the repository."""
 EDITION = 3
 """Of the presets that a row's settings are differences from. Who changes a preset raises it, and gives the settings of the rows
 that still count anew."""

@@ -29,16 +29,15 @@ from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data.dataset import Dataset
 from wbgs_jax.data.load import load_dataset
+from wbgs_jax.data.splits import keep_links
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.inference.predictor import observe_links
 from wbgs_jax.inference.trained_field import TrainedField
 from wbgs_jax.metrics import ssim
-from wbgs_jax.training.batches import training_data
-from wbgs_jax.training.calibration.changes import Group, gather, notice, objects_of, with_object_moved, without_object
-from wbgs_jax.training.calibration.objective import CalibrationProblem
+from wbgs_jax.training.calibration.changes import Group, notice, objects_of, with_object_moved, without_object
 from wbgs_jax.training.run_folder import load_trained
-from wbgs_jax.training.update import check_new, joined, lines_of, object_name, part_names, some_links, updated
+from wbgs_jax.training.update import check_new, compare, lines_of, object_name, part_names, updated
 
 SCENES = 2, 4
 GHZ = 2.4, 5.0, 24.25, 60.0
@@ -185,13 +184,7 @@ def tested(trained: TrainedField, old: Dataset, case: Case, kind: str, folder: P
     """Returns the result of the test alone with the new links of one file."""
     new = check_new(load_dataset(str(folder / f"{case.name}_{kind}.npz")), old)
     begin, cpu = time.monotonic(), time.process_time()
-    (both, group), _ = joined(old, new)
-    part = trained.field.ability(Calibratable)
-    assert part is not None, "a field with paths"
-    data = training_data(both)
-    problem = CalibrationProblem(part.field, part.field.prepare(data.links, data.receivers), data, np.arange(len(both)))
-    evidence = gather(problem, part.of(trained.params), objects_of(part.field), group)
-    noticed = notice(evidence, np.random.default_rng(trained.config.seed))
+    noticed = notice(compare(trained, old, new).evidence, np.random.default_rng(trained.config.seed))
     return {
         "case": case.name, "scene": case.scene, "places": kind, "transmitters": len(np.unique(new.tx_index)),
         "moved": case.moved, "removed": case.removed, "p_value": noticed.p_value, "p_values": noticed.p_values,
@@ -226,12 +219,7 @@ def account(trained: TrainedField, old: Dataset, case: Case, kind: str, folder: 
 def false_alarms(trained: TrainedField, old: Dataset, draws: int) -> dict[str, float]:
     """Returns the share of random groups of test transmitters of the unchanged room in which a change is noticed."""
     index = old.test[np.isin(np.round(old.frequencies_hz[old.test] / 1e9, 4), GHZ)]
-    (both, group), _ = joined(old, some_links(old, index))
-    part = trained.field.ability(Calibratable)
-    assert part is not None, "a field with paths"
-    data = training_data(both)
-    problem = CalibrationProblem(part.field, part.field.prepare(data.links, data.receivers), data, np.arange(len(both)))
-    every = gather(problem, part.of(trained.params), objects_of(part.field), group)
+    every = compare(trained, old, keep_links(old, index)).evidence
     rng, is_new = np.random.default_rng(SEED), every.group == Group.NEW
     old_ones, tests = np.flatnonzero(~is_new), np.flatnonzero(is_new)
     p_values = []

@@ -19,14 +19,13 @@ from typing import Any
 
 import tyro
 
-from experiments.results import FOLDER
+from experiments.results import FOLDER, SHARED
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import VARIABLE
 from wbgs_jax._util.errors import UserError
 from wbgs_jax._util.files import read_json, write_json
 from wbgs_jax.evaluation.report import environment
 
-SHARED = Path("..") / "shared" / "data"
 CASES: Mapping[str, tuple[str, ...]] = {
     "scene1 smoke": ("--scene", "1", "--preset", "smoke"),
     "scene1": ("--scene", "1", "--preset", "cpu"),

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float, Int
 
-from experiments.results import FOLDER
+from experiments.results import FOLDER, SHARED
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.files import write_json
 from wbgs_jax.applications import choose_next_places
@@ -25,7 +25,6 @@ from wbgs_jax.evaluation.report import environment
 from wbgs_jax.power_map.model import LENGTH, learn_map, received_power
 from wbgs_jax.power_map.survey import load_survey
 
-SHARED = Path("..") / "shared" / "data"
 SETS = {"ble_flat": 100, "ble_tetam": 40}
 """Measured sets, and the number of random readings whose error the others have to reach."""
 BEGIN, ROUND, MOST = 5, 10, 145

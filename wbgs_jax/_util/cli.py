@@ -62,14 +62,14 @@ def option_value(arguments: Sequence[str], name: str, default: str) -> str:
     return value
 
 
-def parse_positions(words: tuple[str, ...]) -> Float[np.ndarray, "tx 3"]:
-    """Returns positions (metres) parsed from strings "x,y,z".
+def parse_positions(words: tuple[str, ...], option: str = "--tx") -> Float[np.ndarray, "n 3"]:
+    """Returns positions (metres) parsed from the strings "x,y,z" of an option.
 
     Raises:
         UserError: a string is not of this form, or a coordinate is too large.
     """
-    unit = "metres, such as --tx 1.0,2.5,1.5"
-    return np.array([parse_vector(word, "--tx", "position", unit) for word in words]).reshape(-1, 3)
+    unit = f"metres, such as {option} 1.0,2.5,1.5"
+    return np.array([parse_vector(word, option, "position", unit) for word in words]).reshape(-1, 3)
 
 
 def parse_vector(word: str, option: str, kind: str = "velocity", unit: str = "metres per second") -> Float[np.ndarray, "3"]:

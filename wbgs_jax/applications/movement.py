@@ -97,8 +97,12 @@ def _tracing(field: Field, params: Params) -> tuple[Calibratable, Params]:
     """Returns the part of a field that traces paths; a field without one is a `UserError`."""
     field, params = field.receiver_independent(params)
     if not isinstance(field, Calibratable):
-        raise UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
+        raise _untraced(field)
     return field, params
+
+
+def _untraced(field: Field) -> UserError:
+    return UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
 
 
 def make_movement(
@@ -252,7 +256,7 @@ def nearest_body(field: Field, point: Float[np.ndarray, "3"]) -> int:
     """
     own = field.ability(Calibratable)
     if own is None:
-        raise UserError(f"the {field.name} field traces no paths; train one that does, on data with a mesh")
+        raise _untraced(field)
     corners, number = np.asarray(own.field.facets.corners), np.asarray(own.field.facets.mover)
     samples = np.concatenate([corners, corners.mean(1, keepdims=True)], 1)
     distance = np.linalg.norm(samples - point, axis=-1).min(1)

@@ -11,7 +11,6 @@ import wbgs_jax._util.quiet  # noqa: F401, before JAX is loaded
 
 # isort: split
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +19,13 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from wbgs_jax._util.cli import parse_vector, run_command, say
+from wbgs_jax._util.cli import parse_positions, parse_vector, run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.errors import UserError
-from wbgs_jax._util.files import atomic_write, check_writable, write_csv
+from wbgs_jax._util.files import check_writable, write_csv
 from wbgs_jax._util.progress_lines import CountProgress
 from wbgs_jax.commands.options import PICTURES, TrainedFieldOptions, check_suffixes, load_field, parse_frequencies, warn
+from wbgs_jax.inference.results_file import write_arrays
 
 if TYPE_CHECKING:
     from wbgs_jax.fields import Field
@@ -88,11 +88,6 @@ def check(command: Command) -> None:
         raise UserError(f"--rate {command.rate:g} is not a rate; give instants per second")
 
 
-def places_of(words: tuple[str, ...], option: str) -> Float[np.ndarray, "n 3"]:
-    """Returns the places that an option names, metres."""
-    return np.array([parse_vector(word, option, "position", "metres") for word in words])
-
-
 def length_of(places: Float[np.ndarray, "n 3"]) -> float:
     """Returns the length of a way, metres."""
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
@@ -105,8 +100,8 @@ def times_of(command: Command, frequency_hz: float) -> Float[np.ndarray, " t"]:
     """
     from wbgs_jax.types import SPEED_OF_LIGHT
 
-    ends = length_of(places_of(command.tx, "--tx")), np.linalg.norm(_vector(command.rx_shift, "--rx-shift"))
-    bodies = length_of(places_of(command.person, "--person")) if command.person else 0.0
+    ends = length_of(parse_positions(command.tx)), np.linalg.norm(_vector(command.rx_shift, "--rx-shift"))
+    bodies = length_of(parse_positions(command.person, "--person"))
     bodies = max(bodies, float(np.linalg.norm(_vector(command.body_shift, "--body-shift"))))
     needed = 2 * (sum(ends) + 2 * bodies) / command.seconds * frequency_hz / SPEED_OF_LIGHT
     rate = max(SPARE * needed, FEWEST / command.seconds) if command.rate is None else command.rate
@@ -131,7 +126,7 @@ def motion_of(command: Command, field: "Field", params: Any, share: Float[np.nda
         number = nearest_body(field, parse_vector(command.body, "--body", "position", "metres"))
         shift[number] = share[:, None] * _vector(command.body_shift, "--body-shift")
     if command.person:
-        places = places_of(command.person, "--person")
+        places = parse_positions(command.person, "--person")
         ahead = places[-1] - places[0]
         field, params, number = add_body(field, params, person(places[0], azimuth=float(np.arctan2(ahead[1], ahead[0]))))
         shift[number] = position_along(places, share) - places[0]
@@ -150,8 +145,8 @@ def simulate(command: Command) -> None:
     share = np.linspace(0, 1, len(seconds))
     loaded = load_field(command.folder, command.rx, frequency_hz)
     field, params, motion = motion_of(command, *loaded.trained.field.receiver_independent(loaded.trained.params), share)
-    tx = position_along(places_of(command.tx, "--tx"), share)
-    warn(loaded.domain, loaded.receiver.position, places_of(command.tx, "--tx"), np.array([frequency_hz]))
+    tx = position_along(parse_positions(command.tx), share)
+    warn(loaded.domain, loaded.receiver.position, parse_positions(command.tx), np.array([frequency_hz]))
     blocks = -(-len(seconds) // AT_ONCE)
     with CountProgress(f"channel, blocks of {AT_ONCE} instants", blocks) as progress:
         query = make_query(tx, frequency_hz)
@@ -177,8 +172,7 @@ def write(path: Path, found: dict[str, np.ndarray], source: dict[str, Any]) -> N
         rows = ([f"{value:.8g}" for value in row] for row in zip(*columns, strict=True))
         write_csv(path, [["time_s", "tx_x", "tx_y", "tx_z", "power_db", "phase_rad"], *rows])
         return
-    with atomic_write(path) as stream:
-        np.savez_compressed(stream, **found, source=json.dumps(source))  # type: ignore[arg-type]
+    write_arrays(path, found, source)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -146,7 +146,7 @@ def select_receivers(dataset: Dataset, which: Sequence[int]) -> Dataset:
         raise UserError(f"{dataset.name} has receivers 0 to {dataset.n_receivers - 1}; choose each once, not {list(which)}")
     number = np.full(dataset.n_receivers, -1)
     number[list(which)] = np.arange(len(which))
-    chosen = _keep_links(dataset, np.flatnonzero(number[dataset.receiver_index] >= 0))
+    chosen = keep_links(dataset, np.flatnonzero(number[dataset.receiver_index] >= 0))
     return dataclasses.replace(
         chosen,
         name=f"{dataset.name}_rx" + "-".join(map(str, which)),
@@ -167,10 +167,10 @@ def with_validation_trained(dataset: Dataset) -> Dataset:
 
 def without_test(dataset: Dataset) -> Dataset:
     """Returns the dataset with only its `training_links`."""
-    return _keep_links(dataset, training_links(dataset))
+    return keep_links(dataset, training_links(dataset))
 
 
-def _keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
+def keep_links(dataset: Dataset, kept: Int[np.ndarray, " n"]) -> Dataset:
     """Returns a dataset of some links in order; the remaining transmitters are renumbered."""
     place = np.full(len(dataset), -1)  # new index of every link that is kept
     place[kept] = np.arange(len(kept))

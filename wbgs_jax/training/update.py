@@ -23,7 +23,8 @@ from wbgs_jax._util.files import write_json
 from wbgs_jax.data.dataset import Dataset, checksum
 from wbgs_jax.data.load import PARTS, source_paths
 from wbgs_jax.data.scene_file import SceneFile, load_scene, save_scene
-from wbgs_jax.data.splits import training_links
+from wbgs_jax.data.splits import keep_links, training_links
+from wbgs_jax.fields.base import Ability
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.inference.intervals import write_confidence
@@ -38,6 +39,7 @@ from wbgs_jax.training.calibration.changes import (
     CONTROLS,
     STATISTICS,
     Change,
+    Evidence,
     Group,
     Notice,
     box_of,
@@ -156,7 +158,7 @@ def joined(old: Dataset, new: Dataset) -> tuple[Joined, list[str]]:
     transmitters, first = np.unique(old.tx_index[learned], return_index=True)
     if len(transmitters) < FEWEST_TX:
         raise UserError(f"the run has {len(transmitters)} old transmitters to compare with; an update needs {FEWEST_TX}")
-    new = some_links(new, np.flatnonzero(np.isin(new.frequencies_hz, hertz)))
+    new = keep_links(new, np.flatnonzero(np.isin(new.frequencies_hz, hertz)))
     places = np.unique(new.tx_positions, axis=0)
     near = cKDTree(old.tx_positions[learned[first]]).query(places, min(CONTROLS, len(first)))[1]
     kept = learned[np.isin(old.tx_index[learned], transmitters[np.unique(near)])]
@@ -164,39 +166,18 @@ def joined(old: Dataset, new: Dataset) -> tuple[Joined, list[str]]:
     return Joined(with_links(old, kept, new), groups), remarks
 
 
-def some_links(dataset: Dataset, kept: Int[np.ndarray, " k"]) -> Dataset:
-    """Returns some links of a dataset, in no part of it."""
-    nothing = np.zeros(0, int)
-    return dataclasses.replace(
-        dataset,
-        tx_positions=dataset.tx_positions[kept],
-        frequencies_hz=dataset.frequencies_hz[kept],
-        receiver_index=dataset.receiver_index[kept],
-        tx_index=dataset.tx_index[kept],
-        observations={name: values[kept] for name, values in dataset.observations.items()},
-        train=nothing,
-        validation=nothing,
-        test=nothing,
-    )
-
-
 def with_links(old: Dataset, kept: Int[np.ndarray, " k"], new: Dataset) -> Dataset:
     """Returns a dataset of some of the old links and all new ones, which are for training."""
-    place = np.full(len(old), -1)
-    place[kept] = np.arange(len(kept))
-    parts = {name: place[getattr(old, name)] for name in PARTS}
-    parts = {name: index[index >= 0] for name, index in parts.items()}
-    parts["train"] = np.concatenate([parts["train"], len(kept) + np.arange(len(new))])
-    positions = np.concatenate([old.tx_positions[kept], new.tx_positions])
-    observed = {name: np.concatenate([values[kept], new.observations[name]]) for name, values in old.observations.items()}
+    rest = keep_links(old, kept)
+    observed = {name: np.concatenate([values, new.observations[name]]) for name, values in rest.observations.items()}
     return dataclasses.replace(
-        old,
-        tx_positions=positions,
-        frequencies_hz=np.concatenate([old.frequencies_hz[kept], new.frequencies_hz]),
-        receiver_index=np.concatenate([old.receiver_index[kept], new.receiver_index]),
-        tx_index=np.concatenate([old.tx_index[kept], old.tx_index.max() + 1 + new.tx_index]),  # even at an old place
+        rest,
+        tx_positions=np.concatenate([rest.tx_positions, new.tx_positions]),
+        frequencies_hz=np.concatenate([rest.frequencies_hz, new.frequencies_hz]),
+        receiver_index=np.concatenate([rest.receiver_index, new.receiver_index]),
+        tx_index=np.concatenate([rest.tx_index, rest.tx_index.max(initial=-1) + 1 + new.tx_index]),  # even at an old place
+        train=np.concatenate([rest.train, len(rest) + np.arange(len(new))]),
         observations=observed,
-        **parts,
     )
 
 
@@ -288,6 +269,41 @@ def object_name(dataset: Dataset, field: Calibratable, movers: Int[np.ndarray, "
     return names[part] if part < len(names) else f"part {part}"
 
 
+class Comparison(NamedTuple):
+    """New links beside the old ones next to them."""
+
+    part: Ability[Calibratable]
+    """The part of the field that traces paths."""
+    problem: CalibrationProblem
+    """All of these links, with their paths."""
+    new: Int[np.ndarray, " k"]
+    """Indices of the new links among its spectra."""
+    evidence: Evidence
+    """Scores of their transmitters, for the test."""
+    remarks: list[str]
+    """Remarks for the terminal."""
+
+
+def compare(trained: TrainedField, old: Dataset, new: Dataset, say: Say = silent) -> Comparison:
+    """Returns new links beside the old ones next to them, scored by a field with paths.
+
+    Raises:
+        UserError: the field has no paths, or there are too few old links.
+    """
+    part = trained.field.ability(Calibratable)
+    if part is None:
+        raise UserError(
+            f"the {trained.config.field} field traces no paths, so that no object can be found; train one that does"
+        )
+    (both, group), remarks = joined(old, new)
+    counts = [len(np.unique(both.tx_index[group == one])) for one in (Group.NEW, Group.OLD)]
+    say(f"{counts[0]} new transmitters are compared with the {counts[1]} old ones next to them")
+    data = training_data(both)
+    problem = CalibrationProblem(part.field, part.field.prepare(data.links, data.receivers), data, np.arange(len(both)))
+    evidence = gather(problem, part.of(trained.params), objects_of(part.field), group)
+    return Comparison(part, problem, np.flatnonzero(group == Group.NEW), evidence, remarks)
+
+
 def updated(trained: TrainedField, old: Dataset, new: Dataset, false_alarms: float, say: Say = silent) -> Update:
     """Returns whether a room has changed, what has, and the updated field.
 
@@ -299,25 +315,15 @@ def updated(trained: TrainedField, old: Dataset, new: Dataset, false_alarms: flo
         say: called with a description of each stage.
 
     Raises:
-        UserError: the field has no paths, or there are too few validation links.
+        UserError: as `compare`.
     """
-    part = trained.field.ability(Calibratable)
-    if part is None:
-        raise UserError(
-            f"the {trained.config.field} field traces no paths, so that no object can be found; train one that does"
-        )
-    field, params = part.field, part.of(trained.params)
-    (both, group), remarks = joined(old, new)
-    data, is_new = training_data(both), group == Group.NEW
-    problem = CalibrationProblem(field, field.prepare(data.links, data.receivers), data, np.arange(len(both)))
-    counts = [len(np.unique(both.tx_index[group == one])) for one in (Group.NEW, Group.OLD)]
-    say(f"{counts[0]} new transmitters are compared with the {counts[1]} old ones next to them")
-    evidence, rng = gather(problem, params, objects_of(field), group), np.random.default_rng(trained.config.seed)
+    part, problem, new_links, evidence, remarks = compare(trained, old, new, say)
+    field, params, rng = part.field, part.of(trained.params), np.random.default_rng(trained.config.seed)
     noticed = notice(evidence, rng)
     result = Update(noticed, [], 0.0, trained, old, np.zeros(len(old), bool), remarks)
     if noticed.p_value > false_alarms:
         return result
-    of_new = dataclasses.replace(problem, spectra=np.flatnonzero(is_new))
+    of_new = dataclasses.replace(problem, spectra=new_links)
     now, own, changes = find_changes(of_new, params, limit_of(evidence, false_alarms, rng), say)
     gain_db = 0.0
     if noticed.p_values["power"] <= false_alarms / len(STATISTICS) and abs(power_change_db(evidence)) > LEAST_GAIN_DB:

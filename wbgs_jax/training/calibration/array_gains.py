@@ -12,21 +12,16 @@ estimated on half of the spectra in use, and kept if the other half fits signifi
 import dataclasses
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 
 from wbgs_jax.fields.calibratable import Calibratable
-from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
+from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.fields.losses import GOOD_MATCH
-from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.training.calibration.objective import CalibrationProblem, surely_better
+from wbgs_jax.training.calibration.objective import CalibrationProblem, predicted, surely_better
 
 ROUNDS = 20
 """Iterations of least squares."""
-AT_ONCE = 8
-"""Number of snapshots that are computed together."""
 FEWEST = 32
 """Minimum number of snapshots of a receiver; with fewer its array is not calibrated."""
 SURE = 3.0
@@ -78,36 +73,14 @@ def gains_of(
     their root mean square 1, since a common factor is not observable."""
     receiver = np.asarray(problem.data.links.receiver_index)[spectra]
     positions = problem.data.receivers.element_positions
-    gains = np.ones(positions.shape[:2], complex)
+    assert problem.data.snapshots is not None, "array gains are estimated from snapshots"
+    measured, gains = np.asarray(problem.data.snapshots), np.ones(positions.shape[:2], complex)
     for number in np.unique(receiver):
         own = spectra[receiver == number]
         if len(own) >= FEWEST:
-            gains[number] = least_squares(*_snapshots(field, params, problem, own))
+            of_receiver = dataclasses.replace(problem, field=field, spectra=own)
+            gains[number] = least_squares(predicted(of_receiver, params, "snapshots"), measured[own])
     return gains
-
-
-def _snapshots(
-    field: Calibratable, params: WaveParams, problem: CalibrationProblem, spectra: Int[np.ndarray, " n"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns predicted and measured snapshots (n, elements) of links."""
-    padded = np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE)  # repeated to whole blocks
-    predicted = _predicted(field, params, problem.prepared, problem.data, jnp.asarray(padded, jnp.int32))
-    assert problem.data.snapshots is not None, "array gains are estimated from snapshots"
-    return np.asarray(predicted)[: len(spectra)], np.asarray(problem.data.snapshots)[spectra]
-
-
-@jax.jit
-def _predicted(
-    field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, " n"]
-) -> Complex[Array, "n elements"]:
-    def one(link: Int[Array, ""]) -> Complex[Array, " elements"]:
-        batch = data.batch(link[None], jax.random.key(0))
-        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        assert seen.snapshots is not None, "a coherent field predicts snapshots"
-        return seen.snapshots[0]
-
-    found: Complex[Array, "n elements"] = jax.lax.map(one, spectra, batch_size=AT_ONCE)
-    return found
 
 
 def least_squares(

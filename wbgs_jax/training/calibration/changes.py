@@ -23,7 +23,7 @@ from enum import IntEnum
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -31,9 +31,9 @@ from wbgs_jax._util.statistics import by_transmitter
 from wbgs_jax.fields.calibratable import Calibratable
 from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
 from wbgs_jax.mesh.facets import areas, centres
+from wbgs_jax.observation_kinds import power_of
 from wbgs_jax.propagation.displacement import still
-from wbgs_jax.training.batches import TrainingData
-from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Compared, predicted
 from wbgs_jax.training.calibration.obstacles import each_by_itself, of_air
 from wbgs_jax.training.hooks import Say, silent
 
@@ -51,8 +51,6 @@ NOTICED: Compared = "snapshots"
 """The quantity that is compared in the test and to rank objects; covariances would take four times as long."""
 COMPARED: Compared = "covariances"
 """The quantity that is compared in the search, which accounts for the uncertainty of positions."""
-AT_ONCE = 8
-"""Links whose received powers are predicted together."""
 LIKELY, LIKELIEST = 6, 1
 """Number of objects that are tried nearby, those without which the new links fit best, and of those that are tried further
 away."""
@@ -262,11 +260,8 @@ def _upper_share(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 def _power_error_db(problem: CalibrationProblem, params: WaveParams) -> Float[np.ndarray, " n"] | None:
     """Returns measured minus predicted received powers; None for data without powers."""
-    if not problem.data.has_scale:
-        return None
-    blocks = np.resize(problem.spectra, (-(-len(problem.spectra) // AT_ONCE), AT_ONCE))
-    found = _power_errors(problem.field, params, problem.prepared, problem.data, jnp.asarray(blocks, jnp.int32))
-    return np.asarray(found).reshape(-1)[: len(problem.spectra)]
+    measured = power_of({name: values[problem.spectra] for name, values in problem.data.observations.items()})
+    return None if measured is None else np.asarray(measured) - predicted(problem, params, "power_db")
 
 
 @dataclass(frozen=True)
@@ -438,19 +433,3 @@ def _tried(here: CalibrationProblem, field: Calibratable, params: WaveParams) ->
 
 def _scores(problem: CalibrationProblem, params: WaveParams) -> Float[np.ndarray, " n"]:
     return problem.scores(compared=COMPARED)([params])[0]
-
-
-@jax.jit
-def _power_errors(
-    field: Calibratable, params: WaveParams, prepared: PreparedPaths, data: TrainingData, blocks: Int[Array, "k b"]
-) -> Float[Array, "k b"]:
-    """Returns measured minus predicted received powers of blocks of links, dB."""
-
-    def one(link: Int[Array, ""]) -> Float[Array, ""]:
-        batch = data.batch(link[None], jax.random.key(0))
-        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        assert seen.power_db is not None and batch.received_db is not None, "both have powers"
-        return batch.received_db[0] - seen.power_db[0]
-
-    found: Float[Array, "k b"] = jax.lax.map(jax.vmap(one), blocks)
-    return found

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 from scipy.stats import norm, permutation_test
 
 from wbgs_jax._util.statistics import by_transmitter, standard_error
@@ -36,6 +36,10 @@ Compared = Literal["snapshots", "covariances", "spectra", "powers"]
 snapshots given the uncertainty of phases (`losses.surprise`); "spectra" (log mean absolute error), which is also used if there
 are no snapshots; "powers" (log absolute error in dB), which is always used if there is nothing else. A link on which nothing
 was received has the same score for every candidate."""
+
+
+Predicted = Literal["snapshots", "power_db"]
+"""A quantity of `fields.base.Observation` that `predicted` returns."""
 
 
 @runtime_checkable
@@ -112,6 +116,33 @@ class CalibrationProblem:
     def tx_index(self, count: int | None = None) -> Int[np.ndarray, " k"]:
         """Returns the transmitters of the first `count` spectra."""
         return np.asarray(self.data.links.tx_index)[self.spectra[:count]]
+
+
+def predicted(problem: CalibrationProblem, params: WaveParams, quantity: Predicted) -> Num[np.ndarray, "n ..."]:
+    """Returns the snapshots (n, elements) or the received powers (n,), dB, that a field predicts for the spectra of a problem
+    (host)."""
+    spectra = problem.spectra
+    padded = jnp.asarray(np.resize(spectra, -(-len(spectra) // AT_ONCE) * AT_ONCE), jnp.int32)  # repeated to whole blocks
+    return np.asarray(_predicted(problem.field, params, problem.prepared, problem.data, padded, quantity))[: len(spectra)]
+
+
+@functools.partial(jax.jit, static_argnames="quantity")
+def _predicted(
+    field: Calibratable,
+    params: WaveParams,
+    prepared: PreparedPaths,
+    data: TrainingData,
+    spectra: Int[Array, " n"],
+    quantity: Predicted,
+) -> Num[Array, "n ..."]:
+    def one(link: Int[Array, ""]) -> Array:
+        batch = data.batch(link[None], jax.random.key(0))
+        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
+        found: Array = getattr(seen, quantity)
+        return found[0]
+
+    found: Num[Array, "n ..."] = jax.lax.map(one, spectra, batch_size=AT_ONCE)
+    return found
 
 
 def comparable(compared: Compared, data: TrainingData) -> Compared:
