@@ -44,8 +44,13 @@ class TxPaths:
     """complex128, including the carrier phase, one column per receiver element."""
     delays: Float[np.ndarray, " paths"]
     """Seconds."""
-    order: Int[np.ndarray, " paths"]
-    """Number of interactions; 0 is the line of sight."""
+    kinds: Int[np.ndarray, "paths depth"]
+    """`sionna.rt.InteractionType` of every interaction from the transmitter on; 0 beyond the last."""
+
+    @property
+    def order(self) -> Int[np.ndarray, " paths"]:
+        """Number of interactions; 0 is the line of sight."""
+        return (self.kinds != rt.InteractionType.NONE).sum(-1)
 
     def snapshot(self) -> Complex[np.ndarray, " elements"]:
         """Returns the coherent sum of the paths, complex64."""
@@ -94,8 +99,8 @@ class Simulator:
         for frequency in frequencies_hz:
             self._set_frequency(frequency)
             found = [tracer.fields(geometry) for tracer, geometry in zip(self._tracers, traced, strict=True)]
-            elements = self.array.rows * self.array.columns
-            result.append(_by_transmitter([paths for paths in found if paths], frequency, len(tx_positions), elements))
+            shape = self.array.rows * self.array.columns, self.settings.max_depth
+            result.append(_by_transmitter([paths for paths in found if paths], frequency, len(tx_positions), shape))
         return result
 
     def _set_frequency(self, frequency_hz: float) -> None:
@@ -150,35 +155,41 @@ def _yaw_pitch_roll(quaternion: Sequence[float]) -> list[float]:
     return [float(yaw), float(pitch), float(roll)]
 
 
-def _by_transmitter(found: Sequence[rt.Paths], frequency_hz: float, n_tx: int, elements: int) -> list[TxPaths]:
-    parts = [_arrays(paths, frequency_hz, n_tx) for paths in found] or [_no_paths(elements, n_tx)]
+def _by_transmitter(found: Sequence[rt.Paths], frequency_hz: float, n_tx: int, shape: tuple[int, int]) -> list[TxPaths]:
+    parts = [_arrays(paths, frequency_hz, n_tx, shape) for paths in found] or [_no_paths(*shape, n_tx)]
     return [_sorted_paths(*map(np.concatenate, zip(*(part[i] for part in parts), strict=True))) for i in range(n_tx)]
 
 
-def _arrays(found: rt.Paths, frequency_hz: float, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Returns the coefficients (paths, elements), delays and numbers of interactions of every transmitter's paths."""
+def _arrays(
+    found: rt.Paths, frequency_hz: float, n_tx: int, shape: tuple[int, int]
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Returns the coefficients (paths, elements), delays and interactions (paths, depth) of every transmitter's paths; `shape`
+    is (elements, depth)."""
     # a: (receiver, element, tx, tx element, path); tau, valid: (receiver, tx, path); interactions: (depth, receiver, tx, path).
     real, imaginary = (np.array(x)[0, :, :, 0].astype(np.float64) for x in found.a)
     if found.tau.shape[-1] == 0:
-        return _no_paths(len(real), n_tx)
+        return _no_paths(*shape, n_tx)
     delays = np.array(found.tau)[0].astype(np.float64)
     carrier = np.exp(-2j * np.pi * np.mod(frequency_hz * delays, 1.0))
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]
     valid = np.array(found.valid)[0]
-    order = (np.array(found.interactions)[:, 0] != rt.InteractionType.NONE).sum(0)
+    kinds = np.moveaxis(np.array(found.interactions)[:, 0], 0, -1).astype(np.int64)
+    kinds = np.pad(kinds, ((0, 0), (0, 0), (0, shape[1] - kinds.shape[-1])))
     valid &= np.abs(coefficients).max(-1) > FAINT
-    return [(coefficients[i, valid[i]], delays[i, valid[i]], order[i, valid[i]]) for i in range(n_tx)]
+    return [(coefficients[i, valid[i]], delays[i, valid[i]], kinds[i, valid[i]]) for i in range(n_tx)]
 
 
-def _no_paths(elements: int, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    return [(np.zeros((0, elements), complex), np.zeros(0), np.zeros(0, int))] * n_tx
+def _no_paths(elements: int, depth: int, n_tx: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    return [(np.zeros((0, elements), complex), np.zeros(0), np.zeros((0, depth), int))] * n_tx
 
 
 def _sorted_paths(
-    coefficients: Complex[np.ndarray, "paths elements"], delays: Float[np.ndarray, " paths"], order: Int[np.ndarray, " paths"]
+    coefficients: Complex[np.ndarray, "paths elements"],
+    delays: Float[np.ndarray, " paths"],
+    kinds: Int[np.ndarray, "paths depth"],
 ) -> TxPaths:
     # Two elements resolve the ties of mirrored paths, which have equal delays and magnitudes.
     first, last = coefficients[:, 0], coefficients[:, -1]
     keys = (last.imag, last.real, first.imag, first.real, np.abs(first), delays)  # lexsort: the last key is the primary one
     rank = np.lexsort(keys)
-    return TxPaths(coefficients[rank], delays[rank], order[rank])
+    return TxPaths(coefficients[rank], delays[rank], kinds[rank])
