@@ -174,7 +174,6 @@ def _arrays(
     coefficients = np.moveaxis(real + 1j * imaginary, 0, -1) * carrier[..., None]
     valid = np.array(found.valid)[0]
     kinds = np.moveaxis(np.array(found.interactions)[:, 0], 0, -1).astype(np.int64)
-    kinds = np.pad(kinds, ((0, 0), (0, 0), (0, shape[1] - kinds.shape[-1])))
     valid &= np.abs(coefficients).max(-1) > FAINT
     return [(coefficients[i, valid[i]], delays[i, valid[i]], kinds[i, valid[i]]) for i in range(n_tx)]
 

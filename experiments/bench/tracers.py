@@ -20,7 +20,7 @@ from wbgs_jax.fields import coherent
 from wbgs_jax.propagation.paths import DIFFRACTED, REFLECTED, TRANSMITTED
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
 from wbgs_jax.training.calibration.material_fit import ITU_MATERIALS, with_entry
-from wbgs_jax.types import Query, Transmitter, make_receiver
+from wbgs_jax.types import Query, Receiver, Transmitter, make_receiver
 
 ORDERS = (0, 1, 2)
 SAME_PLACE_M = 2e-3
@@ -54,13 +54,15 @@ def known_params(field: coherent.WaveField, dataset: Dataset) -> Any:
 
 
 class Ours:
-    """The coherent field with its materials known, one isotropic element."""
+    """The coherent field with its materials known; by default, one isotropic element receives."""
 
-    def __init__(self, dataset: Dataset, config: coherent.WaveConfig):
+    def __init__(self, dataset: Dataset, config: coherent.WaveConfig, receiver: Receiver | None = None):
         begin = time.perf_counter()
         field = coherent.make_field(DatasetScene(dataset).mesh(), config)
         self.params = known_params(field, dataset)
-        self.plan = field.plan(self.params, make_receiver(dataset.receiver().position, element_positions=np.zeros((1, 3))))
+        if receiver is None:
+            receiver = make_receiver(dataset.receiver().position, element_positions=np.zeros((1, 3)))
+        self.plan = field.plan(self.params, receiver)
         self.set_up_s = time.perf_counter() - begin
 
     def fields(self, tx: Float[np.ndarray, "tx 3"], frequencies_hz: Float[np.ndarray, " freq"]) -> Any:

@@ -10,6 +10,7 @@ that it crosses. Every pair of the two snapshots, the data of the scene and the 
 import dataclasses
 import itertools
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,20 +26,19 @@ from data_gen.ceilings import scaled_images
 from data_gen.llvm import ensure_backend
 from data_gen.scenes import get_scene
 from data_gen.settings import SolverSettings
-from experiments.bench.tracers import known_params
+from experiments.bench.tracers import Ours
 from experiments.results import FOLDER
 from wbgs_jax import coherent
 from wbgs_jax._util.cli import run_command, say
 from wbgs_jax._util.compilation import use_compilation_cache
 from wbgs_jax._util.files import write_json
 from wbgs_jax.data import Dataset, load_dataset
-from wbgs_jax.data.scene import DatasetScene
 from wbgs_jax.evaluation.report import environment
 from wbgs_jax.metrics import ssim
 from wbgs_jax.propagation.paths import InteractionType
 from wbgs_jax.propagation.transport import element_voltages
 from wbgs_jax.radio.array import SPEED_OF_LIGHT
-from wbgs_jax.types import Query
+from wbgs_jax.radio.channel import Paths
 
 LETTERS = {one.sionna: one.name[0] for one in InteractionType}
 """First letters of the kinds of interactions, by the simulator's numbers."""
@@ -53,6 +53,8 @@ class PathSet(NamedTuple):
     length_m: Float[np.ndarray, " k"]
     kinds: list[str]
     """Letters of the interactions in order: T(ransmitted), R(eflected), D(iffracted)."""
+    points: Float[np.ndarray, "k 5 3"] | None = None
+    """Points of the field's paths, metres (`PathGeometry.points`)."""
 
     @property
     def power(self) -> Float[np.ndarray, " k"]:
@@ -95,22 +97,22 @@ class Room:
 
     def __init__(self, dataset: Dataset) -> None:
         config = coherent.WaveConfig(diffracted_tried=4096, diffracted_kept=1024)  # none is left out for lack of room
-        field = coherent.make_field(DatasetScene(dataset).mesh(), config)
-        params = known_params(field, dataset)
-        self.params = dataclasses.replace(params, excess_loss=jnp.zeros_like(params.excess_loss))
-        self.plan = field.plan(self.params, dataset.receiver())
+        self.field = Ours(dataset, config, dataset.receiver())
+        nothing = jnp.zeros_like(self.field.params.excess_loss)
+        self.field.params = dataclasses.replace(self.field.params, excess_loss=nothing)
         self.mesh = trimesh.Trimesh(dataset.vertices, dataset.faces, process=False)
 
-    def paths(self, position: Float[np.ndarray, "3"], frequency_hz: float) -> tuple[PathSet, Float[np.ndarray, "k 5 3"]]:
-        """Returns the paths of a transmitter, and their points, metres."""
-        query = Query(jnp.asarray(position, jnp.float32)[None], jnp.full(1, frequency_hz, jnp.float32))
-        arrived = coherent.channels(self.params, self.plan, query)
-        arrived = jax.tree.map(lambda leaf: leaf[0] if getattr(leaf, "ndim", 0) else leaf, arrived)
-        voltages = np.asarray(element_voltages(arrived, self.plan.receiver, jnp.float32(frequency_hz)))
+    def paths(self, position: Float[np.ndarray, "3"], frequencies_hz: Sequence[float]) -> list[PathSet]:
+        """Returns the paths of a transmitter, traced once, at every frequency."""
+        arrived = self.field.fields(position[None], np.asarray(frequencies_hz))
+        return [self._at(jax.tree.map(lambda leaf, i=i: leaf[0, i], arrived), hz) for i, hz in enumerate(frequencies_hz)]
+
+    def _at(self, arrived: Paths, frequency_hz: float) -> PathSet:
+        voltages = np.asarray(element_voltages(arrived, self.field.plan.receiver, jnp.float32(frequency_hz)))
         there = np.flatnonzero(np.abs(voltages).max(-1) > 0)
         kinds = ["".join(InteractionType(int(k)).name[0] for k in row if k) for row in np.asarray(arrived.interaction)[there]]
-        points = np.asarray(arrived.points, np.float64)[there]
-        return PathSet(voltages[there], np.asarray(arrived.length, np.float64)[there], kinds), points
+        lengths, points = (np.asarray(of, np.float64)[there] for of in (arrived.length, arrived.points))
+        return PathSet(voltages[there], lengths, kinds, points)
 
     def crossed(self, points: Float[np.ndarray, "5 3"]) -> int:
         """Returns the number of surfaces between the points of a path, by ray casts through the triangles."""
@@ -127,13 +129,12 @@ class Room:
         return count
 
 
-def account(dataset: Dataset, room: Room, traced: Any, tx: int, frequency_hz: float) -> dict[str, Any]:
+def account(dataset: Dataset, room: Room, own: PathSet, traced: Any, tx: int, frequency_hz: float) -> dict[str, Any]:
     """Returns what is matched and what is missing for one transmitter, as shares of the traced power, and the SSIM between the
     spectra of the data, of the field, and of all paths of either."""
     link = int(np.flatnonzero((dataset.tx_index == tx) & np.isclose(dataset.frequencies_hz, frequency_hz, rtol=1e-4))[0])
     kinds = ["".join(LETTERS[int(k)] for k in row if k) for row in traced.kinds]
     truth = PathSet(traced.coefficients, traced.delays * SPEED_OF_LIGHT, kinds)
-    own, points = room.paths(dataset.tx_positions[link], frequency_hz)
     pairs, total = match(truth, own), truth.power.sum()
     known = pairs.partner >= 0
     error = np.sum(np.abs(truth.voltages[known] - own.voltages[pairs.partner[known]]) ** 2)
@@ -141,7 +142,8 @@ def account(dataset: Dataset, room: Room, traced: Any, tx: int, frequency_hz: fl
     for k in np.flatnonzero(~known):
         lacking[group(kinds[k])] += float(truth.power[k] / total)
     strong = np.flatnonzero(pairs.extra & (own.power > 1e-3 * total))
-    confirmed = np.array([room.crossed(points[k]) == own.kinds[k].count("T") for k in strong], bool)
+    assert own.points is not None, "of the field"
+    confirmed = np.array([room.crossed(own.points[k]) == own.kinds[k].count("T") for k in strong], bool)
     union = truth.voltages.sum(0) + own.voltages[pairs.extra].sum(0)
     elements = np.asarray(dataset.receiver().element_wavelengths(jnp.float32(frequency_hz)))
     images = scaled_images(np.stack([own.voltages.sum(0), union]), elements)
@@ -184,7 +186,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             some = [row for row in rows if row["in_sight"] is sight and row["ghz"] == ghz]
             if not some:
                 continue
-            names = [name for name in some[0] if name.startswith(("ssim", "matched", "error", "simulator", "of_these"))]
+            names = [name for name, value in some[0].items() if isinstance(value, float) and name != "ghz"]
             groups = sorted({name for row in some for name in row["field_lacks"]})
             found[f"{'in' if sight else 'out_of'}_sight_{ghz:g}_ghz"] = {
                 "transmitters": len(some),
@@ -223,8 +225,10 @@ def main() -> None:
         size = simulator.settings.tx_per_call
         for some in (tx[i : i + size] for i in range(0, len(tx), size)):
             positions = np.stack([dataset.tx_positions[dataset.tx_index == number][0] for number in some])
-            for hz, paths in zip(frequencies, simulator.paths(positions, frequencies), strict=True):
-                rows += [account(dataset, room, own, int(number), hz) for number, own in zip(some, paths, strict=True)]
+            traced = simulator.paths(positions, frequencies)
+            for i, number in enumerate(some):
+                own = room.paths(positions[i], frequencies)
+                rows += [account(dataset, room, own[k], traced[k][i], int(number), hz) for k, hz in enumerate(frequencies)]
             say(f"scene {scene}: {len(rows) // len(frequencies)} of {len(tx)} transmitters")
         found[f"scene{scene}"] = {"summary": summary(rows), "rows": rows}
         write_json(command.out, found | environment())

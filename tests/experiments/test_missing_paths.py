@@ -53,25 +53,23 @@ def test_groups(kinds, name):
 
 def test_crossings_are_those_of_the_field(dataset, room):
     """Ray casts through the triangles count the same transmissions as the field, on every path of one transmitter."""
-    own, points = room.paths(dataset.tx_positions[dataset.train[0]], 10e9)
+    (own,) = room.paths(dataset.tx_positions[dataset.train[0]], [10e9])
     strong = np.argsort(-own.power)[:40]
     assert len({own.kinds[k].count("T") for k in strong}) > 1
-    assert [room.crossed(points[k]) for k in strong] == [own.kinds[k].count("T") for k in strong]
+    assert [room.crossed(own.points[k]) for k in strong] == [own.kinds[k].count("T") for k in strong]
 
 
 def test_a_path_that_is_taken_away_is_found_again(dataset, room):
     """The field's own paths, without the strongest, as if a simulator had traced them: exactly that one is missing."""
     link = dataset.train[0]
-    own, _ = room.paths(dataset.tx_positions[link], 10e9)
+    (own,) = room.paths(dataset.tx_positions[link], [10e9])
     numbers = {"T": 4, "R": 1, "D": 8}
     kinds = np.zeros((len(own.kinds), 5), int)
     for row, letters in zip(kinds, own.kinds, strict=True):
         row[: len(letters)] = [numbers[letter] for letter in letters]
     left = np.arange(len(own.kinds)) != np.argmax(own.power)
-    traced = SimpleNamespace(
-        coefficients=own.voltages[left], delays=own.length_m[left] / SPEED_OF_LIGHT, kinds=kinds[left], order=None
-    )
-    row = account(dataset, room, traced, int(dataset.tx_index[link]), 10e9)
+    traced = SimpleNamespace(coefficients=own.voltages[left], delays=own.length_m[left] / SPEED_OF_LIGHT, kinds=kinds[left])
+    row = account(dataset, room, own, traced, int(dataset.tx_index[link]), 10e9)
     expected = own.power.max() / own.power[left].sum()
     assert row["matched"] == pytest.approx(1, abs=1e-6) and row["error_of_matched"] < 1e-9
     assert row["simulator_lacks"] == pytest.approx(expected, rel=1e-5)
