@@ -12,7 +12,7 @@ from builders.synthetic import FREQUENCIES_HZ, tiny_settings
 from builders.wave_runs import PARTS, places, run_in, snapshots
 
 from wbgs_jax.radio.antenna import Antenna, upright
-from wbgs_jax.training.calibration.antennas import antenna_candidates, gains_much, search_antennas
+from wbgs_jax.training.calibration.antennas import antenna_candidates, choose_pair, gains_much, search_antennas, search_pair
 from wbgs_jax.training.calibration.objective import make_scores, surely_better
 
 N_TX = 30
@@ -28,13 +28,17 @@ def untrained(tmp_path_factory):
     return run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("untrained"), places(N_TX), FREQUENCIES_HZ)
 
 
-def searched(run, known_elements=False, **antennas):
-    """What is found in snapshots that the field itself made with these antennas."""
+def scored(run, count, **antennas):
+    """Returns how candidates are scored on the first `count` snapshots, made by the field with these antennas, and whose they
+    are."""
     plan = run.field.plan(run.state.params, run.dataset.receiver(), prepared=run.prepared)
     y = snapshots(dataclasses.replace(run.state.params, **antennas), plan, run.prepared, run.data.links)
-    data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:60]
-    score = make_scores(run.field, run.prepared, data, jnp.asarray(spectra))
-    tx = run.dataset.tx_index[spectra]
+    data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:count]
+    return make_scores(run.field, run.prepared, data, jnp.asarray(spectra)), run.dataset.tx_index[spectra]
+
+
+def searched(run, known_elements=False, **antennas):
+    score, tx = scored(run, 60, **antennas)
     return search_antennas(run.state.params, score, tx, SETTINGS.calibration, known_elements)
 
 
@@ -125,6 +129,54 @@ def test_few_transmitters_seldom_take_a_wrong_antenna(count, rng):
     harm = [taken(np.array(STORED[name]), count, rng)[1] for name in ("scene1", "scene2", "scene4")]
     assert np.mean(harm) < 0.03  # 0.01 and less in 3,600 draws; three standard errors more in these
     assert count < 24 or np.mean(harm) < 0.01
+
+
+PAIRS = np.load(Path(__file__).parent / "antenna_pairs.npz")
+"""Scores of all pairs of antennas in data sets, by antenna of the elements, of the transmitters (the first ones are what is
+there) and training transmitter."""
+
+
+def paired(scores, count, rng, draws=200):
+    """How often so many of the transmitters take other antennas, and how often such as are worse over all transmitters."""
+    over_all = scores.mean(-1)
+    chosen = [choose_pair(scores[..., rng.choice(scores.shape[-1], count, replace=False)]) for _ in range(draws)]
+    found = np.array([over_all[pair] for pair in chosen])
+    return np.mean([pair != (0, 0) for pair in chosen]), np.mean(found > over_all[0, 0] + 0.01)
+
+
+@pytest.mark.parametrize(("count", "least"), [(2, 0.6), (3, 0.82), (5, 0.95), (11, 0.99)])
+def test_two_ends_together_are_found_with_few_transmitters(count, least, rng):
+    """In the authors' sample transmitters look down and elements are dipoles; 5 transmitters see the former alone in four draws
+    of ten, 2 in none."""
+    scores = PAIRS["example1"].astype(float)
+    another, worse = paired(scores, count, rng)
+    assert another > least and worse < 0.02
+    assert choose_pair(scores[:1, :, :11])[0] == 0 and choose_pair(scores[:1, :1, :11]) == (0, 0)
+
+
+@pytest.mark.parametrize(("count", "most"), [(2, 0.06), (3, 0.04), (5, 0.02), (11, 0.0)])
+def test_few_transmitters_seldom_take_a_wrong_pair(count, most, rng):
+    """All antennas are isotropic there. Here every transmitter has two spectra; with ten, wrong pairs are a third as many."""
+    harm = [paired(PAIRS[name].astype(float), count, rng)[1] for name in ("scene1", "scene2", "scene4")]
+    assert np.mean(harm) <= most
+
+
+@pytest.mark.heavy
+def test_a_pair_is_named_by_three_transmitters(untrained, rng):
+    candidates = antenna_candidates()
+    wanted = {"element": "dipole along +z", "transmitter": "tr38901 along +x towards -z"}
+    score, tx = scored(untrained, 60, **{end: candidates[name] for end, name in wanted.items()})
+    few = np.isin(tx, np.unique(tx)[:3])
+
+    def of_few(tried, first=None):
+        return score(tried)[:, few][:, :first]
+
+    params, taken = search_pair(untrained.state.params, of_few, tx[few], known_elements=False)
+    assert taken == wanted
+    np.testing.assert_array_equal(params.element.exponents, candidates[wanted["element"]].exponents)
+    assert search_pair(untrained.state.params, score, tx, known_elements=False)[1] == {}  # there are many
+    _, known = search_pair(untrained.state.params, of_few, tx[few], known_elements=True)
+    assert "element" not in known
 
 
 def test_no_gain_by_the_choice_among_many(rng):

@@ -47,7 +47,7 @@ class TrainingProgress:
         self.total, self.start_step = total, done
         self.held_out: dict[str, float] = {}
         self.begun = self.started = time.monotonic()
-        self.compiled = False
+        self.entries = 0
         self.state = "compiling"
         console = Console(file=sys.stderr)
         self.bar = Bar(
@@ -86,15 +86,18 @@ class TrainingProgress:
         shown = {LABELS.get(name, name): value for name, value in (entry | self.held_out).items() if name not in UNSHOWN}
         figures = [f"{name} {value:.4g}" for name, value in shown.items() if value is not None]
         elapsed = max(time.monotonic() - self.started, 1e-9)
-        rate = (step - self.start_step) / elapsed if self.compiled else None
+        rate = (step - self.start_step) / elapsed if self.entries > 1 else None
         status = "  ".join([*figures, *([] if rate is None else [f"{rate:.1f} steps/s"])])
         self.bar.update(self.task, completed=step, status=status)
         left = "" if rate is None else f"  {(self.total - step) / max(rate, 1e-9):.0f} s left"
         self.state = f"step {step}/{self.total}  {status}{left}"
         if step >= self.total:
             self.pulse.print()
-        if not self.compiled:  # calibration and compilation happen once: their time is not part of the rate
-            self.compiled, self.started, self.start_step = True, time.monotonic(), step
+        self.entries += 1
+        # Calibration and compilation happen once: their time is not part of the rate. While the first evaluation is compiled,
+        # the second epoch runs.
+        if self.entries <= 2:
+            self.started, self.start_step = time.monotonic(), step
 
 
 PROBE_SECONDS = 0.0095

@@ -24,10 +24,14 @@ ENDS = "transmitter", "element"
 """Parameters whose antennas are calibrated."""
 UP = ("+x", "+y", "+z")
 """Directions of an antenna's z axis; an opposite direction only changes the sign."""
+FEW = 20
+"""Number of transmitters below which pairs of antennas are tried."""
 LARGE, SURE_OF_LARGE = 0.3, 1.5
 """A large gain (natural logarithm: the error is reduced by a quarter) must be significant by fewer standard errors. With few
 transmitters it is much worse to miss the correct antenna than to take a wrong one that gains nothing; docs/history.md lists the
 probabilities of both."""
+LARGE_OF_PAIR, PAIR_SPECTRA = 0.5, 32
+"""Gain that a pair of antennas must have, and number of spectra on which pairs are compared."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,51 @@ def _antenna(pattern: str, forward: str, up: str) -> Antenna:
     return Antenna(
         jnp.asarray(np.roll(quaternion, 1), jnp.float32), jnp.asarray(PATTERN_EXPONENTS[pattern], jnp.float32)
     )  # SciPy has w last
+
+
+def search_pair(
+    params: WaveParams, score: Scores, tx_index: Int[np.ndarray, " n"], known_elements: bool
+) -> tuple[WaveParams, dict[str, str]]:
+    """Returns parameters with the antennas that `choose_pair` chooses for few transmitters, and descriptions of those that are
+    new; unchanged parameters for many transmitters, and for a single one.
+
+    Args:
+        params: parameters.
+        score: scores of candidates.
+        tx_index: transmitters of the scored spectra.
+        known_elements: whether the data define the pattern of the elements, which is then unchanged.
+    """
+    if not 1 < len(np.unique(tx_index)) < FEW:
+        return params, {}
+    tx_index = tx_index[:PAIR_SPECTRA]
+    elements, transmitters = ([{}, *({end: name} for name in antenna_candidates())] for end in reversed(ENDS))
+    elements = elements[:1] if known_elements else elements
+    pairs = [element | transmitter for element in elements for transmitter in transmitters]
+    # Arrays of its own for each end, since training donates each of them once.
+    antennas = {end: antenna_candidates() for end in ENDS}
+    tried = [replaced(params, **{end: antennas[end][name] for end, name in pair.items()}) for pair in pairs]
+    scores = np.stack([by_transmitter(own, tx_index) for own in score(tried, len(tx_index))])
+    element, transmitter = choose_pair(scores.reshape(len(elements), len(transmitters), -1))
+    best = element * len(transmitters) + transmitter
+    return tried[best], pairs[best]
+
+
+def choose_pair(scores: Float[np.ndarray, "k m n"]) -> tuple[int, int]:
+    """Returns the best antenna of the elements and that of the transmitters, by number; 0 is the present one.
+
+    Few transmitters are little evidence of either end, but sufficient for both together. Both the gain and the choice between
+    one end and both are cross-validated (`gains_of_chosen`).
+
+    Args:
+        scores: score of each of N transmitters by antenna of the elements and of the transmitters.
+    """
+    best, largest = (0, 0), LARGE_OF_PAIR
+    for some in (scores[:1], scores[:, :1], scores) if scores.shape[-1] > 1 else ():
+        flat = some.reshape(-1, scores.shape[-1])
+        if len(flat) > 1 and (gain := gains_of_chosen(flat).mean()) > largest:
+            place = np.unravel_index(1 + flat[1:].sum(1).argmin(), some.shape[:2])
+            best, largest = (int(place[0]), int(place[1])), gain
+    return best
 
 
 def search_antennas(
@@ -97,12 +146,14 @@ def search_antennas(
 
 
 def gains_much(scores: Float[np.ndarray, "k n"], tx_index: Int[np.ndarray, " n"]) -> bool:
-    """Returns whether the best of several candidates gains more than `LARGE` over the first one.
+    """Returns whether the best of several candidates gains more than `LARGE` over the first one."""
+    gains = gains_of_chosen(np.stack([by_transmitter(own, tx_index) for own in scores]))
+    return bool(gains.mean() > LARGE and surely_better(gains, np.arange(len(gains)), SURE_OF_LARGE))
 
-    For every transmitter the candidate is chosen with the other transmitters, so that the selection does not bias its gain.
-    """
-    of_tx = np.stack([by_transmitter(own, tx_index) for own in scores])
-    chosen = 1 + (of_tx.sum(1, keepdims=True) - of_tx)[1:].argmin(0)
-    transmitters = np.arange(of_tx.shape[1])
-    gains = of_tx[0] - of_tx[chosen, transmitters]
-    return bool(gains.mean() > LARGE and surely_better(gains, transmitters, SURE_OF_LARGE))
+
+def gains_of_chosen(scores: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
+    """Returns the gain over the first candidate for each of N transmitters, if another one is chosen with the remaining
+    transmitters, so that the selection does not bias it."""
+    chosen = 1 + (scores.sum(1, keepdims=True) - scores)[1:].argmin(0)
+    gains: Float[np.ndarray, " n"] = scores[0] - scores[chosen, np.arange(scores.shape[1])]
+    return gains

@@ -23,7 +23,7 @@ from wbgs_jax.fields.coherent_model import WaveParams
 from wbgs_jax.radio.antenna import is_directional
 from wbgs_jax.radio.channel import beyond_free_space_db, received_power_db
 from wbgs_jax.training.calibration.alignment import Place, learn_geometry
-from wbgs_jax.training.calibration.antennas import search_antennas
+from wbgs_jax.training.calibration.antennas import search_antennas, search_pair
 from wbgs_jax.training.calibration.array_gains import search_tuning
 from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
 from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable
@@ -154,10 +154,15 @@ class Calibration(Hook):
     def _antennas(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> tuple[WaveParams, bool]:
         """Returns parameters with calibrated antennas, and whether any antenna has changed."""
         count, known = self.config.antenna_spectra, is_directional(problem.data.receivers.antenna)
-        params, found = search_antennas(params, problem.scores(count), problem.tx_index(count), self.config, known)
-        before = report.get("antennas", dataclasses.asdict(found))
-        report["antennas"] = before | {"after": found.after, "taken": before["taken"] | found.taken}
-        return params, bool(found.taken)
+        score, tx_index, pair = problem.scores(count), problem.tx_index(count), dict[str, str]()
+        if "antennas" not in report:
+            before = float(score([params]).mean())
+            params, pair = search_pair(params, score, tx_index, known)
+            report["antennas"] = {"before": before, "taken": {}}
+        params, found = search_antennas(params, score, tx_index, self.config, known)
+        taken = pair | found.taken
+        report["antennas"] |= {"after": found.after, "taken": report["antennas"]["taken"] | taken}
+        return params, bool(taken)
 
     def _tuning(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> Calibratable:
         """Returns the field with calibrated array gains, which needs at least two transmitters."""
