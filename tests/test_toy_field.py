@@ -268,6 +268,7 @@ def test_it_is_used_as_a_library(trained, tmp_path):
     np.testing.assert_allclose(again([1.0, 2.0, 1.5], 5e9), result.params["image"][0], atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_a_receiver_alone_is_looked_at_as_if_it_were_the_only_one(trained, tmp_path):
     """`--receiver 1` of three, and the field made of it."""
     scene = wb.load_trained(trained("snapshot", 3)).config.source

@@ -62,6 +62,7 @@ def test_aimed_plates_send_the_wave_to_their_user(rng):
             np.testing.assert_allclose(ways[0] @ normal, ways[1] @ normal, atol=1e-4)
 
 
+@pytest.mark.heavy
 def test_slopes_are_differences(rng):
     plate = make_reflector(TX, np.array([USER, [3.5, 0.5, 1.0]]), (0.5, 0.4), HZ)
     near = FACING[0] + jnp.asarray(rng.uniform(-0.03, 0.03, 5), jnp.float32)
@@ -72,6 +73,7 @@ def test_slopes_are_differences(rng):
         assert float(slope) == pytest.approx(float(ahead - behind) / 4e-3, rel=0.03, abs=0.5)
 
 
+@pytest.mark.heavy
 def test_the_best_plate_halves_the_angle(rng):
     """For one user the law of reflection; and no other pose of thousands serves it better."""
     plate = make_reflector(TX, USER, (0.5, 0.4), HZ)

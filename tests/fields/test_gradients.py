@@ -223,6 +223,7 @@ def test_empty_slots_have_no_gradient(rng, x64, name):
         assert not np.asarray(leaf)[empty].any() and np.asarray(leaf)[~empty].any()
 
 
+@pytest.mark.heavy
 def test_materials_of_known_thickness_have_no_gradient_of_it(rng, x64):
     _, (params, _, _) = differentiated("wave")(random_arguments(rng, "wave"), rng.normal(size=(2, 90, 360)))
     assert (np.asarray(params.materials.log_thickness) != 0).tolist() == [True, False, True]

@@ -84,6 +84,7 @@ def test_rays_along_the_axes_reach_the_faces_opposite():
     np.testing.assert_allclose(rays.length, [2.7, 2.7, 1.8, 3.3, 1.8, 1.0], rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_sampled_pixels_are_those_of_the_whole_image(rng):
     field = make_field()
     params = make_params(rng, field)
@@ -155,6 +156,7 @@ def test_its_pixels_are_drawn_with_the_runs_seed(tmp_path):
     assert first.epoch()["loss"] != other.epoch()["loss"]
 
 
+@pytest.mark.heavy
 def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
     dataset = tiny_dataset()
     dataset = dataclasses.replace(dataset, validation=dataset.test, test=dataset.test[:0])

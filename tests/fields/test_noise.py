@@ -87,6 +87,7 @@ def found(unaware, learned, observed, tx):
     return floor_of(ExpertPredictions(unaware, np.zeros_like(unaware), learned), observed, tx)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("share", [0.01, 0.1])
 def test_it_is_found_and_hardly_ever_too_high(rng, share):
     arguments, floor = known(rng, share, n_tx=30, per_tx=4)
@@ -100,6 +101,7 @@ def test_raising_is_taking_out_and_adding_again(rng):
     np.testing.assert_array_equal(at_least_floor(pas, 0.0), pas)
 
 
+@pytest.mark.heavy
 def test_without_noise_there_is_none(rng):
     clean, _, observed, tx = known(rng, 0.0)[0]
     assert found(clean, clean, observed, tx) == 0
@@ -114,6 +116,7 @@ def test_missing_paths_look_like_noise_to_one_field_alone(rng):
     assert 0 < found(fewer, learned, observed, tx) < 1.2 * floor
 
 
+@pytest.mark.heavy
 def test_where_no_path_arrives_both_have_learned_the_floor(rng):
     """The coherent field takes over what the splatting one says there."""
     (clean, learned, observed, tx), _ = known(rng, 0.1)
@@ -131,6 +134,7 @@ def test_noise_of_a_diverged_field_stays_visible():
     assert np.isnan(without_floor(jnp.full((1, 90, 360), jnp.nan), 0.01)).all()
 
 
+@pytest.mark.heavy
 def test_what_is_not_sure_is_none(rng):
     (clean, learned, observed, tx), _ = known(rng, 0.1)
     assert found(clean, learned, observed, tx) > 0

@@ -30,6 +30,7 @@ def antennas(rng):
     return Antenna(jnp.asarray(quaternions, jnp.float32), jnp.array([[1.0, 0.0], [0.3, 0.8]]))
 
 
+@pytest.mark.heavy
 def test_each_transmitter_has_its_own_antenna(setup, rng):
     """As if the field had learned it for all of them."""
     _, params, _, render = setup
@@ -53,6 +54,7 @@ def test_the_orientation_of_a_transmitter_rotates_its_antenna(setup, rng):
     np.testing.assert_allclose(turned, expected[0], atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.heavy
 def test_a_tabulated_antenna_is_that_of_its_table(setup):
     """The table of the dipole."""
     _, params, _, render = setup

@@ -215,6 +215,7 @@ def test_links_of_several_receivers_are_rendered_as_those_of_each_alone():
         wave.trace(field.plan(params, own, prepared=field.prepare(dataset.links(index), dataset.receivers)), jnp.ones((1, 3)))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("parts", [SHEETS, pytest.param(PARTS, marks=pytest.mark.slow)], ids=["sheets", "edges"])
 def test_all_parameters_have_finite_gradients(rng, parts):
     """Of image, correlation and power losses together, from metal's frequencies to those of dust, near the floor and above.

@@ -38,6 +38,7 @@ def products_without_precision(jaxpr):
     return found
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("costly", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("room", [pytest.param(name, marks=[pytest.mark.slow] * (name == "hybrid")) for name in ROOMS])
 def test_every_public_function_lowers_for_cuda(room, costly):

@@ -216,6 +216,7 @@ def test_spectra_of_a_dataset_are_those_of_its_queries(trained, predict, monkeyp
     np.testing.assert_allclose(images, expected, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_links_of_any_number_share_a_compiled_program(tmp_path, monkeypatch):
     """Paths are prepared for all links and handed over for those of a block: the answers are those of the whole plan."""
     coherent = load_trained(make_coherent_run(tmp_path / "run"))

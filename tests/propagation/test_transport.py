@@ -270,6 +270,7 @@ def test_curved_waves_are_those_of_a_point_source_and_plane_ones_their_limit(rng
         assert error > 0.2 if far < 10 else error < 2e-3
 
 
+@pytest.mark.heavy
 def test_gradients_on_the_line_of_an_edge_are_finite(rng):
     """Above the corner of a table at round coordinates; nothing is diffracted along its edge."""
     rx, frequency = (3.0, 0.4, 1.3), jnp.float32(5e9)

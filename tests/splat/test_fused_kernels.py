@@ -92,6 +92,7 @@ def compare(monkeypatch, rng, kind, b, tiling, spare=0):
     return jobs
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["all around", "crowded", "on the seam"])
 def test_kernels_draw_the_reference_and_have_its_gradients(kind, rng, monkeypatch):
     jobs = compare(monkeypatch, rng, kind, 3, LARGE_TILES, spare=40)

@@ -286,6 +286,7 @@ def test_a_gradient_that_is_not_finite_is_not_committed(tmp_path, dataset):
     assert_equal_states(state, before)
 
 
+@pytest.mark.heavy
 def test_the_loss_decreases(tmp_path, dataset):
     """Three spectra are learned by heart."""
     few = dataclasses.replace(dataset, train=dataset.train[:3])
