@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 from jaxtyping import Float
+from scipy.special import expit
 
 from experiments.few import SHARED
 from experiments.results import FOLDER, read_rows
@@ -72,7 +73,7 @@ def decisions() -> tuple[Decision, ...]:
         Decision("shares of the two fields by query", VALIDATION_LINKS, "validation", 1.0, "one share for all"),
         Decision("residuals of neighbours", fit_kriging.SCORED, "validation", fit_kriging.SURE, "not used; never below 20"),
         Decision("share of a field beside simple methods", 10_000, "validation", ERRORS, "the simple methods"),
-        Decision("... of a field that follows paths", 10_000, "validation", ERRORS_WITH_PATHS, "the simple methods"),
+        Decision("... of a field that follows paths", 10_000, "validation", ERRORS_WITH_PATHS, "the field"),
     )
 
 
@@ -102,17 +103,20 @@ def simulate(rng: np.random.Generator) -> dict[str, dict[str, float]]:
     if not pairs:
         raise UserError(f"{FOLDER} holds no scores of {FEWEST} transmitters")
 
-    def by_share(first: np.ndarray, second: np.ndarray, errors: float) -> float:
-        scores = (1 - SHARES) * first[:, None] + SHARES * second[:, None]
-        (bias, _), alone = choose_share(scores, np.zeros(len(first)), np.arange(len(first)), errors)
-        return 1.0 if alone else 1 / (1 + np.exp(-bias))
+    def by_share(first: np.ndarray, second: np.ndarray, with_paths: bool) -> float:
+        """Returns the weight of the second: a field beside simple methods, or simple methods beside a field with paths."""
+        simple, field = (second, first) if with_paths else (first, second)
+        scores = (1 - SHARES) * simple[:, None] + SHARES * field[:, None]
+        (bias, _), alone = choose_share(scores, np.zeros(len(first)), np.arange(len(first)), with_paths)
+        share = 1.0 if alone else float(expit(bias))
+        return 1 - share if with_paths else share
 
     tests = {
         "surely_better_1": lambda a, b: float(surely_better(b - a, np.arange(len(a)), 1.0)),
         "surely_better_2": lambda a, b: float(surely_better(b - a, np.arange(len(a)), 2.0)),
         "surely_better_3": lambda a, b: float(surely_better(b - a, np.arange(len(a)), 3.0)),
-        "share_2": lambda a, b: by_share(a, b, ERRORS),
-        "share_1": lambda a, b: by_share(a, b, ERRORS_WITH_PATHS),
+        "share_2": lambda a, b: by_share(a, b, with_paths=False),
+        "share_1": lambda a, b: by_share(a, b, with_paths=True),
     }
     found: dict[str, dict[str, float]] = {}
     for name, taken in tests.items():

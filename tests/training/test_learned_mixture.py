@@ -15,8 +15,6 @@ from wbgs_jax.metrics import ssim
 from wbgs_jax.training import fit_mixture
 from wbgs_jax.training import fit_mixture as module
 from wbgs_jax.training.fit_mixture import (
-    ERRORS,
-    ERRORS_WITH_PATHS,
     HeldOut,
     Known,
     choose_share,
@@ -124,7 +122,7 @@ def test_a_field_that_knows_nothing_has_no_share_and_one_that_knows_stands_alone
     bad = learn_mixture(dataset, known, held(dataset, known, rng.random(truth.shape)))
     assert not bad.alone and bad.mixture.field[0] < -5 and "weight is 0.00" in bad.line
     close = 0.98 * truth
-    good = learn_mixture(dataset, known, held(dataset, known, close), ERRORS_WITH_PATHS)
+    good = learn_mixture(dataset, known, held(dataset, known, close), with_paths=True)
     assert good.alone and "used alone" in good.line
     none = learn_mixture(dataset, known, HeldOut(*(part[:0] for part in held(dataset, known, truth))))
     assert not none.alone and none.mixture.field[0] < -5
@@ -149,9 +147,11 @@ def scores_of(simple, field):
     return simple[:, None] * (1 - SHARES) + field[:, None] * SHARES
 
 
-def share_for(gains, errors=ERRORS):
+def share_for(gains, with_paths=False):
     simple = np.full(len(gains), 0.5)
-    (bias, slope), alone = choose_share(scores_of(simple, simple + gains), np.zeros(len(gains)), np.arange(len(gains)), errors)
+    (bias, slope), alone = choose_share(
+        scores_of(simple, simple + gains), np.zeros(len(gains)), np.arange(len(gains)), with_paths
+    )
     assert slope == 0
     return 1 / (1 + np.exp(-bias)), alone
 
@@ -164,9 +164,18 @@ def test_three_transmitters_that_agree_prove_little():
     assert share_for(np.full(60, -0.03))[0] < 0.01
 
 
-def test_one_transmitter_is_enough_for_a_field_that_follows_paths():
-    assert share_for(np.array([0.17]), ERRORS_WITH_PATHS)[1] and share_for(np.array([0.17]))[0] < 0.01
-    assert share_for(np.array([-0.05]), ERRORS_WITH_PATHS)[0] < 0.01
+def test_a_field_with_paths_stands_unless_simple_methods_are_better():
+    assert share_for(np.array([0.17]))[0] < 0.01
+    assert share_for(np.array([0.17]), with_paths=True)[1] and share_for(np.array([-0.05]), with_paths=True)[1]
+    assert share_for(np.array([-0.3]), with_paths=True)[0] < 0.01
+    assert share_for(np.full(8, -0.06), with_paths=True)[0] < 0.01
+
+
+def test_simple_methods_improve_a_field_with_paths_where_both_err():
+    field = np.full(8, 0.7)
+    scores = field[:, None] + 0.4 * SHARES * (1 - SHARES) - 0.1 * (1 - SHARES)
+    (bias, slope), alone = choose_share(scores, np.zeros(8), np.arange(8), with_paths=True)
+    assert not alone and slope == 0 and 0.5 < 1 / (1 + np.exp(-bias)) < 0.8
 
 
 def test_links_of_a_group_are_one_piece_of_evidence(rng):

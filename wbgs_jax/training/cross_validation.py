@@ -1,8 +1,8 @@
 """Corrections of a trained field if few transmitters were measured: simple methods, the weight of the field, and prediction
 intervals, all from cross-validation (host).
 
-A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than 20, simple methods
-are part of the mixture from the start (training/fit_mixture.py). A field without paths is cross-validated over all
+A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than 20, simple methods may be
+part of the mixture (training/fit_mixture.py). A field without paths is cross-validated over all
 transmitters, in blocks (`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A
 field with paths takes too long for that; only its predictions for the validation part are used.
 
@@ -32,7 +32,7 @@ from wbgs_jax.inference.kriging import Mixture
 from wbgs_jax.inference.predictor import as_observed, predict_spectra
 from wbgs_jax.training.batches import knows_no_paths
 from wbgs_jax.training.fit_intervals import confidence_of
-from wbgs_jax.training.fit_mixture import ERRORS, ERRORS_WITH_PATHS, Found, HeldOut, Known, learn_mixture
+from wbgs_jax.training.fit_mixture import Found, HeldOut, Known, learn_mixture
 from wbgs_jax.training.hooks import Say
 from wbgs_jax.training.loop import train
 
@@ -164,7 +164,7 @@ def learn_few(field: Field, params: Params, dataset: Dataset, training: Training
     known, held = cross_validated(field, params, dataset, training, say)
     if not len(held.links) and not no_paths:
         return Few(None, None, "no links were held out: the field, which predicts paths, is used alone")
-    found = learn_mixture(dataset, known, held, ERRORS if no_paths else ERRORS_WITH_PATHS)
+    found = learn_mixture(dataset, known, held, with_paths=not no_paths)
     if found.alone:
         return Few(None, None, found.line)
     return Few(found.mixture, _confidence(dataset, held, found), found.line)

@@ -2,9 +2,10 @@
 
 The simple methods are part of the mixture from the start. Their weights are those that predict measured spectra best (SSIM)
 from others at all distances: every spectrum is left out, alone and together with fractions of the other transmitters, the
-nearest ones. This is stacking, with weights that are functions of one number. The field receives a weight only if it is better
-on spectra that it was not trained on: of all weights, the one whose gain over the simple methods has the largest lower
-confidence bound. Without evidence its weight is zero.
+nearest ones. This is stacking, with weights that are functions of one number. A field without paths receives a weight only if
+it is better on spectra that it was not trained on: of all weights, the one whose gain over the simple methods has the largest
+lower confidence bound. Without evidence its weight is zero. A field with paths uses more information than the spectra: without
+evidence it is used alone, and simple methods receive a weight only if they improve on it.
 """
 
 import dataclasses
@@ -105,8 +106,8 @@ PRIOR, RIDGE, RIDGE_SLOPE = (-1.0, 0.0, 0.0, 2.0, 0.0), (0.03, 0.03, 0.03, 0.03,
 transmitter, on the squared distances from these and on squared slopes. A line of sight becomes apparent from few transmitters;
 the other methods differ little, and a few transmitters do not show which is best."""
 ERRORS, ERRORS_WITH_PATHS = 2.0, 1.0
-"""Distance of the bound below the mean gain, in standard errors; smaller for fields with paths, which use more information
-than the spectra."""
+"""Distance of the bound below the mean gain, in standard errors: of a field over simple methods, and of these over a field with
+paths."""
 
 
 class Known(NamedTuple):
@@ -146,21 +147,21 @@ class Found:
     """Summary for the terminal."""
 
 
-def learn_mixture(dataset: Dataset, known: Known, held: HeldOut, errors: float = ERRORS) -> Found:
+def learn_mixture(dataset: Dataset, known: Known, held: HeldOut, with_paths: bool = False) -> Found:
     """Returns the mixture for a field.
 
     Args:
         dataset: data of one receiver.
         known: measured spectra.
         held: predictions of the field for links that it was not trained on, possibly none.
-        errors: standard errors by which the field must be better.
+        with_paths: whether the field predicts paths.
     """
     mixture = learn_members(dataset, known)
     if not len(held.links):
         return Found(mixture, np.zeros(0), held.pas, np.zeros(0), False, "simple methods only: no links were held out")
     simple, distance = simple_answers(mixture, dataset, known, held)
     scores, u = share_scores(mixture, dataset, held, simple, distance)
-    field, alone = choose_share(scores, u, held.group, errors)
+    field, alone = choose_share(scores, u, held.group, with_paths)
     mixture = dataclasses.replace(mixture, field=jnp.asarray(field, jnp.float32))
     share = expit(field[0] + field[1] * u)
     answers = share[:, None, None] * held.pas + (1 - share[:, None, None]) * simple
@@ -348,7 +349,7 @@ def _means(known: Known, kept: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n 
 
 
 def choose_share(
-    scores: Float[np.ndarray, "n shares"], u: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], errors: float = ERRORS
+    scores: Float[np.ndarray, "n shares"], u: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"], with_paths: bool = False
 ) -> tuple[tuple[float, float], bool]:
     """Returns bias and slope of the logit of the field's weight, and whether the field alone is as good.
 
@@ -356,30 +357,31 @@ def choose_share(
         scores: SSIM of held-out links by the weight of the field (`fields.mixture.SHARES`).
         u: scaled_distance logarithm of the distance to the nearest measured transmitter.
         group: groups of links with correlated errors.
-        errors: distance of the bound below the mean gain, in standard errors.
+        with_paths: whether the field predicts paths, so that its weight is one without evidence instead of zero.
     """
-    bound = functools.partial(lower_bound, group=group, errors=errors)
-    best, found = 0.0, (-30.0, 0.0)
+    bound = functools.partial(lower_bound, group=group, errors=ERRORS_WITH_PATHS if with_paths else ERRORS)
+    default = -1 if with_paths else 0
+    best, found = 0.0, (30.0 if with_paths else -30.0, 0.0)
     slopes = (0.0, -1.0, 1.0)  # slopes of the logit of the field's weight that are tried
     least_gain = 0.005  # minimum gain (SSIM) of a slope other than 0, and of a mixture over the field alone
     for slope in slopes:
-        for middle in SHARES[1:]:
+        for middle in np.delete(SHARES, default):
             bias = float(logit(np.clip(middle, 1e-4, 1 - 1e-4)))
             share = expit(bias + slope * u) if slope else np.full(len(u), middle)
-            worth = bound(_at(scores, share) - scores[:, 0], share=float(share.mean()))
+            worth = bound(_at(scores, share) - scores[:, default], share=float(np.abs(share - SHARES[default]).mean()))
             if worth > best + (least_gain if slope and not found[1] else 0):
                 best, found = worth, (bias, slope)
     chosen = expit(found[0] + found[1] * u)
-    alone = (
-        bound(scores[:, -1] - scores[:, 0], share=1.0) > 0
-        and standard_error(_at(scores, chosen) - scores[:, -1], group)[0] < least_gain
-    )
+    alone = (with_paths or bound(scores[:, -1] - scores[:, 0], share=1.0) > 0) and standard_error(
+        _at(scores, chosen) - scores[:, -1], group
+    )[0] < least_gain
     return found, bool(alone)
 
 
 def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:
-    """Returns the lower confidence bound of a mean gain over groups. Their variance combines the observed one with a prior that
-    counts as two groups, so that a few groups that happen to agree are little evidence."""
+    """Returns the lower confidence bound of the mean gain over groups of a change of the field's weight by `share`. Their
+    variance combines the observed one with a prior that counts as two groups, so that a few groups that happen to agree are
+    little evidence."""
     by_group = by_transmitter(gains, group)
     n = len(by_group)
     # Prior standard deviation over transmitters of the gain of a field (SSIM), and the number of transmitters it counts as.
