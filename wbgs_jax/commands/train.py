@@ -282,11 +282,20 @@ def learn_beside(result: TrainResult, dataset: Dataset, config: RunConfig, folde
     """Fits and writes the corrections by measured spectra and the prediction intervals of a trained field."""
     trained = result.field, result.params, dataset
     if config.neighbours and is_few(dataset):
-        few = learn_few(*trained, Training(config.field, config.settings, result.steps, config.seed, folder, devices), say)
-        write_neighbours(folder, few.mixture)
-        say(few.line)
-        of_spectra, of_powers = learn_confidence(*trained, None)
-        write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
+        training = Training(config.field, config.settings, result.steps, config.seed, folder, devices)
+        state = "validation: simple methods, prediction intervals"
+
+        def stage(text: str) -> None:
+            nonlocal state
+            state = text
+            say(text)
+
+        with Pulse(lambda: state):
+            few = learn_few(*trained, training, stage)
+            write_neighbours(folder, few.mixture)
+            say(few.line)
+            of_spectra, of_powers = learn_confidence(*trained, None)
+            write_confidence(folder, of_spectra if few.mixture is None else few.confidence, of_powers)
         return
     with Pulse(lambda: "validation: correction by measured spectra nearby, prediction intervals") as pulse:
         pulse.print()
