@@ -28,17 +28,17 @@ def untrained(tmp_path_factory):
     return run_in(PARTS, SETTINGS, tmp_path_factory.mktemp("untrained"), places(N_TX), FREQUENCIES_HZ)
 
 
-def scored(run, count, **antennas):
-    """Returns how candidates are scored on the first `count` snapshots, made by the field with these antennas, and whose they
-    are."""
+def scored(run, **antennas):
+    """How candidates are scored on snapshots that the field itself made with these antennas, and whose these are."""
     plan = run.field.plan(run.state.params, run.dataset.receiver(), prepared=run.prepared)
     y = snapshots(dataclasses.replace(run.state.params, **antennas), plan, run.prepared, run.data.links)
-    data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:count]
+    data, spectra = run.data.with_observations(snapshots=y), run.dataset.train[:60]
     return make_scores(run.field, run.prepared, data, jnp.asarray(spectra)), run.dataset.tx_index[spectra]
 
 
 def searched(run, known_elements=False, **antennas):
-    score, tx = scored(run, 60, **antennas)
+    """What is found in such snapshots."""
+    score, tx = scored(run, **antennas)
     return search_antennas(run.state.params, score, tx, SETTINGS.calibration, known_elements)
 
 
@@ -162,10 +162,10 @@ def test_few_transmitters_seldom_take_a_wrong_pair(count, most, rng):
 
 
 @pytest.mark.heavy
-def test_a_pair_is_named_by_three_transmitters(untrained, rng):
+def test_a_pair_is_named_by_three_transmitters(untrained):
     candidates = antenna_candidates()
     wanted = {"element": "dipole along +z", "transmitter": "tr38901 along +x towards -z"}
-    score, tx = scored(untrained, 60, **{end: candidates[name] for end, name in wanted.items()})
+    score, tx = scored(untrained, **{end: candidates[name] for end, name in wanted.items()})
     few = np.isin(tx, np.unique(tx)[:3])
 
     def of_few(tried, first=None):

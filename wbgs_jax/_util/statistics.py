@@ -16,6 +16,6 @@ def standard_error(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n
     return float(by_tx.mean()), float(error)
 
 
-def by_transmitter(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, " k"]:
-    """Returns the mean gain of every transmitter."""
-    return np.array([gains[tx_index == tx].mean() for tx in np.unique(tx_index)])
+def by_transmitter(gains: Float[np.ndarray, "*c n"], tx_index: Int[np.ndarray, " n"]) -> Float[np.ndarray, "*c k"]:
+    """Returns the mean gain of every transmitter, along the last axis."""
+    return np.moveaxis(np.array([gains[..., tx_index == tx].mean(-1) for tx in np.unique(tx_index)]), 0, -1)

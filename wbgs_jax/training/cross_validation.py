@@ -2,9 +2,9 @@
 intervals, all from cross-validation (host).
 
 A validation part of a few transmitters is not sufficient to decide anything. If there are fewer than 20, simple methods may be
-part of the mixture (training/fit_mixture.py). A field without paths is cross-validated over all
-transmitters, in blocks (`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A
-field with paths takes too long for that; only its predictions for the validation part are used.
+part of the mixture (training/fit_mixture.py). A field without paths is cross-validated over all transmitters, in blocks
+(`held_out_blocks`): it is trained briefly several times, each time without a block of transmitters. A field with paths takes
+too long for that; only its predictions for the validation part are used.
 
 The transmitters of a block are adjacent in space, so that its centre is as far from the data as queries from elsewhere are.
 Random transmitters would lie between those that are trained.

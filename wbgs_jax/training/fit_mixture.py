@@ -372,10 +372,9 @@ def choose_share(
             if worth > best + (least_gain if slope and not found[1] else 0):
                 best, found = worth, (bias, slope)
     chosen = expit(found[0] + found[1] * u)
-    alone = (with_paths or bound(scores[:, -1] - scores[:, 0], share=1.0) > 0) and standard_error(
-        _at(scores, chosen) - scores[:, -1], group
-    )[0] < least_gain
-    return found, bool(alone)
+    proven = with_paths or bound(scores[:, -1] - scores[:, 0], share=1.0) > 0
+    gain, _ = standard_error(_at(scores, chosen) - scores[:, -1], group)
+    return found, bool(proven and gain < least_gain)
 
 
 def lower_bound(gains: Float[np.ndarray, " n"], share: float, group: Int[np.ndarray, " n"], errors: float = ERRORS) -> float:

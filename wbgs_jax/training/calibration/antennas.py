@@ -88,7 +88,7 @@ def search_pair(
     # Arrays of its own for each end, since training donates each of them once.
     antennas = {end: antenna_candidates() for end in ENDS}
     tried = [replaced(params, **{end: antennas[end][name] for end, name in pair.items()}) for pair in pairs]
-    scores = np.stack([by_transmitter(own, tx_index) for own in score(tried, len(tx_index))])
+    scores = by_transmitter(score(tried, len(tx_index)), tx_index)
     element, transmitter = choose_pair(scores.reshape(len(elements), len(transmitters), -1))
     best = element * len(transmitters) + transmitter
     return tried[best], pairs[best]
@@ -147,7 +147,7 @@ def search_antennas(
 
 def gains_much(scores: Float[np.ndarray, "k n"], tx_index: Int[np.ndarray, " n"]) -> bool:
     """Returns whether the best of several candidates gains more than `LARGE` over the first one."""
-    gains = gains_of_chosen(np.stack([by_transmitter(own, tx_index) for own in scores]))
+    gains = gains_of_chosen(by_transmitter(scores, tx_index))
     return bool(gains.mean() > LARGE and surely_better(gains, np.arange(len(gains)), SURE_OF_LARGE))
 
 

@@ -374,7 +374,8 @@ def by_object(
 ) -> Float[np.ndarray, " objects"]:
     """Returns the mean gain of links without each object, those that get worse counted as zero: a moved object can stand in the
     way of some links as before."""
-    return np.array([by_transmitter(np.maximum(score - own, 0), tx_index).mean() for own in without])
+    gains: Float[np.ndarray, " objects"] = by_transmitter(np.maximum(score - without, 0), tx_index).mean(-1)
+    return gains
 
 
 def _anywhere(

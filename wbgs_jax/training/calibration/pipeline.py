@@ -158,11 +158,10 @@ class Calibration(Hook):
         if "antennas" not in report:
             before = float(score([params]).mean())
             params, pair = search_pair(params, score, tx_index, known)
-            report["antennas"] = {"before": before, "taken": {}}
+            report["antennas"] = {"before": before, "taken": pair}
         params, found = search_antennas(params, score, tx_index, self.config, known)
-        taken = pair | found.taken
-        report["antennas"] |= {"after": found.after, "taken": report["antennas"]["taken"] | taken}
-        return params, bool(taken)
+        report["antennas"] |= {"after": found.after, "taken": report["antennas"]["taken"] | found.taken}
+        return params, bool(pair or found.taken)
 
     def _tuning(self, params: WaveParams, problem: CalibrationProblem, report: dict[str, Any]) -> Calibratable:
         """Returns the field with calibrated array gains, which needs at least two transmitters."""
