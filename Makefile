@@ -33,8 +33,8 @@ setup: $(READY)  ## make .venv with the locked dependencies (uv where it is, els
 
 $(READY): uv.lock requirements.lock pyproject.toml
 	@echo "setup: installing the locked dependencies into $(VENV) ..."
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "error: $(PYTHON) is older than Python 3.11; give another one: make PYTHON=python3.12 ..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "error: $(PYTHON) is not there or older than Python 3.11; give another one: make PYTHON=python3.12 ..." >&2; exit 2; }
 	@if command -v uv >/dev/null 2>&1; then \
 		uv sync --quiet --locked --inexact --python "$(PYTHON)" --extra dev $(if $(CUDA),--extra cuda); \
 	else \

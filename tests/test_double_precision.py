@@ -44,6 +44,7 @@ def run(code, *arguments, double=True):
     return float(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.heavy
 def test_the_example_of_the_readme_runs(monkeypatch, capsys):
     """In single precision in this process, where nothing has to be imported again."""
     monkeypatch.chdir(ROOT)
@@ -57,6 +58,7 @@ def test_runs_answer_in_single_precision(tmp_path):
     assert run(RUNS, str(tmp_path / "a")) == pytest.approx(run(single, str(tmp_path / "b"), double=False), rel=1e-3)
 
 
+@pytest.mark.heavy
 def test_commands_compute_in_single_precision():
     code = "import sys; sys.argv = ['wbgs-jax']; import wbgs_jax._util.quiet, jax; print(int(jax.config.jax_enable_x64))"
     assert run(code) == 0

@@ -43,6 +43,7 @@ def test_elements_look_where_the_angles_say_and_stay_level(rng):
         assert abs(float(turn[2, 1])) < 1e-6
 
 
+@pytest.mark.heavy
 def test_one_wave_is_heard_best_by_elements_that_look_at_it(rng):
     for angles in rng.uniform([-3, -0.9], [3, 0.9], (3, 2)):
         found = rotate_array(power_when_rotated(waves(looking(angles)[None], [1e-6])))
@@ -56,6 +57,7 @@ def test_two_equal_waves_are_heard_best_from_between():
     np.testing.assert_allclose(found.place[0], [0.1, 0.0], atol=0.03)
 
 
+@pytest.mark.heavy
 def test_slopes_are_differences(rng):
     powers = power_when_rotated(waves(np.array([looking(a) for a in rng.uniform(-0.5, 0.5, (3, 2))]), [1e-6, 2e-6, 1e-7]))
     angles, way = (jnp.asarray(rng.uniform(-0.3, 0.3, 2), jnp.float32) for _ in range(2))

@@ -35,6 +35,7 @@ def test_gaussians_for_a_splat_viewer(runs, tmp_path):
     assert_error_for_people(refused, "wave field", "no Gaussians")
 
 
+@pytest.mark.heavy
 def test_paths_out_and_in_again(runs, tmp_path):
     """As Sionna's and as a DeepMIMO scenario: both become the same scene."""
     grid = ["--grid", "-1,0.5,1.5:1,1,1.5:3x2x1", "--ghz", 5]

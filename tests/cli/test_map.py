@@ -82,6 +82,7 @@ def test_the_picture_shows_maps_and_walls(runs, tmp_path):
     assert np.ptp(pixels, -1).max() > 80 and pixels.std() > 20
 
 
+@pytest.mark.heavy
 def test_a_map_marks_places_without_confidence(runs, tmp_path):
     """Those far outside of the mesh, and no others."""
     out = tmp_path / "wide.npz"
@@ -116,6 +117,7 @@ def test_a_map_holds_intervals_only_within_the_room_and_the_band(runs, tmp_path)
     )
 
 
+@pytest.mark.heavy
 def test_another_receiver_has_another_map(runs, tmp_path):
     maps = []
     for name, rx in (("own", []), ("other", ["--rx", "0.5,0.5,1.5"])):

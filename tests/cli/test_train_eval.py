@@ -130,6 +130,7 @@ def test_eval_of_other_data_for_people_with_results(run, layout, tmp_path):
     assert provenance["settings"]["wideband"]["width"] == 8
 
 
+@pytest.mark.heavy
 def test_a_validation_part_is_of_whole_transmitters_and_the_test_is_untouched(tmp_path, scene, monkeypatch):
     """Curves watch it, `eval --part validation` scores it, and what belongs to the test is not replaced by it."""
     run = train_and_check(tmp_path / "run", "--scene", scene, "--validation", 0.3, *TOY)
@@ -172,6 +173,7 @@ def test_a_part_that_there_is_not(tmp_path, scene):
     assert not (run / "eval_validation.json").exists()
 
 
+@pytest.mark.heavy
 def test_one_receiver_of_several_frequencies_and_fewer_transmitters(tmp_path):
     """What is looked at is part of the run: evaluated as it was trained, and said by its name and provenance."""
     save_scene(tmp_path / "three.npz", tiny_scene(n_rx=3))
@@ -279,6 +281,7 @@ def test_a_released_scene_is_not_hidden_by_a_folder_of_its_name(tmp_path, monkey
     assert train_command.run_config(*train_command.parse(["--data", "cabin"])).source == str(tmp_path / "cabin")
 
 
+@pytest.mark.heavy
 def test_a_stop_behind_the_last_step_says_how_to_go_on(run, scene, monkeypatch):
     """Nobody takes what is not finished for finished."""
     arguments = ["--scene", scene, "--out", run, *TINY, "--resume"]

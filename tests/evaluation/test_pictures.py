@@ -52,6 +52,7 @@ def assert_shows_something(path):
     assert pixels.std() > 10 and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
 
 
+@pytest.mark.heavy
 def test_a_whole_set_of_pictures(tmp_path, dataset):
     files = draw_all(tmp_path / "pictures", dataset, dataset.test, *predictions(dataset), CURVE)
     assert sorted(path.name for path in files) == ["curves.png", "spectra.png", "spectra_polar.png", "ssim_by_frequency.png"]
@@ -61,6 +62,7 @@ def test_a_whole_set_of_pictures(tmp_path, dataset):
     assert plt.get_fignums() == []  # nothing is left open
 
 
+@pytest.mark.heavy
 def test_a_single_frequency_without_curves(tmp_path, dataset):
     single = select_frequencies(dataset, train_ghz=[10.0], test_ghz=[10.0])
     files = draw_all(tmp_path, single, single.test, *predictions(single), [])

@@ -68,6 +68,7 @@ def test_links_are_observed_in_their_order_whichever_receiver_they_are_of(knowin
     assert empty.pas.shape == (0, 90, 360)
 
 
+@pytest.mark.heavy
 def test_a_report_holds_all_that_field_and_data_know(knowing, blind, dataset):
     report, predicted = evaluate(knowing, dataset)
     assert (report["scene"], report["field"], report["part"], report["n"]) == ("box", "knowing", "test", len(dataset.test))

@@ -51,6 +51,7 @@ def test_the_account_of_a_scene(tmp_path, monkeypatch):
     assert scores["nearest"] == pytest.approx(scores["mean"])  # of three frequencies the others are two
 
 
+@pytest.mark.heavy
 def test_a_run_without_neighbours_scores_the_same_twice(tmp_path, monkeypatch):
     run = make_run(tmp_path)
     monkeypatch.setattr("sys.argv", ["neighbours_account", str(run), "--out", str(tmp_path)])

@@ -80,6 +80,7 @@ def test_the_parts_of_a_step_can_be_traced(tiny_run, monkeypatch):
     assert EXPECTED["training"] <= report.metrics.keys() and len(report.metrics) == 11
 
 
+@pytest.mark.heavy
 def test_queries_are_answered(tiny_run, monkeypatch):
     monkeypatch.setattr(queries, "start_run", lambda *_: tiny_run)
     report = timing.Report()

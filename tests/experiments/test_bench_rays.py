@@ -64,6 +64,7 @@ def test_tracers_that_are_not_installed_are_left_out(monkeypatch):
     assert not report.metrics and "pip install no_such_tracer" in report.skipped["rays_scene1_nobody"]
 
 
+@pytest.mark.heavy
 def test_our_side_finds_the_line_of_sight_and_two_reflections():
     dataset = tiny_dataset()
     dataset = dataclasses.replace(dataset, materials=None)

@@ -51,6 +51,7 @@ def test_groups(kinds, name):
     assert group(kinds) == name
 
 
+@pytest.mark.heavy
 def test_crossings_are_those_of_the_field(dataset, room):
     """Ray casts through the triangles count the same transmissions as the field, on every path of one transmitter."""
     (own,) = room.paths(dataset.tx_positions[dataset.train[0]], [10e9])

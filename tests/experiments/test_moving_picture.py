@@ -26,6 +26,7 @@ def test_a_walk_shows_held_out_transmitters_and_all_frequencies(run):
     assert set(dataset.frequencies_hz[links]) == set(dataset.frequencies_hz[dataset.test])
 
 
+@pytest.mark.heavy
 def test_it_is_a_picture_that_moves(run, tmp_path, monkeypatch):
     out = tmp_path / "walk.gif"
     monkeypatch.setattr(sys, "argv", ["moving_picture", "--run", str(run), "--out", str(out), "--transmitters", "2"])

@@ -183,6 +183,7 @@ def disagreements(rng, name):
     return found
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", NAMES)
 def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
     """A wrong gradient is wrong everywhere; differences err where many kinks meet, and hardly at two points in turn."""
@@ -191,6 +192,7 @@ def test_every_leaf_agrees_with_central_finite_differences(rng, x64, name):
         assert not found.keys() & again.keys(), {where: (found[where], again[where]) for where in found.keys() & again.keys()}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["wideband", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nerf2", "wave"))])
 def test_single_precision_is_near_double(rng, x64, name):
     """Training is in single precision. At 2 to 4 GHz: phases at 94 GHz are in tests/propagation/test_transport.py."""
@@ -213,6 +215,7 @@ def distance(found, expected):
     return np.linalg.norm(np.asarray(found, float) - expected) / np.linalg.norm(expected)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["wideband", "wrfgs"])
 def test_empty_slots_have_no_gradient(rng, x64, name):
     arguments = random_arguments(rng, name)
@@ -229,6 +232,7 @@ def test_materials_of_known_thickness_have_no_gradient_of_it(rng, x64):
     assert (np.asarray(params.materials.log_thickness) != 0).tolist() == [True, False, True]
 
 
+@pytest.mark.heavy
 def test_what_is_no_path_has_no_gradient_and_spoils_none(x64):
     """Candidates without strength fill the list of paths up; their legs may have no length."""
     field = field_of("wave")
@@ -283,6 +287,7 @@ def relative(a, b):
 DESIGN_HZ = 3e9
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["wideband", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nerf2", "wave"))])
 def test_an_array_in_metres_is_one_in_wavelengths_at_its_design_frequency(rng, x64, name):
     """The same spectrum and the same gradient; that of the frequency has a part more, for the array grows with it."""

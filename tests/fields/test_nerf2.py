@@ -96,6 +96,7 @@ def test_sampled_pixels_are_those_of_the_whole_image(rng):
     np.testing.assert_allclose(seen, whole.reshape(2, -1)[:, pixels], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.heavy
 def test_a_query_does_not_depend_on_its_neighbours_in_the_batch(rng):
     field = make_field()
     params = make_params(rng, field)
@@ -146,6 +147,7 @@ def test_the_key_of_a_step_decides_the_directions():
     assert first == again != other
 
 
+@pytest.mark.heavy
 def test_its_pixels_are_drawn_with_the_runs_seed(tmp_path):
     """The same parameters and batches, another seed: another loss in the first epoch."""
     first, other = (Run(tiny_dataset(), "nerf2", SETTINGS, seed, tmp_path / str(seed)) for seed in (0, 1))
@@ -173,6 +175,7 @@ def test_training_lowers_the_loss_and_resumes_as_if_never_interrupted(tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.heavy
 def test_the_command_line_trains_and_the_run_can_be_loaded(tmp_path):
     """With the settings of the other tests, to compile them once."""
     save_scene(tmp_path / "box.npz", tiny_scene())

@@ -110,6 +110,7 @@ def test_without_noise_there_is_none(rng):
     assert found(fewer, np.where(clean < 0.05, 0, clean), observed, tx) < 3e-4  # too dark, but not for want of noise
 
 
+@pytest.mark.heavy
 def test_missing_paths_look_like_noise_to_one_field_alone(rng):
     (clean, learned, observed, tx), floor = known(rng, 0.02)
     fewer = np.where(clean < 0.3, 0, clean)

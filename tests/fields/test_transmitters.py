@@ -42,6 +42,7 @@ def test_each_transmitter_has_its_own_antenna(setup, rng):
         np.testing.assert_allclose(found[number], expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.heavy
 def test_the_orientation_of_a_transmitter_rotates_its_antenna(setup, rng):
     _, params, _, render = setup
     both = antennas(rng)
@@ -64,6 +65,7 @@ def test_a_tabulated_antenna_is_that_of_its_table(setup):
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
 
 
+@pytest.mark.heavy
 def test_absolute_powers(setup):
     _, params, _, render = setup
     query = make_query(TX, HZ, power_dbm=[20.0, 30.0])
@@ -101,6 +103,7 @@ def test_frequencies_in_gigahertz_are_refused_outside_of_jit():
         pas(make_field(), make_params(), receiver, wrong)
 
 
+@pytest.mark.heavy
 def test_two_polarisations_at_both_ends(setup):
     """A line of sight keeps them apart, reflections mix them, and slanted ports are sums of both."""
     _, params, _, render = setup
@@ -118,6 +121,7 @@ def test_two_polarisations_at_both_ends(setup):
     np.testing.assert_allclose(matrix[..., 3], (vertical - horizontal) / np.sqrt(2), atol=1e-4 * strength)
 
 
+@pytest.mark.heavy
 def test_a_slanted_receiver_takes_its_share_of_both_polarisations():
     angle = 0.6
     field, params, plan = field_of(room(), (1.0, 1.0, 1.2), mirror_areas=(0.0,), specular_kept=8, diffracted_kept=1)

@@ -53,6 +53,7 @@ def test_rendering_is_bit_identical_across_frequency(trained):
     np.testing.assert_array_equal(spectra, spectra[:, :1].repeat(3, 1))
 
 
+@pytest.mark.heavy
 def test_no_configuration_lets_the_frequency_in(dataset, trained):
     aware, scene = FIELDS["wideband"], DatasetScene(dataset)
     assert aware.attenuation_frequency and aware.radiance_frequency
@@ -68,6 +69,7 @@ def test_no_configuration_lets_the_frequency_in(dataset, trained):
         WrfgsConfig().check("wrfgs")
 
 
+@pytest.mark.heavy
 def test_one_model_a_frequency_learns_it_and_is_asked_about_other_transmitters(dataset, trained):
     for index in (dataset.train, dataset.test):
         np.testing.assert_array_equal(dataset.frequencies_hz[index], 10e9)

@@ -30,6 +30,7 @@ def image_and_gradients(gaussians, attenuation, signal):
     return np.asarray(image), jax.tree.map(np.asarray, gradients)
 
 
+@pytest.mark.heavy
 def test_one_gaussian(rng):
     gaussians, attenuation, signal = drawn(rng, 1)
     image, gradients = image_and_gradients(gaussians, attenuation, signal)

@@ -46,6 +46,7 @@ def distance(found: list[float], expected: list[float]) -> float:
     return difference / expected[1] if expected[1] else difference
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("room", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in ROOMS])
 def test_values_and_gradients_are_those_of_other_versions(room):
     known = json.loads(FILE.read_text())

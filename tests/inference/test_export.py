@@ -131,6 +131,7 @@ def test_files_of_the_first_format_are_read(tmp_path):
     assert old.observe(TX[:0], HZ[0]).keys() == {"pas"}
 
 
+@pytest.mark.heavy
 def test_the_gradient_too(exported, predict, rng):
     weight = jnp.asarray(rng.normal(size=(3, 90, 360)), jnp.float32)
 
@@ -156,6 +157,7 @@ def test_metadata(exported):
     assert said["versions"] == {"wbgs_jax": wbgs_jax.__version__, "jax": jax.__version__}
 
 
+@pytest.mark.heavy
 def test_the_file_holds_no_paths_of_this_machine_and_equal_fields_make_equal_files(trained, path, tmp_path):
     with zipfile.ZipFile(path) as archive:
         assert sorted(archive.namelist()) == ["field.bin", "metadata.json"]
@@ -267,7 +269,7 @@ def test_an_export_that_fails_leaves_nothing(trained, tmp_path):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("name", "unit"), [("hybrid", "wavelengths"), ("wave", "metres")])
+@pytest.mark.parametrize(("name", "unit"), [pytest.param("hybrid", "wavelengths", marks=pytest.mark.slow), ("wave", "metres")])
 def test_fields_with_paths_trace_them_in_the_file(tmp_path, name, unit):
     coherent = WaveConfig(specular_tried=32, specular_kept=8, diffracted_tried=32, diffracted_kept=8)
     blurred = make_trained(tmp_path).field.config

@@ -110,6 +110,7 @@ def test_paths_add_up_to_the_snapshot(asked):
     np.testing.assert_allclose(total, truth, atol=2e-4 * np.abs(truth).max())
 
 
+@pytest.mark.heavy
 def test_doppler_shifts_are_rates_of_lengths(asked, rng):
     tx_velocity, rx_velocity, moment = rng.normal(size=3), np.zeros(3), 1e-3
     now = paths(asked, tx_velocity=tx_velocity, rx_velocity=rx_velocity)
@@ -130,6 +131,7 @@ def test_doppler_shifts_are_rates_of_lengths(asked, rng):
     assert abs(together["doppler_hz"][sight]) < 1e-3  # both ends move alike
 
 
+@pytest.mark.heavy
 def test_a_response_is_that_of_the_paths(asked):
     band, points = 40e6, 16
     answer = dataclasses.replace(asked, options=Options(band_hz=band, points=points)).evaluate("frequency-response", TX, GHZ)

@@ -45,6 +45,7 @@ def spectra_at(mixture, position, frequency, known=None):
     return member_spectra(mixture, mixture.mean, jnp.asarray(position, jnp.float32), jnp.float32(frequency), known)
 
 
+@pytest.mark.heavy
 def test_every_simple_method_is_that_of_its_equation(dataset, rng):
     mixture, link = made(dataset), dataset.test[rng.integers(len(dataset.test))]
     position, frequency = dataset.tx_positions[link], dataset.frequencies_hz[link]
@@ -111,6 +112,7 @@ def test_at_frequencies_that_nobody_observed_the_field_answers(dataset, rng):
     np.testing.assert_array_equal(correct(made(dataset), own, query), own)
 
 
+@pytest.mark.heavy
 def test_it_can_be_differentiated_at_a_known_transmitter(dataset):
     mixture = made(dataset, field=jnp.zeros(2))
     own, frequency = jnp.full((1, 90, 360), SOME), np.array([dataset.frequencies_hz[dataset.train[0]]])

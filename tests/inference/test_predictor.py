@@ -66,6 +66,7 @@ def test_vmap_and_jit(predict, expected):
     np.testing.assert_allclose(jax.jit(jax.vmap(predict))(jnp.asarray(TX), jnp.asarray(HZ)), expected, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_gradients_are_those_of_the_field(trained, plan, predict, rng):
     """tests/fields/test_wideband.py compares the field's own with finite differences."""
     weight = jnp.asarray(rng.normal(size=(2, 90, 360)), jnp.float32)

@@ -50,6 +50,7 @@ def test_what_was_measured_comes_back_and_fades(rng):
         assert np.allclose(*answers, atol=1e-3) == same
 
 
+@pytest.mark.heavy
 def test_the_covariance_is_that_of_the_formula(rng):
     """Mean and variance against the textbook's equations in double precision (Rasmussen and Williams, 2.25 and 2.26)."""
     tx, asked = places(rng, 30), places(rng, 7)
@@ -78,6 +79,7 @@ def test_the_covariance_is_that_of_the_formula(rng):
         np.testing.assert_allclose(std[:, r], np.sqrt(variance), rtol=2e-3)
 
 
+@pytest.mark.heavy
 def test_intervals_hold_nine_in_ten(rng):
     """Fields drawn from the covariance that the map assumes, told of all but a tenth."""
     held, total, scales = 0, 0, Scales(room=3.0, wall=0.0, place=0.1, reading=1.0)
@@ -175,6 +177,7 @@ def test_what_cannot_be_learned_is_said(rng):
         learn_map(readings(tx, powers(tx)), NO_WALLS)
 
 
+@pytest.mark.heavy
 def test_the_guide_runs():
     names: dict = {}
     (block,) = re.findall(r"```python\n(.*?)```", GUIDE.read_text(), re.DOTALL)

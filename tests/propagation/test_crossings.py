@@ -119,6 +119,7 @@ def crossings_compared(rng) -> int:
     return met
 
 
+@pytest.mark.heavy
 def test_paths_cross_what_brute_force_finds_in_that_order(rng):
     """One room alone may have hardly anything in the way."""
     met = 0
@@ -139,6 +140,7 @@ def brute_force(points, living, hierarchy, most, near=NEAR):
     return Crossings(jnp.bitwise_count(words).astype(jnp.int32).sum(-1), number // LEAF, bit)
 
 
+@pytest.mark.heavy
 def test_boxes_hide_no_crossing(rng):
     """Facets of all sizes, and segments of all lengths: with one level of boxes and with two, all are found."""
     most = 64

@@ -24,6 +24,7 @@ def channels(search, slabs, receiver, frequency, tx):
     return jax.lax.map(lambda one: arrivals_of(search, trace(search, one), slabs, receiver, frequency), tx)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("wavelengths", [8.0, 15.0])
 def test_the_lobe_of_a_strip_is_that_of_its_aperture(wavelengths):
     """Half-power width within 3 %, and the pattern itself within 4 % of its maximum, first side lobe included."""

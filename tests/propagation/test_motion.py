@@ -74,6 +74,7 @@ def test_lengths_follow_surfaces_and_ends(kind, rng):
     assert np.abs(found).max() > 2e-4
 
 
+@pytest.mark.heavy
 def test_nothing_changes_where_nothing_moves():
     search = search_of(PARTS, RX, mirror_areas=(0.0,))
     paths = trace(search, TX).specular
@@ -85,6 +86,7 @@ def test_nothing_changes_where_nothing_moves():
         np.testing.assert_allclose(getattr(same, name), getattr(facets, name), atol=1e-12)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ["specular", "diffracted"])
 def test_the_gradient_says_what_the_changes_say(kind, rng):
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))
@@ -105,6 +107,7 @@ def test_the_terms_say_what_the_changes_say(kind, rng):
     np.testing.assert_allclose(by_terms[alive], length_changes(paths, search, motion)[alive], atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_without_paths_nothing_depends_on_anything():
     """A mesh without an edge has none that are diffracted."""
     search = search_of(PARTS, RX, mirror_areas=(0.0, 0.0))

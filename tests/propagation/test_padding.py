@@ -27,6 +27,7 @@ def test_sizes_hold_what_is_there_and_at_most_an_eighth_more(count):
     assert padded_size(size) == size
 
 
+@pytest.mark.heavy
 def test_padding_adds_no_path(rng):
     """The same paths, in value and in order, with and without it."""
     rx, tx = rng.uniform(0.2, 0.8, (2, 3)) * SIZE

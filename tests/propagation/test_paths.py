@@ -57,6 +57,7 @@ def test_an_empty_box_gives_the_image_lattice(rng):
     np.testing.assert_allclose(np.sort(found), np.sort(expected), rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_angles_of_incidence_and_reflection_are_equal(rng):
     rx, tx = rng.uniform(0.2, 0.8, (2, 3)) * SIZE
     search = search_of([*room(SIZE), box((2, 1, 0.5), (3, 2, 1.2))], rx)
@@ -70,6 +71,7 @@ def test_angles_of_incidence_and_reflection_are_equal(rng):
                 np.testing.assert_allclose(into - 2 * (into @ normals[facet]) * normals[facet], out, atol=1e-3)
 
 
+@pytest.mark.heavy
 def test_what_is_crossed_is_counted_in_order():
     """Three sheets between the ends, and a closed body off the line."""
     sheets = [rectangle((x, -1, -1), (0, 2, 0), (0, 0, 2)) for x in (1.0, 3.0, 2.0)]
@@ -82,6 +84,7 @@ def test_what_is_crossed_is_counted_in_order():
     assert order.tolist() == [1, 2, 0]  # x = 3, 2, 1
 
 
+@pytest.mark.heavy
 def test_six_sheets_are_one_too_many():
     sheets = [rectangle((x, -1, -1), (0, 2, 0), (0, 0, 2)) for x in range(1, 7)]
     for n, seen in ((5, True), (6, False)):
@@ -89,6 +92,7 @@ def test_six_sheets_are_one_too_many():
         assert (paths.alive & ~(paths.interaction_type == REFLECTED).any(-1)).any() == seen
 
 
+@pytest.mark.heavy
 def test_a_diffracted_ray_is_the_shortest_over_its_edge():
     """Keller's cone, by Fermat's principle."""
     rx, tx = np.array([0, 0.2, 0.1]), np.array([2.6, 1.9, 0.3])
@@ -102,6 +106,7 @@ def test_a_diffracted_ray_is_the_shortest_over_its_edge():
         np.testing.assert_allclose(lengths_of(paths)[k], expected, rtol=1e-5)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("first", [REFLECTED, DIFFRACTED])
 def test_a_mirror_before_or_behind_an_edge(first):
     """The length is that over the mirror image of one end."""

@@ -42,6 +42,7 @@ def test_flat_pieces_lose_nothing(rng):
         np.testing.assert_allclose(area, part.area, rtol=1e-5)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("count", [2000, 300])
 def test_a_sphere_is_off_as_its_sagitta(count):
     """Triangles of N per sphere have sides of sqrt(4 pi r^2 / N * 4 / sqrt(3)), whose chords stand off by side^2 / 8 r."""
@@ -119,6 +120,7 @@ def test_of_many_facets_those_are_kept_that_make_up_the_surface(monkeypatch):
             assert len(facets_that_fit(mesh_of(*parts), most).offset) == expected
 
 
+@pytest.mark.heavy
 def test_a_curved_mesh_keeps_its_surface():
     """The largest triangles of a ball would be half of it."""
     ball = trimesh.creation.icosphere(4, 1.0)

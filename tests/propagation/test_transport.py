@@ -52,6 +52,7 @@ def assert_waves_equal(found, expected, amplitude=0.01, degrees=5.0):
     assert np.abs(np.angle(found[strong] / expected[strong], deg=True)).max() < degrees
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("pattern", ["iso", "tr38901"])
 @pytest.mark.parametrize("frequency", FREQUENCIES)
 def test_free_space(frequency, pattern, rng):
@@ -61,6 +62,7 @@ def test_free_space(frequency, pattern, rng):
     assert_waves_equal(snapshot_of(search, tx, frequency, receiver), free_space(tx, rx, frequency, pattern), 1e-4, 2)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("frequency", FREQUENCIES)
 @pytest.mark.parametrize("tiles", [1, 5])
 def test_a_plate_of_tiles_is_a_mirror(frequency, tiles, rng):
@@ -112,6 +114,7 @@ def specular_only(search, tx, frequency, receiver=None, kept=128, **slab):
     return snapshot_over(search, TracedPaths((traced.specular, dark)), frequency, receiver, **slab)
 
 
+@pytest.mark.heavy
 def test_the_field_is_continuous_where_the_shadow_of_metal_begins():
     """Direct ray and diffraction together; without diffraction the sum jumps by the whole direct ray."""
     search = search_of([box((1, -1, -3), (2, 1, 3))], (0, 0, 0), mirror_areas=(0.0, 0.0))

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.special import fresnel, wofz
 
 from wbgs_jax.propagation.utd import faddeeva, transition, wedge_coefficients
@@ -58,6 +59,7 @@ def test_a_half_plane_equals_sommerfelds_solution(rng):
         np.testing.assert_allclose(field, half_plane(phi_in, phi_out, rho, wavenumber, soft), atol=5e-3)
 
 
+@pytest.mark.heavy
 def test_gradients_are_finite_at_a_border():
     def total(phi_out):
         ones = jnp.ones(())

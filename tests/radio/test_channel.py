@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from wbgs_jax.radio import channel
 from wbgs_jax.radio.array import SPEED_OF_LIGHT, cbf, pas_directions, planar_array, steering_vector
@@ -116,6 +117,7 @@ def test_a_path_on_a_sample_is_one_tap():
     np.testing.assert_allclose(paths.taps(BAND, -1, 4, normalize=True)[0, 1], 2 / np.sqrt(5), rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_normalised_channels_have_the_energy_of_one_sample(rng):
     paths, offsets = link(rng), jnp.linspace(-BAND / 2, BAND / 2, 64)
     faint = paths._replace(amplitude=paths.amplitude * 1e-20)  # whose squares underflow

@@ -35,6 +35,7 @@ def test_sinr_is_the_ratio_of_powers(rng):
     np.testing.assert_allclose(sinr_db(first, noise, second), expected, atol=1e-3)
 
 
+@pytest.mark.heavy
 def test_equal_transmitters_and_noise_alone_have_closed_forms():
     equal = sinr_db(jnp.full((1, 2), -60.0), -160.0)
     np.testing.assert_allclose(equal, 0, atol=1e-5)  # one interferes with the other
@@ -71,6 +72,7 @@ def rises(objective, start, step):
     return gain
 
 
+@pytest.mark.heavy
 def test_a_step_of_powers_and_of_places_raises_the_tenth_percentile():
     """Of a field known in closed form."""
     field, params = trained().field, trained().params

@@ -101,7 +101,10 @@ def test_kernels_draw_the_reference_and_have_its_gradients(kind, rng, monkeypatc
         assert int(jnp.max(jnp.sum(jobs.gaussian >= 0, -1))) == CHUNK
 
 
-@pytest.mark.parametrize("b", [1, fused_kernels.QUERIES, fused_kernels.QUERIES + 1, pytest.param(32, marks=pytest.mark.heavy)])
+HEAVY = [pytest.param(b, marks=pytest.mark.heavy) for b in (1, fused_kernels.QUERIES, 32)]
+
+
+@pytest.mark.parametrize("b", [fused_kernels.QUERIES + 1, *HEAVY])
 def test_any_number_of_queries(b, rng, monkeypatch):
     compare(monkeypatch, rng, "a few", b, Tiling(45, 24))
 
@@ -113,11 +116,13 @@ def test_tiles_of_any_size(tiling, rng, monkeypatch):
     compare(monkeypatch, rng, "on the seam", 1, tiling)
 
 
+@pytest.mark.heavy
 def test_few_programs_share_all_jobs(rng, monkeypatch):
     monkeypatch.setattr(fused_kernels, "PROGRAMS", 7)
     compare(monkeypatch, rng, "all around", 2, Tiling(45, 24))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("short", ["entries", "jobs"])
 def test_lists_that_do_not_fit_are_empty(short, rng, monkeypatch):
     """No kernel follows them past their end: an overflowed step runs to its end before it is thrown away."""
@@ -154,6 +159,7 @@ def test_every_slot_is_that_of_its_gaussian(rng, monkeypatch):
     assert (jobs.slots.slot[begin:] < 0).all() and begin == jobs.required_entries
 
 
+@pytest.mark.heavy
 def test_kernels_lower_for_cuda_and_nothing_is_added_atomically(rng):
     """A GPU gives the same bits again: the order of every sum is in the program."""
     gaussians, receiver, attenuation, signal = random_case(rng, n=60, dtype=np.float32)

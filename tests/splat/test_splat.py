@@ -131,6 +131,7 @@ def test_tiles_equal_the_dense_reference_in_value_and_every_gradient(rng, x64, p
     assert all(np.abs(g).max() > 0 for g in (*reached, gradients[1].position, gradients[1].orientation))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("tiling", [CPU_TILING, GPU_TILING])
 def test_tiles_of_any_size_draw_the_reference_whatever_the_spare_room(tiling, rng, x64):
     """Wide Gaussians give a tile several jobs. The last row of a GPU's tiles reaches beyond the image."""
@@ -153,6 +154,7 @@ def test_tiles_of_any_size_draw_the_reference_whatever_the_spare_room(tiling, rn
             assert relative(got, want) < EXACT
 
 
+@pytest.mark.heavy
 def test_what_runs_the_code_chooses_the_form(rng):
     """Not what traces it: lowered here for a CPU and for a GPU; neither holds the other's code."""
     gaussians, receiver, attenuation, signal = random_case(rng, dtype=np.float32)

@@ -138,6 +138,7 @@ def test_variances_of_lengths_follow_from_those_of_places(run, rng):
         np.testing.assert_allclose(own[alive], np.asarray(changes)[alive] ** 2, atol=1e-10)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("most", [3, 1000])
 def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch):
     """Any covariance of what is adjusted, and any variances of the rest: those of all lengths are J C J^T, written out."""
@@ -159,6 +160,7 @@ def test_variances_of_lengths_know_what_places_share(most, run, rng, monkeypatch
         np.testing.assert_allclose(found[pair][alive], np.concatenate(expected)[alive], rtol=1e-3, atol=1e-9)
 
 
+@pytest.mark.heavy
 def test_the_movers_that_most_paths_meet_are_adjusted(run, monkeypatch):
     """All of them where there are few; every receiver in any case."""
     np.testing.assert_array_equal(adjusted_numbers(run.prepared, run.field.motion), everything(run))

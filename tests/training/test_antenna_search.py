@@ -86,6 +86,7 @@ def test_what_is_sure_counts_transmitters_and_not_spectra(rng):
     assert surely_better(np.ones(400), tx, 3.0) and not surely_better(np.ones(180), tx[:180], 3.0)
 
 
+@pytest.mark.heavy
 def test_a_large_gain_among_gains_is_no_reason_for_doubt(rng):
     gains = np.append(rng.uniform(0.01, 0.3, 19), 4.0)
     assert surely_better(gains, np.arange(20), 3.0)
@@ -117,6 +118,7 @@ def taken(scores, count, rng, draws=300):
     return another / draws, worse / draws
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("count", "least"), [(5, 0.25), (8, 0.4), (11, 0.65), (24, 0.98)])
 def test_few_transmitters_take_an_antenna_that_gains_much(count, least, rng):
     """In the authors' sample transmitters look down; 11 of its transmitters at three errors take it in one draw of twenty."""

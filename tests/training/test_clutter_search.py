@@ -88,6 +88,7 @@ def test_grids_without_cells_are_refused(values):
         WaveConfig(**values).check("wave")
 
 
+@pytest.mark.heavy
 def test_few_transmitters_prove_nothing(tmp_path, rng):
     nothing = np.ones((12, 1, len(FREQUENCIES), 16), np.complex64)
     params, problem = told_of(PARTS, nothing, tmp_path, n_tx=12)

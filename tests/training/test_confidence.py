@@ -56,6 +56,7 @@ def test_intervals_hold_nine_of_ten_new_scores(rng):
     assert np.mean(ratios) == pytest.approx(1, rel=0.1)
 
 
+@pytest.mark.heavy
 def test_what_says_nothing_is_left_out(rng):
     taken = [np.any(fit(*drawn(rng, 40, slope=0.0), SETS)[2][:-1] != 0) for _ in range(100)]
     assert sum(taken) <= 12  # by chance 3
@@ -314,6 +315,7 @@ def test_expected_errors_of_powers_follow_their_formula(rng):
     assert everyone.within_db[0] != everyone.within_db[1]  # receivers of their own
 
 
+@pytest.mark.heavy
 def test_confidence_of_powers_is_learned_over_all_receivers(rng):
     dataset = hold_out_validation(tiny_dataset(40, n_rx=2))
     field, params = make_field(), make_params()

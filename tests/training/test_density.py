@@ -243,6 +243,7 @@ def test_what_was_removed_is_reported_by_the_pure_part_too(state):
     np.testing.assert_array_equal(edit.params.gaussians.means, control(state).state.params.gaussians.means)
 
 
+@pytest.mark.heavy
 def test_training_goes_on_after_a_control_and_leaves_padding_alone(state, tmp_path):
     run = Run(tiny_dataset(), "wideband", GROWING, 0, tmp_path)
     gaussians = control(state).state.params.gaussians

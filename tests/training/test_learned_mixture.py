@@ -128,6 +128,7 @@ def test_a_field_that_knows_nothing_has_no_share_and_one_that_knows_stands_alone
     assert not none.alone and none.mixture.field[0] < -5
 
 
+@pytest.mark.heavy
 def test_held_out_links_are_looked_at_alone(dataset, known, rng):
     truth = np.asarray(dataset.pas(dataset.validation))
     pas = np.clip(truth + rng.normal(0, 0.2, truth.shape), 0, 1)

@@ -35,6 +35,7 @@ def alike(dataset, rng, spread):
     return dataclasses.replace(dataset, observations={"snapshots": snapshots}, tx_positions=dataset.tx_positions[0] + offsets)
 
 
+@pytest.mark.heavy
 def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
     dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
     neighbours, line, _ = learn_neighbours(field, params, dataset)
@@ -47,6 +48,7 @@ def test_they_are_asked_where_neighbours_are_alike(field, params, rng):
     assert ssim(corrected, truth).mean() > ssim(alone, truth).mean() + 0.2
 
 
+@pytest.mark.heavy
 def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     dataset = tiny_dataset(24)
     plan = field.plan(params, dataset.receiver())
@@ -57,6 +59,7 @@ def test_they_are_not_asked_where_they_know_nothing(field, params, rng):
     assert neighbours is None and "not used" in line
 
 
+@pytest.mark.heavy
 def test_noise_is_nothing_that_neighbours_know(field, params):
     """They would add it to every answer: the field leaves it out, and the known spectra have it."""
     noisy, dataset = NoisyField(RippleConfig()), tiny_dataset(24)
@@ -100,6 +103,7 @@ def test_what_gains_little_is_not_worth_it():
     assert choose({few: np.full(8, 0.006)}, np.arange(8))[0] == few
 
 
+@pytest.mark.heavy
 def test_the_test_part_changes_nothing(field, params, rng):
     dataset = hold_out_validation(alike(tiny_dataset(24), rng, 0.1))
     poisoned = dataset.snapshots.copy()

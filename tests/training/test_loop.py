@@ -133,6 +133,7 @@ def test_resuming_from_the_middle_equals_not_stopping(dataset, tmp_path, uninter
     assert_same_run(dataset, tmp_path / "run", uninterrupted(case), case)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_saves_and_says_how_to_go_on(dataset, tmp_path, monkeypatch, uninterrupted, number):
     """The device has been given the next epoch already, which is waited for; the density control is due after it."""
@@ -245,6 +246,7 @@ def test_the_epoch_is_compiled_while_hooks_calibrate(dataset, tmp_path):
     assert epoch_programs._cache_size() == compiled and run.compile_seconds == 0
 
 
+@pytest.mark.heavy
 def test_a_device_that_goes_on_trains_what_one_does_that_waits(dataset, tmp_path, monkeypatch):
     """Also where the first of two epochs that were given ends early: the second does nothing until the capacity holds."""
     states, figures = [], []
@@ -308,6 +310,7 @@ def test_curves_watch_the_validation_part_or_nothing(dataset, tmp_path):
     assert set(run.numbers[run.batches(0, 50).ravel()]) <= set(dataset.train.tolist())
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("field", ["wideband", "nerf2", "wave", "hybrid"])
 def test_nothing_of_a_training_looks_at_the_test(dataset, tmp_path, field):
     """What is held out, place and spectrum, may be anything: field, links, data and batches are bit for bit the same."""

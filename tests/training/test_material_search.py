@@ -118,6 +118,7 @@ def test_an_entry_that_a_glance_overlooks_is_replaced_by_a_better_one_alone(run_
     np.testing.assert_allclose(found.materials.log_susceptibility[0], np.log(ITU_MATERIALS[expected][0] - 1), rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_it_ends_when_nothing_is_left_to_change(run_on, monkeypatch):
     """Where the last change was that of material k, nobody looks again at k and those behind it."""
     run = run_on([ITU_MATERIALS["wood"]] * len(PARTS))
@@ -153,6 +154,7 @@ def test_it_finds_out_what_ray_tracers_leave_out(natural, run_on, tmp_path, rng)
         assert report[name]["dropped"] == (name in natural) == float(getattr(run.state.params, name)), report
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("steps, rounds", [(5, 3), (0, 0)])
 def test_it_is_left_out_when_resumed_or_switched_off(steps, rounds, run_on, tmp_path):
     search = dataclasses.replace(SETTINGS.calibration, rounds=rounds)

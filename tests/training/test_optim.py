@@ -126,6 +126,7 @@ def test_muon_makes_the_singular_values_of_a_step_equal(params, rng):
         np.testing.assert_allclose(update, -RATES["wideband"][PLACES["wideband"][f".gaussians{path}"]], rtol=1e-4)
 
 
+@pytest.mark.heavy
 def test_a_stack_of_matrices_is_moved_like_each_by_itself(rng):
     shapes = ((8, 8), (3, 8), (8, 1), (5, 8))  # one side in common: the unit of a step is the longest
     weights, gradients = ([jnp.asarray(rng.normal(size=shape)) for shape in shapes] for _ in range(2))

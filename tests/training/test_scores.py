@@ -79,6 +79,7 @@ def test_few_programs_score_all_numbers_of_candidates_and_spectra(run, rng):
     assert objective._score._cache_size() == programs
 
 
+@pytest.mark.heavy
 def test_links_find_their_own_paths_among_those_that_were_taken_out(run, rng):
     """In any order, some of them twice."""
     links = jax.tree.map(lambda leaf: leaf[rng.integers(0, len(run.dataset), 8)], run.data.links)

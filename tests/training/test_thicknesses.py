@@ -107,6 +107,7 @@ def test_a_known_thickness_is_not_searched(room, rng):
     np.testing.assert_array_equal(found.materials.log_thickness, start.materials.log_thickness)
 
 
+@pytest.mark.heavy
 def test_pictures_alone_are_not_asked(room, rng, monkeypatch):
     start = room.field.init(jax.random.key(0))
     heard = problem(room, of(start, ["wood"] * len(PARTS), rng.uniform(0.01, 0.3, len(PARTS))))

@@ -51,6 +51,7 @@ def test_an_answer_is_the_fields(coherent):
     assert away.outside and "outside" in away.warnings[0]
 
 
+@pytest.mark.heavy
 def test_paths_run_from_transmitter_to_receiver_over_their_length(coherent):
     paths = coherent.predict(PLACE, HZ).paths
     rx = np.asarray(coherent.receiver.position)
