@@ -60,7 +60,7 @@ measured: setup  ## learn and score a map of measured powers: make measured DATA
 test: setup  ## run the tests: about five minutes on two cores
 	$(PY) -m pytest -n 2 --dist worksteal -m "not slow and not heavy"
 
-test-heavy: setup  ## run the tests that compile, search or train for long; CI runs them too: about ten minutes
+test-heavy: setup  ## run the tests that compile, search or train for long; CI runs them too: a quarter of an hour
 	$(PY) -m pytest -n 2 --dist worksteal -m "heavy and not slow"
 
 test-slow: setup  ## run all tests in fully optimised code on fresh random inputs, larger cases of what the others check too: hours

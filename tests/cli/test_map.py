@@ -36,8 +36,10 @@ def ask(runs, field, *arguments):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("ghz", [(28,), (2.4, 28, 60)])
-@pytest.mark.parametrize("what", ["power", "k-factor", "delay-spread", "angular-spread"])
+@pytest.mark.parametrize(
+    ("what", "ghz"),
+    [("power", (2.4, 28, 60)), ("k-factor", (28,)), ("delay-spread", (28,)), ("angular-spread", (2.4, 28, 60))],
+)
 def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
     out, points = tmp_path / "map.npz", tmp_path / "points.npz"
     result = ask(runs, "wave", "--ghz", *ghz, "--what", what, *AREA, "--step", 0.5, "--out", out)
