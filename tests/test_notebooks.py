@@ -39,16 +39,17 @@ def test_a_notebook_runs_with_a_short_training(tool):
     preset = '"--preset", "smoke"'
     (training,) = (cell for cell in notebook.cells if preset in cell.source)
     training.source = training.source.replace(preset, f'{preset}, "--optim.steps", "20"')
-    assert_pictures(tool.execute(notebook).cells)
+    assert_pictures(tool.execute(notebook), tool)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_run(name, tool, monkeypatch):
     monkeypatch.delenv("XLA_FLAGS", raising=False)  # they train: there it pays to optimise what is compiled
-    assert_pictures(tool.execute(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)).cells)
+    assert_pictures(tool.execute(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)), tool)
 
 
-def assert_pictures(cells):
+def assert_pictures(notebook, tool):
     """A cell that fails has raised before."""
-    assert any("image/png" in output.get("data", {}) for cell in cells if cell.cell_type == "code" for output in cell.outputs)
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any(tool.PICTURE in output.get("data", {}) for output in outputs)

@@ -38,7 +38,11 @@ def ask(runs, field, *arguments):
 @pytest.mark.heavy
 @pytest.mark.parametrize(
     ("what", "ghz"),
-    [("power", (2.4, 28, 60)), ("k-factor", (28,)), ("delay-spread", (28,)), ("angular-spread", (2.4, 28, 60))],
+    [
+        *[("power", (2.4, 28, 60)), ("k-factor", (28,)), ("delay-spread", (28,)), ("angular-spread", (2.4, 28, 60))],
+        *[pytest.param(what, (28,), marks=pytest.mark.slow) for what in ("power", "angular-spread")],
+        *[pytest.param(what, (2.4, 28, 60), marks=pytest.mark.slow) for what in ("k-factor", "delay-spread")],
+    ],
 )
 def test_a_map_holds_what_predict_says(runs, tmp_path, what, ghz):
     out, points = tmp_path / "map.npz", tmp_path / "points.npz"

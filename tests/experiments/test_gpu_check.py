@@ -192,12 +192,17 @@ def start_here(name, seconds, path, stand_in, folder, **_):
     return SimpleNamespace(wait=lambda *_: 0 if done else PART)
 
 
+SOME_CALLS = [(("--next",), ["parity"]), *((("--only", name), [name]) for name in ("paper_scene1", "wrfgs_scene4"))]
+"""Options of calls after the first, and the pieces that each ends."""
+ALL_CALLS = [(("--next",), [name]) for name in PIECES[:3]] + [((), [*PIECES[3:]])]
+
+
 @pytest.mark.heavy
 @pytest.mark.long
-@pytest.mark.parametrize("names", [("paper_scene1", "wrfgs_scene4"), pytest.param(PIECES, marks=pytest.mark.slow)])
-def test_the_stand_in_runs_pieces_and_continues_a_training(names, monkeypatch, tmp_path):
-    """The first training is interrupted after its first steps; the next call takes parity. In this process, where nothing has
-    to be imported again, that training is continued and the other pieces follow."""
+@pytest.mark.parametrize("calls", [SOME_CALLS, pytest.param(ALL_CALLS, marks=pytest.mark.slow)])
+def test_the_stand_in_runs_pieces_and_continues_a_training(calls, monkeypatch, tmp_path):
+    """The first training is interrupted after its first steps and continued by a later call. Calls that do not take the next
+    piece run in this process, where nothing has to be imported again."""
     folder, device = tmp_path / "stand_in" / "paper_scene1", command_line.find_device()
     monkeypatch.setattr(command_line, "find_device", lambda: device)
 
@@ -212,19 +217,20 @@ def test_the_stand_in_runs_pieces_and_continues_a_training(names, monkeypatch, t
         _, found = run(patch, tmp_path, "--only", "paper_scene1")
     training = found["paper_scene1"]["figures"]["training"]
     assert found["paper_scene1"]["state"] == "part" and 0 < training["saved_step"] == training["steps"] < training["of"]
-    code, found = run(monkeypatch, tmp_path, "--next")
-    assert code == 0 and found["parity"]["state"] == "done" and found["parity"]["figures"]["repeat_difference"] == 0.0
-    monkeypatch.setattr(command_line, "start", start_here)
-    monkeypatch.setattr(command_line, "end", lambda process: None)
-    for options in [()] if names == PIECES else [("--only", name) for name in names]:
+    ended = set[str]()
+    for options, names in calls:
+        if options != ("--next",):
+            monkeypatch.setattr(command_line, "start", start_here)
+            monkeypatch.setattr(command_line, "end", lambda process: None)
         code, found = run(monkeypatch, tmp_path, *options)
-        assert code == 0
-    assert set(found) == {"parity", *names}
+        ended |= set(names)
+        assert code == 0 and {name for name in found if found[name]["state"] == "done"} == ended
+    assert set(found) == ended and found["parity"]["figures"]["repeat_difference"] == 0.0
     for name, result in found.items():
         assert result["stand_in"] and {"version", "commit", "device", "jax", "jaxlib"} <= set(result["provenance"])
         assert [call["state"] for call in result["calls"]] == ["part", "done"][name != "paper_scene1" :]
         assert result["seconds"] == pytest.approx(sum(call["seconds"] for call in result["calls"]), abs=0.2)
-    trainings = [name for name in TRAININGS if name in names]
+    trainings = [name for name in TRAININGS if name in ended]
     for name in trainings:
         figures = found[name]["figures"]
         assert figures["training"]["steps"] == figures["training"]["of"] == figures["seen"]["step"] == 40
@@ -232,5 +238,5 @@ def test_the_stand_in_runs_pieces_and_continues_a_training(names, monkeypatch, t
     frequencies = dict(zip(TRAININGS, (10, 8, 1, 1, 10, 10), strict=True))
     assert all(len(found[name]["figures"]["seen"]["by_ghz"]) == frequencies[name] for name in trainings)
     assert len(found["paper_scene1"]["figures"]["unseen"]["by_ghz"]) == 17
-    if "paper_scene4" in names:
+    if "paper_scene4" in ended:
         assert list(found["paper_scene4"]["figures"]["unseen"]["by_ghz"]) == ["24.25", "77"]
