@@ -10,6 +10,7 @@ from builders.synthetic import tiny_scene, tiny_settings
 from builders.wave_runs import PARTS, places, run_in
 
 from wbgs_jax.data import scene_dataset
+from wbgs_jax.fields.losses import log_decorrelation, surprise
 from wbgs_jax.mesh.edges import common_size
 from wbgs_jax.training.calibration import objective
 from wbgs_jax.training.calibration.material_fit import with_entry
@@ -53,6 +54,27 @@ def test_candidates_side_by_side_score_as_each_alone(run, rng, compared):
     first = score(candidates, 3)
     np.testing.assert_allclose(first, found[:, :3], atol=1e-4)
     np.testing.assert_array_equal(score([params, params])[0], score([params])[0])
+
+
+@pytest.mark.heavy
+def test_scores_are_those_of_rendered_links(run, rng):
+    """The one program of all comparisons, and what the field renders link by link."""
+    params, train, data = other_materials(run.state.params, rng), np.asarray(run.dataset.train)[:5], run.data
+    expected = {
+        "snapshots": lambda seen, batch: log_decorrelation(seen.snapshots, batch.snapshots)[0],
+        "covariances": lambda seen, batch: surprise(seen.covariance, batch.snapshots)[0],
+        "spectra": lambda seen, batch: jnp.log(jnp.mean(jnp.abs(seen.pas - batch.pas))),
+        "powers": lambda seen, batch: jnp.log(1 + jnp.abs(seen.power_db - batch.received_db)[0]),
+    }
+    programs = None
+    for compared, of in expected.items():
+        found = make_scores(run.field, run.prepared, data, train, compared)([params])[0]
+        for link, score in zip(train, found, strict=True):
+            batch = data.batch(jnp.asarray([link]), jax.random.key(0))
+            plan = run.field.plan(params, batch.receiver, run.prepared)
+            np.testing.assert_allclose(score, of(run.field.render(params, plan, batch.links), batch), atol=1e-4)
+        assert programs in (None, objective._score._cache_size())
+        programs = objective._score._cache_size()
 
 
 @pytest.mark.heavy

@@ -186,7 +186,7 @@ def first_params(config: WaveConfig, facets: int, materials: int, placement: Any
 @jax.jit
 def path_snapshots(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query) -> Complex[Array, "b elements"]:
     """Returns the snapshots of B links from their paths."""
-    return _snapshots(plan, path_arrivals(params, plan, paths, links), links.frequency_hz)
+    return snapshots_of(plan, path_arrivals(params, plan, paths, links), links.frequency_hz)
 
 
 @jax.jit
@@ -196,7 +196,8 @@ def path_arrivals(params: WaveParams, plan: WavePlan, paths: TracedPaths, links:
     return found
 
 
-def _snapshots(plan: WavePlan, arrived: Paths, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
+def snapshots_of(plan: WavePlan, arrived: Paths, frequency_hz: Float[Array, " b"]) -> Complex[Array, "b elements"]:
+    """Returns the snapshots of B links from their arrivals."""
     y = jax.vmap(lambda arrived, f: snapshots_from_paths(arrived, plan.receiver, f))(arrived, frequency_hz)
     return y if plan.array_gains is None else y * element_gains(plan.array_gains)
 
@@ -213,13 +214,19 @@ def observe(params: WaveParams, plan: WavePlan, paths: TracedPaths, links: Query
         blind = phase_blind_pas(params, plan, paths, links)
         return Observation(blind, paths=path_arrivals(params, plan, paths, links))
     arrived, frequency_hz = path_arrivals(params, plan, paths, links), links.frequency_hz
-    y, elements = _snapshots(plan, arrived, frequency_hz), plan.receiver.element_wavelengths(frequency_hz)
     covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
-    if plan.lag_basis is not None:
-        pas = covariance_to_pas(covariance, plan.lag_basis)
-    else:
-        pas = wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (y.shape[0], *elements.shape[-2:])))
+    pas, y = spectra_of(plan, covariance, frequency_hz), snapshots_of(plan, arrived, frequency_hz)
     return Observation(pas, y, decibels(power), covariance, arrived)
+
+
+def spectra_of(
+    plan: WavePlan, covariance: Complex[Array, "b elements elements"], frequency_hz: Float[Array, " b"]
+) -> Float[Array, "b 90 360"]:
+    """Returns the spectra of B links from their covariances."""
+    if plan.lag_basis is not None:
+        return covariance_to_pas(covariance, plan.lag_basis)
+    elements = plan.receiver.element_wavelengths(frequency_hz)
+    return wide_covariance_to_pas(covariance, jnp.broadcast_to(elements, (len(covariance), *elements.shape[-2:])))
 
 
 @jax.jit

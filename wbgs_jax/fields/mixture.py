@@ -35,10 +35,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from wbgs_jax._util.pytree import pytree
+from wbgs_jax._util.pytree import AnyArray, pytree
 from wbgs_jax._util.statistics import standard_error
 from wbgs_jax.fields.base import Observation, Params
-from wbgs_jax.fields.losses import ssim, ssim_of_mixtures
+from wbgs_jax.fields.losses import COARSE, ssim, ssim_of_mixtures
 from wbgs_jax.radio.array import EXACT
 from wbgs_jax.radio.channel import NO_PATH_DB, beyond_free_space_db
 from wbgs_jax.types import Query
@@ -142,7 +142,7 @@ def mixed(shares: Shares, features: Float[Array, "b features"], predicted: Exper
     return _mix(share_of(shares.uninformed, features), first, predicted.informed)
 
 
-def _mix(share: Float[Array, " b"], one: Any, other: Any) -> Any:
+def _mix(share: Float[AnyArray, " b"], one: Any, other: Any) -> Any:
     share = share.reshape(share.shape + (1,) * (one.ndim - 1))
     return share * one + (1 - share) * other
 
@@ -188,9 +188,7 @@ def learn_shares(
             first.
     """
     coherent = learn_share(Scored(features, worth(predicted.coherent, predicted.own), tx_index))
-    first = np.asarray(
-        _mix(share_of(coherent, jnp.asarray(features)), jnp.asarray(predicted.coherent), jnp.asarray(predicted.own))
-    )
+    first = _mix(np.asarray(share_of(coherent, jnp.asarray(features))), predicted.coherent, predicted.own)
     return Shares(coherent, learn_share(Scored(features, worth(first, predicted.informed), tx_index)))
 
 
@@ -209,7 +207,7 @@ def in_blocks(score: Callable[..., Array], *spectra: Float[np.ndarray, "n 90 360
 
 @jax.jit
 def _ssim_of_mixtures(one: Any, other: Any, truth: Float[Array, "b 90 360"]) -> Float[Array, "b shares"]:
-    return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32))
+    return ssim_of_mixtures(jnp.asarray(one), jnp.asarray(other), truth, jnp.asarray(SHARES, jnp.float32), COARSE)
 
 
 def nearness(measured_db: Float[np.ndarray, " n"], one: Any, other: Any) -> Float[np.ndarray, "n shares"]:
@@ -241,7 +239,12 @@ def _best(scores: Float[np.ndarray, "n shares"]) -> float:
 
 
 def _worth(share: Share, known: Scored) -> Float[np.ndarray, " n"]:
-    return np.asarray(score_at(jnp.asarray(known.scores), share_of(share, jnp.asarray(known.features))))
+    return np.asarray(_score_of(share, known.features.astype(np.float32), known.scores.astype(np.float32)))
+
+
+@jax.jit
+def _score_of(share: Share, features: Float[Array, "n features"], scores: Float[Array, "n shares"]) -> Float[Array, " n"]:
+    return score_at(scores, share_of(share, features))
 
 
 def score_at(scores: Float[Array, "n shares"], share: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -357,9 +360,9 @@ def floor_of(predicted: ExpertPredictions, observed: Float[np.ndarray, "n 90 360
 def observed_predictions(predicted: ExpertPredictions, floor: float) -> ExpertPredictions:
     """Returns spectra of the experts as they would be observed if the floor were first removed from those that have learned it
     and then added to all (host)."""
-    own, informed = (at_least_floor(jnp.asarray(learned), floor) for learned in predicted[1:])
-    coherent = jnp.where(_met(predicted)[:, None, None], with_floor(jnp.asarray(predicted.coherent), floor), own)
-    return ExpertPredictions(*(np.asarray(spectra) for spectra in (coherent, own, informed)))
+    own, informed = (np.asarray(at_least_floor(learned, floor)) for learned in predicted[1:])
+    coherent = np.where(_met(predicted)[:, None, None], np.asarray(with_floor(predicted.coherent, floor)), own)
+    return ExpertPredictions(coherent, own, informed)
 
 
 def _met(predicted: ExpertPredictions) -> Bool[np.ndarray, " n"]:
@@ -371,7 +374,8 @@ def _alike(
     change: Callable[..., Array], predicted: Float[Array, "b 90 360"], observed: Float[Array, "b 90 360"]
 ) -> Float[Array, "b levels"]:
     """Returns the similarity (SSIM) to the observed spectra of others that are changed by each floor of `LEVELS`."""
-    return jax.lax.map(lambda floor: ssim(change(predicted, floor), observed), jnp.asarray(LEVELS, predicted.dtype)).T
+    levels = jnp.asarray(LEVELS, predicted.dtype)
+    return jax.lax.map(lambda floor: ssim(change(predicted, floor), observed, COARSE), levels).T
 
 
 _added, _raised = (jax.jit(partial(_alike, change)) for change in (with_floor, at_least_floor))

@@ -7,7 +7,7 @@ for each parameter, such as optimiser moments, are transformed (`map_moments`), 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -59,8 +59,6 @@ class Context(NamedTuple):
     say: Say = silent
     validation: Callable[[], list[Batch]] = list
     """Function that returns batches of validation links, each of one receiver."""
-    ahead: Callable[[Hashable, Callable[[], object]], None] = lambda key, call: None
-    """Function that starts a call which compiles programs for later, in the background; calls with the same key start once."""
 
 
 class Hook(ABC):

@@ -305,8 +305,7 @@ class Run:
                     self._compile_ahead(self.state.params, self.capacity)
                 begin, step = time.perf_counter(), self.step
                 rng = np.random.default_rng([self.seed, hook.stream, step])
-                parts = self.data, self.prepared, self.dataset.train, say, self.validation_batches, self.precompilation.begin
-                context = Context(*parts)
+                context = Context(self.data, self.prepared, self.dataset.train, say, self.validation_batches)
                 edit = hook.apply(self.field, self.state.params, self.state.statistics[number], context, step, rng)
                 self._commit(number, edit)
                 check_alike(self.state, f"the parameters after {type(hook).__name__}")

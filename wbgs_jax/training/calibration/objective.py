@@ -1,10 +1,11 @@
 """Scores of candidate parameters of a field on training spectra, and the test whether one candidate is significantly better,
 for calibration before training and selections after it. Lower scores are better."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +13,20 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Num
 from scipy.stats import norm, permutation_test
 
+from wbgs_jax._util.pytree import AnyArray
 from wbgs_jax._util.statistics import by_transmitter, standard_error
 from wbgs_jax.fields.calibratable import Calibratable
-from wbgs_jax.fields.coherent_model import PreparedPaths, WaveParams
+from wbgs_jax.fields.coherent_model import (
+    PreparedPaths,
+    WaveParams,
+    path_arrivals,
+    path_covariances,
+    phase_blind_pas,
+    snapshots_of,
+    spectra_of,
+)
 from wbgs_jax.fields.losses import log_decorrelation, surprise
+from wbgs_jax.radio.channel import decibels
 from wbgs_jax.training.batches import TrainingData
 from wbgs_jax.types import Batch, Links
 
@@ -55,7 +66,7 @@ def make_scores(
     field: Calibratable,
     prepared: PreparedPaths,
     data: TrainingData,
-    spectra: Int[Array, " n"],
+    spectra: Int[AnyArray, " n"],
     compared: Compared = "snapshots",
 ) -> Scores:
     """Returns the function that scores candidates on spectra.
@@ -67,7 +78,7 @@ def make_scores(
         spectra: indices of the links.
         compared: the compared quantity.
     """
-    by = comparable(compared, data)
+    by, spectra = np.int32(get_args(Compared).index(comparable(compared, data))), np.asarray(spectra, np.int32)
 
     @functools.cache
     def common() -> tuple[Calibratable, PreparedPaths]:
@@ -85,7 +96,8 @@ def make_scores(
         structure, count = jax.tree.structure(candidates[0]), len(spectra[:first])
         columns = list(zip(*(jax.tree.leaves(candidate) for candidate in candidates), strict=True))
         own = tuple(np.ndim(column[0]) < 2 or any(leaf is not column[0] for leaf in column) for column in columns)
-        leaves = tuple(_rows(column) if of_candidate else column[0] for of_candidate, column in zip(own, columns, strict=True))
+        # On the host: operations of JAX would each be compiled, behind large programs that are compiled in the background.
+        leaves = tuple(_rows(column) if varies else np.asarray(column[0]) for varies, column in zip(own, columns, strict=True))
         leaves = tuple(jax.tree.leaves(field.params_in_common_shapes(jax.tree.unflatten(structure, leaves))))
         slim, some = common()[0], np.int32(len(candidates))
         found = [_score(slim, structure, own, leaves, some, *block(start), by) for start in range(0, count, AT_ONCE)]
@@ -107,7 +119,7 @@ class CalibrationProblem:
     def scores(self, count: int | None = None, compared: Compared = "snapshots", highest_hz: float = np.inf) -> Scores:
         """Returns the function that scores candidates on the first `count` of the spectra up to a frequency."""
         own = self.spectra[self.frequency_hz() <= highest_hz * (1 + 1e-6)][:count]
-        return make_scores(self.field, self.prepared, self.data, jnp.asarray(own, jnp.int32), compared)
+        return make_scores(self.field, self.prepared, self.data, own, compared)
 
     def frequency_hz(self) -> Float[np.ndarray, " n"]:
         """Returns the frequencies of the spectra."""
@@ -146,7 +158,7 @@ def _predicted(
 
 
 def comparable(compared: Compared, data: TrainingData) -> Compared:
-    """Returns what is compared instead if data do not contain it, so that equal comparisons share a program."""
+    """Returns what is compared instead if data do not contain it."""
     elements = 0 if data.snapshots is None else data.snapshots.shape[-1]
     if elements == 1 or not data.has_spectra:  # the snapshot of a single element contains its power only
         return "powers"
@@ -167,7 +179,7 @@ def _looked_at(prepared: PreparedPaths, data: TrainingData, spectra: Int[Array, 
     return prepared.subset(links), jax.vmap(lambda link: data.batch(link[None], jax.random.key(0)))(spectra)
 
 
-@functools.partial(jax.jit, static_argnames=("structure", "own", "compared"))
+@functools.partial(jax.jit, static_argnames=("structure", "own"))
 def _score(
     field: Calibratable,
     structure: jax.tree_util.PyTreeDef,
@@ -176,38 +188,25 @@ def _score(
     count: Int[Any, ""],
     prepared: PreparedPaths,
     batches: Batch,
-    compared: Compared,
+    compared: Int[Any, ""],
 ) -> Float[Array, "most m"]:
     """Returns the scores of the first `count` candidates; the other rows are zero.
 
-    The program is the same whatever differs between candidates: compiling one takes as long as scoring ten thousand candidates,
-    and what candidates have in common is a small part of the work. On a CPU it scores one candidate after the other, which is
-    the smallest program; elsewhere it scores many side by side.
+    The program is the same whatever differs between candidates and whatever is compared: compiling one takes as long as scoring
+    ten thousand candidates, and most of it is the field along paths, which all comparisons have in common. On a CPU it scores
+    one candidate after the other, which is the smallest program; elsewhere it scores many side by side.
 
     Args:
         own: whether a leaf of the parameters has a row for each candidate; static.
         leaves: leaves of the parameters.
+        compared: index of the compared quantity in `Compared`, which the data contain (`comparable`).
     """
     side_by_side = 1 if jax.default_backend() == "cpu" else MOST
-
-    def compare(batch: Batch, params: WaveParams) -> Float[Array, ""]:
-        seen = field.render(params, field.plan(params, batch.receiver, prepared), batch.links)
-        if compared == "snapshots" and batch.snapshots is not None and seen.snapshots is not None:
-            return log_decorrelation(seen.snapshots, batch.snapshots)[0]
-        if compared == "covariances" and batch.snapshots is not None and seen.covariance is not None:
-            return surprise(seen.covariance, batch.snapshots)[0]
-        if batch.pas is None or compared == "powers":
-            received = batch.received_db
-            assert received is not None and seen.power_db is not None, "data without powers are compared by spectra"
-            unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(seen.power_db - received)[0])
-            return unlike if batch.snapshots is None else jnp.where(jnp.any(batch.snapshots != 0), unlike, 0)
-        unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(seen.pas - batch.pas)), ALIKE))
-        return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
 
     def candidate(number: Int[Array, ""]) -> Float[Array, " m"]:
         rows = (leaf[number] if of_candidate else leaf for leaf, of_candidate in zip(leaves, own, strict=True))
         params = jax.tree.unflatten(structure, rows)
-        scores: Float[Array, " m"] = jax.vmap(lambda batch: compare(batch, params))(batches)
+        scores: Float[Array, " m"] = jax.vmap(lambda batch: _compare(field, params, prepared, batch, compared))(batches)
         return scores
 
     def some(block: Int[Array, ""], scores: Float[Array, "most m"]) -> Float[Array, "most m"]:
@@ -217,6 +216,50 @@ def _score(
 
     leaves = tuple(map(jnp.asarray, leaves))
     return jax.lax.fori_loop(0, -(-count // side_by_side), some, jnp.zeros((MOST, AT_ONCE), jnp.float32))
+
+
+def _compare(
+    field: Calibratable, params: WaveParams, prepared: PreparedPaths, batch: Batch, compared: Int[Any, ""]
+) -> Float[Array, ""]:
+    """Returns the score of a batch of one link. Of the quantities that are derived from its arrivals, only the compared one is
+    computed when the program runs."""
+    plan, links, frequency_hz = field.plan(params, batch.receiver, prepared), batch.links, batch.links.frequency_hz
+    paths, plan = plan.paths_of(links), dataclasses.replace(plan, prepared=None)
+    arrived = path_arrivals(params, plan, paths, links)
+
+    def by_snapshots() -> Float[Array, ""]:
+        return log_decorrelation(snapshots_of(plan, arrived, frequency_hz), batch.snapshots)[0]
+
+    def by_spectra(pas: Float[Array, "1 90 360"]) -> Float[Array, ""]:
+        assert batch.pas is not None, "data without spectra are compared by powers"
+        unlike = jnp.log(jnp.maximum(jnp.mean(jnp.abs(pas - batch.pas)), ALIKE))
+        return jnp.where(jnp.max(batch.pas) > 0, unlike, 0)
+
+    def by_powers(power: Float[Array, " 1"]) -> Float[Array, ""]:
+        assert batch.received_db is not None, "data without powers are compared by spectra"
+        unlike = jnp.log(POWER_MARGIN_DB + jnp.abs(decibels(power) - batch.received_db)[0])
+        return unlike if batch.snapshots is None else jnp.where(jnp.any(batch.snapshots != 0), unlike, 0)
+
+    def by_second_moments() -> Float[Array, ""]:
+        covariance, power = path_covariances(params, plan, paths, arrived, frequency_hz)
+        following = (  # in the order of `Compared`; data that lack a quantity are never compared by it
+            (lambda: surprise(covariance, batch.snapshots)[0]) if batch.snapshots is not None else _nothing,
+            (lambda: by_spectra(spectra_of(plan, covariance, frequency_hz))) if batch.pas is not None else _nothing,
+            (lambda: by_powers(power)) if batch.received_db is not None else _nothing,
+        )
+        score: Float[Array, ""] = jax.lax.switch(compared - 1, following)
+        return score
+
+    if not plan.config.coherent:
+        return by_spectra(phase_blind_pas(params, plan, paths, links))
+    if batch.snapshots is None:
+        return by_second_moments()
+    score: Float[Array, ""] = jax.lax.cond(compared == 0, by_snapshots, by_second_moments)
+    return score
+
+
+def _nothing() -> Float[Array, ""]:
+    return jnp.zeros(())
 
 
 def surely_better(gains: Float[np.ndarray, " n"], tx_index: Int[np.ndarray, " n"], errors: float) -> bool:

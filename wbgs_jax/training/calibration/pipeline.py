@@ -7,7 +7,6 @@ Training starts from the result.
 """
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +25,7 @@ from wbgs_jax.training.calibration.alignment import Place, learn_geometry
 from wbgs_jax.training.calibration.antennas import search_antennas, search_pair
 from wbgs_jax.training.calibration.array_gains import search_tuning
 from wbgs_jax.training.calibration.material_fit import entries_of, search_materials, unknown_mm
-from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores, comparable
+from wbgs_jax.training.calibration.objective import CalibrationProblem, Scores
 from wbgs_jax.training.calibration.obstacles import search_absent, search_clutter
 from wbgs_jax.training.calibration.propagation_options import search_idealisations
 from wbgs_jax.training.calibration.thickness import search_slabs
@@ -100,10 +99,6 @@ class Calibration(Hook):
                 params, gain = search_gain(params, problem.scores(config.spectra))
                 report["search"] = dataclasses.asdict(named)
             return Edit(params, (), None, report | {"gain_db": gain}, field, prepared)
-        if config.rounds:
-            later = {comparable("covariances", data), comparable("spectra", data)} - {comparable("snapshots", data)}
-            for compared in sorted(later):
-                context.ahead(("scores", compared), functools.partial(problem.scores(1, compared), [params]))
         if config.antenna_rounds:
             say("calibration: antenna patterns")
             params, _ = self._antennas(params, problem, report)
